@@ -50,14 +50,16 @@ Answer = Callable[[Matrix], Margin]
 
 @dataclass(frozen=True, eq=False)
 class Boundary(InNotebook):
-    """The probability of a failure over the space, as `boundary` learned it.
+    """The probability of a failure over the space, as learned by `boundary`.
 
-    - `brier`: the mean squared difference of probability and verdict, on rows not learned from.
-    - `base`: that of the share of failures alone, whatever the point.
-    - `calibration`: by tenths of the probability that was said, how many of so many rows failed.
-    - `reach`: distance up to which a row says something of a point (`Samples.points`).
-    - `share`: mean probability over the prior, no bound and no estimate with an interval.
-    - `unsampled`: share of the prior that is farther from all rows. Both are NaN without a space.
+    - `brier`: mean squared difference of predicted probability and verdict, on held-out rows.
+    - `base`: the same for a constant prediction, the share of failures.
+    - `calibration`: for each tenth of the predicted probability, how many rows failed, and of how
+      many.
+    - `reach`: distance up to which a row tells something about a point (`Samples.points`).
+    - `share`: mean probability over the prior; it is neither a bound nor an estimate with an
+      interval.
+    - `unsampled`: share of the prior beyond the reach of all rows. Both are NaN without a space.
     - `samples`: the rows.
     """
 
@@ -76,7 +78,7 @@ class Boundary(InNotebook):
 
         **Arguments:**
         - `points`: a dictionary of the features of one point, or a DataFrame of several.
-        **Returns:** a number, or an array; NaN where no row lies near (`sampled`).
+        **Returns:** a number, or an array; NaN where no row is near (see `sampled`).
         **Raises:** `KeyError` for a feature that is missing.
         """
         frame = _frame(points, self.samples)
@@ -84,15 +86,15 @@ class Boundary(InNotebook):
         return said if isinstance(points, pd.DataFrame) else float(said[0])
 
     def sampled(self, points: Points) -> bool | Bool[np.ndarray, " n"]:
-        """Return whether a row lies within reach of points; of others nothing is known."""
+        """Return whether a row lies within reach of each point; about others nothing is known."""
         near = self._near(_frame(points, self.samples))
         return near if isinstance(points, pd.DataFrame) else bool(near[0])
 
     def next_points(self, count: int = 10) -> pd.DataFrame:
-        """Return points of the prior whose simulation would say most.
+        """Return the points of the prior whose simulation would be most informative.
 
-        Those that no row is near come first, then those whose verdict is open; each is far from
-        the others.
+        Points without a near row come first, then those with an uncertain verdict; they are far
+        from each other.
 
         **Arguments:**
         - `count`: number of points.
@@ -146,10 +148,10 @@ class Boundary(InNotebook):
 def boundary(source: Source, *, seed: int = 0) -> Boundary:
     """Learn the probability of a failure at any point from the rows of a table.
 
-    It is calibrated on rows that were not learned from, and says where no row lies near.
+    It is calibrated on held-out rows, and is NaN where no row is near.
 
     **Arguments:**
-    - `source`: a run, its table, a DataFrame, or `Samples`; rows with a verdict count.
+    - `source`: a run, its table, a DataFrame, or `Samples`; rows with a verdict are used.
     - `seed`: the seed of the folds, and of the points of the prior.
     **Returns:** the `Boundary`.
     **Raises:** `ValueError` for fewer than ten failures, or ten safe rows.

@@ -43,17 +43,16 @@ MAX_NAMED = 8
 class Coverage(Drawn, InNotebook):
     """Coverage of the feature space by the rows of a table.
 
-    **Fields:** `table`: one row a feature, with the number of its `cells`, the share of them
-    `occupied`, the share of pairs of cells with other features (`pairs`), and the share that as
-    many uniform samples would occupy (`expected`, `expected_pairs`), the shares of the prior
-    (`mass`) and of the range (`volume`) that the occupied cells take, and of pairs of cells
+    **Fields:** `table`: one row for each feature, with the number of its `cells`, the share of them
+    that is `occupied`, the share of occupied pairs of cells with other features (`pairs`), the
+    shares that as many uniform samples would occupy (`expected`, `expected_pairs`), and how much of
+    the prior (`mass`) and of the range (`volume`) lies in occupied cells and pairs of cells
     (`pairs_mass`, `pairs_volume`); `untried`: the discrete values and pairs of values that no row
-    has, at most 1000 of `untried_count`; `discrepancy`: squared
-    centred L2 discrepancy over that expected of as many uniform samples: 1 for those, less where
-    the rows are more even, much more where they crowd; `dispersion`: radius of the largest empty
-    ball of the ordered features, in unit coordinates, and `uniform_dispersion` that of as many
-    uniform samples; `hole`: the features in its middle; all None without ordered features;
-    `samples`.
+    has, at most 1000 of `untried_count`; `discrepancy`: squared centred L2 discrepancy divided by
+    that expected of as many uniform samples: about 1 for uniform rows, less for more even ones,
+    much more for clustered ones; `dispersion`: radius of the largest empty ball of the ordered
+    features, in unit coordinates, and `uniform_dispersion` that for as many uniform samples;
+    `hole`: the features at its centre; all None without ordered features; `samples`.
     """
 
     _picture = "coverage", "plot_coverage"
@@ -69,7 +68,7 @@ class Coverage(Drawn, InNotebook):
 
     @property
     def occupied(self) -> float:
-        """Share of all pairs of cells that some row lies in; of cells with a single feature."""
+        """Share of occupied pairs of cells; of occupied cells if there is a single feature."""
         column = "pairs" if len(self.table) > 1 else "occupied"
         return float(np.nanmean(self.table[column].to_numpy(float)))
 
@@ -119,25 +118,25 @@ def coverage(source: Source, *, cells: int = 10, seed: int = 0) -> Coverage:
 
     **Arguments:**
     - `source`: a run, its table, a DataFrame, or `Samples`; of the first three all rows with a
-      verdict.
-    - `cells`: into how many equal parts the range of a feature is cut, fewer where rows are too few
-      to fill them; a discrete feature of up to 20 values has a cell for each.
-    - `seed`: the seed of everything that is drawn at random.
+      verdict are used.
+    - `cells`: number of equal parts of a feature's range, fewer if there are too few rows to fill
+      them; a discrete feature of up to 20 values has a cell for each value.
+    - `seed`: the seed of all random draws.
     **Returns:** a `Coverage`.
 
-    Uniform means distributed by the prior: coordinates are those in which it is uniform, or shares
-    of the ranges in the table where no space is known. With a constraint between features, uniform
-    samples are 8192 that fulfil it, cells without any of them do not count, and the hole is in the
-    midst of one of them; one that less than a two-hundredth fulfils is not looked at. Absent
-    entries are left out feature by feature, and are in the middle where a point is needed. The
-    discrepancy is of 2000 rows at most, drawn by `seed`, with discrete values spread over their
-    cells.
+    "Uniform" means distributed as the prior: coordinates are those in which the prior is uniform,
+    or shares of the ranges in the table if no space is known. With a constraint between features,
+    8192 samples that satisfy it replace the uniform samples, cells without any of them do not
+    count, and the hole is centred on one of them; a constraint that fewer than one in 200 points
+    satisfy is ignored. Absent entries are left out feature by feature, and put in the middle where
+    a point is needed. The discrepancy uses at most 2000 rows, drawn by `seed`, with discrete values
+    spread over their cells.
 
     Sources: Hickernell, A generalized discrepancy and quadrature error bound, Mathematics of
     Computation 67 (1998); its mean for uniform samples, `((5/4)^d - (13/12)^d) / n`, follows from
     the definition. For the others see `cells.py`.
 
-    **Raises:** `ValueError` for no rows, no feature that varies, or fewer than 2 cells.
+    **Raises:** `ValueError` if there are no rows, if no feature varies, or for fewer than 2 cells.
     """
     cells = check_count("cells", cells, 2)
     samples = Samples.of(source, "all")
@@ -271,13 +270,13 @@ def largest_hole(
 ) -> tuple[float, Float[np.ndarray, " k"]]:
     """Return the greatest distance of a probe to its nearest point, and that probe.
 
-    Probes are 4096 points of a Sobol sequence, then more and more closely around the best; 1024 in
-    more than 8 dimensions.
+    Probes are 4096 points of a Sobol sequence (1024 in more than 8 dimensions), then ever closer
+    points around the best.
 
     **Arguments:**
-    - `points`: in the unit cube.
+    - `points`: points of the unit cube.
     - `parts`: the prior distributions of their columns.
-    - `among`: the only points that may be probes, where not all of the cube is allowed.
+    - `among`: the only points that may be probes, if parts of the cube are not allowed.
     """
     from scipy.spatial import KDTree
     from scipy.stats import qmc

@@ -29,9 +29,9 @@ from verifai_jax.problem.problem import Problem
 class Diverse(Drawn, InNotebook):
     """Rows chosen from `samples`, in the order in which they were added.
 
-    **Fields:** `rows` `[k]`: row numbers of the table; `distances` `[k]`: how far each was from the
-    nearest one before, in the coordinates of `samples.points`, infinite for the first;
-    `radius`: how far the row is that is farthest from all chosen ones.
+    **Fields:** `rows` `[k]`: row numbers of the table; `distances` `[k]`: the distance of each from
+    the nearest one chosen earlier, in the coordinates of `samples.points`, infinite for the first;
+    `radius`: the largest distance of any row from its nearest chosen one.
     """
 
     _picture = "clusters", "plot_diverse"
@@ -43,7 +43,7 @@ class Diverse(Drawn, InNotebook):
 
     @cached_property
     def table(self) -> pd.DataFrame:
-        """The rows of the error table, with their `distance` (`distance_` if a feature is it)."""
+        """The rows of the error table with their `distance` (`distance_` if that name is taken)."""
         own = pd.DataFrame({"distance": self.distances}, index=pd.Index(self.rows))
         return with_columns(self.samples.at(self.rows), own)
 
@@ -70,18 +70,18 @@ def diverse(
     scale: Scale = "range",
     space: Problem | FeatureSpace | None = None,
 ) -> Diverse:
-    """Select `k` rows: the worst one first, then always the row farthest from all before.
+    """Select `k` rows: the worst one first, then each time the row farthest from those chosen.
 
     **Arguments:**
     - `source`: a run, its table, a DataFrame with feature columns, or `Samples`.
     - `columns`, `which`, `space`: as in `Samples.of`.
-    - `k`: how many; all rows if there are no more.
-    - `start`: the number of the first row, instead of that of the least robustness.
+    - `k`: number of rows; all rows if there are fewer.
+    - `start`: the number of the first row; by default the one with the least robustness.
     - `scale`: as in `Samples.scaling`.
     **Returns:** a `Diverse`.
 
-    Rows that equal a chosen one come last, at a distance of 0. Of rows that are equally far the
-    first in the table is taken. Takes `n k` steps.
+    Rows that equal a chosen one come last, with distance 0. Ties go to the first row in the table.
+    The time grows with `n k`.
 
     **Raises:** `ValueError` for a `k` below 1;
     `IndexError` for a start that is not among the rows.

@@ -48,10 +48,10 @@ class Item:
 class FrequentPatterns(Drawn, InNotebook):
     """Frequent combinations of values among `samples`.
 
-    **Fields:** `items`: the single values, also those that never occur; `combinations`: each a
-    tuple of indices in `items`; `counts` of rows; `minimum`: the least share that was looked for;
-    `against`: what the shares are compared with, `"table"`, `"prior"` or `"nothing"`; `expected`:
-    the shares compared with.
+    **Fields:** `items`: the single values, including those that never occur; `combinations`: each a
+    tuple of indices in `items`; `counts` of rows; `minimum`: the smallest share searched for;
+    `against`: the reference for the shares, `"table"`, `"prior"` or `"nothing"`; `expected`: the
+    reference shares.
     """
 
     _picture = "frequent_patterns", "plot_frequent_patterns"
@@ -69,10 +69,10 @@ class FrequentPatterns(Drawn, InNotebook):
     def table(self) -> pd.DataFrame:
         """A row for each combination, single values first, then the most frequent first.
 
-        `count` and `share` of the rows looked at; `expected`: the share that the combination has
-        in the prior, or among all rows with a verdict; `lift`: share over expected, which is how
-        many times as often as an average simulation one with these values is among the rows
-        looked at (fails, for counterexamples). NaN where nothing is known to compare with.
+        `count` and `share` of the selected rows; `expected`: the share of the combination in the
+        prior, or among all rows with a verdict; `lift`: share divided by expected. For
+        counterexamples the lift is how many times as often simulations with these values fail as an
+        average one. NaN without a reference.
         """
         share = self.counts / len(self.samples)
         lift = np.divide(
@@ -93,7 +93,7 @@ class FrequentPatterns(Drawn, InNotebook):
 
     @cached_property
     def values(self) -> pd.DataFrame:
-        """All values of each column, also rare ones: `column`, `value`, `count`, `share`."""
+        """All values of each column, including rare ones: `column`, `value`, `count`, `share`."""
         counts = self._present.sum(axis=1)
         table = pd.DataFrame(
             {
@@ -109,7 +109,7 @@ class FrequentPatterns(Drawn, InNotebook):
 
     @cached_property
     def top(self) -> dict[str, Any]:
-        """The most frequent value of each column; the first in the order of choices if equal."""
+        """The most frequent value of each column; of equal ones the first of the choices."""
         first = self.values.drop_duplicates("column")
         return dict(zip(first["column"], first["value"], strict=True))
 
@@ -146,10 +146,10 @@ class FrequentPatterns(Drawn, InNotebook):
 
     @cached_property
     def distinctive(self) -> pd.DataFrame:
-        """Rows of `table` with the greatest lift first, without combinations that add nothing.
+        """Rows of `table` by decreasing lift, without combinations that add nothing.
 
-        A combination adds something if its lift is 1.1 times that of each of its parts. Where
-        nothing is known to compare with, the single values, the most frequent first.
+        A combination adds something if its lift is at least 1.1 times that of each of its parts.
+        Without a reference these are the single values by decreasing frequency.
         """
         table: Any = self.table
         lift = table["lift"].to_numpy()
@@ -179,20 +179,20 @@ def frequent_patterns(
     **Arguments:**
     - `source`: a run, its table, a DataFrame with feature columns, or `Samples`.
     - `columns`, `which`, `space`: as in `Samples.of`.
-    - `size`: values that a combination has at most.
-    - `minimum`: least share of the rows that a combination must have.
-    - `bins`: takes ordered columns too, in so many equally wide cells of their range; whole
-      numbers with fewer values are used directly.
-    - `against`: what a share is compared with: that among all rows with a verdict, or the prior
-      probability. By default the table where it has rows with the other verdict, else the prior
-      where it is known. After an active search both depend on where it went.
+    - `size`: maximum number of values in a combination.
+    - `minimum`: minimum share of the rows that have a combination.
+    - `bins`: if given, ordered columns are included, cut into this many equally wide cells of their
+      range; whole numbers with fewer values are used directly.
+    - `against`: the reference for a share: that among all rows with a verdict (`"table"`), or the
+      prior probability (`"prior"`). By default the table if it has rows with the other verdict,
+      else the prior if it is known. After a search that learns both depend on where it searched.
 
     An absent item of an array has no value.
 
     **Returns:** `FrequentPatterns`.
-    **Raises:** `ValueError` for no unordered column and no
-    `bins`; a `size` or number of bins below 1; a minimum outside (0, 1]; `against="prior"` without
-    a space that knows the prior; more than 50 000 combinations.
+    **Raises:** `ValueError` if there is no unordered column and no `bins`; for a `size` or number
+    of bins below 1; a minimum outside (0, 1]; `against="prior"` without a space that knows the
+    prior; more than 50 000 combinations.
     """
     samples = Samples.of(source, which, columns, space)
     check_count("size", size)

@@ -39,13 +39,13 @@ MAX_NAMED = 6
 
 @dataclass(frozen=True, eq=False)
 class Importance(Drawn, InNotebook):
-    """Losses of a model of the table when a feature is shuffled.
+    """The loss in accuracy of a model of the table when one feature is shuffled.
 
-    **Fields:** `table`: one row a feature, the most important first; `failing` is the loss in the
-    area under the ROC curve (0.5 is chance) of a model of which rows fail, `rho` the loss in R^2
-    of a model of the robustness, each with `_low` and `_high`, two standard deviations of the
-    repetitions away; NaN where there is no model. `scores`: of the models on rows that they were
-    not trained on; `missing`: why there is no model of the one or the other; `name` of the run.
+    **Fields:** `table`: one row for each feature, the most important first; `failing` is the loss
+    in the area under the ROC curve (0.5 is chance) of a model that predicts failures, `rho` the
+    loss in R^2 of a model of the robustness, each with `_low` and `_high`, two standard deviations
+    of the repetitions away; NaN without a model. `scores`: the accuracy of the models on held-out
+    rows; `missing`: why a model is missing; `name` of the run.
     """
 
     _picture = "overview", "plot_importance"
@@ -56,12 +56,12 @@ class Importance(Drawn, InNotebook):
     name: str
 
     def is_reliable(self, target: str) -> bool:
-        """Return whether the model of `"failing"` or `"rho"` predicts rows kept aside."""
+        """Return whether the model of `"failing"` or `"rho"` predicts held-out rows."""
         return self.scores.get(target, -np.inf) >= MIN_SCORE[target]
 
     @property
     def ranked(self) -> list[str]:
-        """Features from the most to the least important, by the model that can be trusted."""
+        """Features by decreasing importance, according to the model that is reliable."""
         return [str(name) for name in self.table.index]
 
     def __repr__(self) -> str:
@@ -88,7 +88,7 @@ class Importance(Drawn, InNotebook):
         return "\n".join(lines)
 
     def score_words(self, target: str) -> str:
-        """Write the score of the model of `"failing"` or `"rho"`."""
+        """Describe the score of the model of `"failing"` or `"rho"`."""
         return f"{SCORES[target]} {self.scores[target]:z.2f} on rows kept aside"
 
 
@@ -100,20 +100,20 @@ def importance(
 
     **Arguments:**
     - `source`: a run, its table, a DataFrame, or `Samples`; of the first three all rows with a
-      verdict.
+      verdict are used.
     - `repeats`: how often each feature is shuffled.
-    - `seed`: the seed of everything that is drawn at random.
+    - `seed`: the seed of all random draws.
     - `progress`: whether to show one line of progress; see `core.display.progress` for the default.
     **Returns:** an `Importance`.
 
-    Half of the rows (4000 at most) train an ensemble of trees; the loss is measured on others. Two
-    features that go together in the table, as an active search may make them, share their
+    Half of the rows (at most 4000) train an ensemble of trees; the loss is measured on the others.
+    If two features are correlated in the table, as after a search that learns, they share their
     importance or hide each other's.
 
     Sources: trees of Geurts, Ernst and Wehenkel, Extremely randomized trees, Machine Learning 63
     (2006); permutation importance of Breiman, Random forests, Machine Learning 45 (2001).
 
-    **Raises:** `ValueError` for no rows, or where neither failing nor the robustness can be
+    **Raises:** `ValueError` if there are no rows, or if neither failing nor the robustness can be
     learned.
     """
     repeats = check_count("repeats", repeats, 2)

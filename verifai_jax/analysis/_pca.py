@@ -55,14 +55,14 @@ class Components(Drawn, InNotebook):
     """Principal components of the ordered features of `samples`, the strongest first.
 
     **Fields:** `pivot` `[k]`: mean of the rows, in units of the features; `directions` `[m, k]`:
-    orthonormal in the scaled coordinates, the largest entry of each positive; `deviations` `[m]`:
-    standard deviation along each, in the scaled coordinates; `shares` `[m]` of the total variance;
-    `offset` and `width` `[k]` of the scaling; `telling`: how many of the first components, of five
-    at most, explain more than chance: more than the first one of features with these deviations
-    that vary independently (Horn's parallel analysis, Psychometrika 30, 1965, at 99 %), each after
-    those before it were taken out.
+    orthonormal in the scaled coordinates, with the largest entry of each positive; `deviations`
+    `[m]`: standard deviation along each, in the scaled coordinates; `shares` `[m]` of the total
+    variance; `offset` and `width` `[k]` of the scaling; `telling`: how many of the first five
+    components explain more variance than chance. A component does if it exceeds the first component
+    of independent features with the same deviations, after the earlier components were removed
+    (Horn's parallel analysis, Psychometrika 30, 1965, at 99 %).
 
-    There are only directions in which the rows vary: none if all rows are equal.
+    Only directions in which the rows vary are included: none if all rows are equal.
     """
 
     _picture = "pca", "plot_components"
@@ -91,14 +91,14 @@ class Components(Drawn, InNotebook):
         return with_columns(table, own)
 
     def project(self, rows: pd.DataFrame | Sequence[int] | None = None) -> pd.DataFrame:
-        """Return coordinates along the components, in scaled units, a column each; 0 is the pivot.
+        """Return coordinates along the components, in scaled units, as columns; 0 is the pivot.
 
         **Arguments:**
         - `rows`: row numbers of the table, or a DataFrame with the columns; by default the rows
           that were analysed.
 
-        An absent entry is taken as the pivot's. **Raises:** `IndexError` for a row number that is
-        not in the table.
+        An absent entry counts as the pivot's. **Raises:** `IndexError` for a row number that is not
+        in the table.
         """
         frame = self.samples.frame
         if isinstance(rows, pd.DataFrame):
@@ -111,19 +111,19 @@ class Components(Drawn, InNotebook):
         return pd.DataFrame(moved @ self.directions.T, index=frame.index, columns=list(columns))
 
     def generate(self, seed: Seed, n: int, spread: float = 1.0) -> pd.DataFrame:
-        """Draw features: normal along the components around the pivot, within the space's bounds.
+        """Draw features from a normal distribution along the components, within the space's bounds.
 
         **Arguments:**
         - `seed`: an integer, a NumPy generator or a `jax.random` key.
-        - `n`: how many.
-        - `spread`: times the standard deviations of the rows.
+        - `n`: number of draws.
+        - `spread`: factor on the standard deviations of the rows.
 
-        Draws outside the bounds (of the space, or of the whole table where no space is known) are
-        drawn again; what is still outside after 32 rounds moves towards the pivot until inside.
-        Whole numbers are rounded. All other features, choices and the number of items of arrays
-        among them, are those of the nearest row analysed. What breaks a constraint of the space is
-        drawn again too, and after 32 rounds is the nearest row itself. The columns are all
-        features, so that `space.from_row` takes a row.
+        Draws outside the bounds (of the space, or of the whole table if no space is known) are
+        repeated; after 32 rounds a draw moves towards the pivot until it is inside. Whole numbers
+        are rounded. All other features, including choices and the number of items of arrays, are
+        those of the nearest analysed row. Draws that break a constraint of the space are repeated
+        too, and replaced by the nearest row after 32 rounds. The columns are all features, so
+        `space.from_row` accepts a row.
 
         **Raises:** `ValueError` for `n < 0` or a spread that is not a positive finite number.
         """
@@ -236,13 +236,14 @@ def pca(
     - `source`: a run, its table, a DataFrame with feature columns, or `Samples`.
     - `columns`, `which`, `space`: as in `Samples.of`.
       Unordered columns are left out.
-    - `components`: how many; by default all in which the rows vary. Fewer are returned where the
-      rows vary in fewer directions.
-    - `scale`: `"range"` compares features by their range in the space, `"raw"` does not scale
-      (VerifAI), `"standard"` gives the components of the correlation matrix, `"rows"` compares by
-      the range of the rows.
+    - `components`: number of components; by default all in which the rows vary, which is also the
+      maximum.
+    - `scale`: `"range"` scales features by their range in the space, `"raw"` does not scale (as
+      VerifAI), `"standard"` gives the components of the correlation matrix, `"rows"` scales by the
+      range of the rows.
     **Returns:** `Components`.
-    **Raises:** `ValueError` for no ordered column, or more components than rows or columns.
+    **Raises:** `ValueError` if there is no ordered column, or fewer rows or columns than
+    components.
     """
     samples = Samples.of(source, which, columns, space)
     samples.need_ordered("principal component analysis")

@@ -50,11 +50,11 @@ DOUBT_OF_KEY = 1e-6
 
 @dataclass(frozen=True)
 class Rule:
-    """One box in the feature space, and how well it describes the failures.
+    """A box in the feature space, and how well it describes the failures.
 
-    **Fields:** `conditions`, which must all be fulfilled; `coverage`: share of the measured
-    failures inside; `precision`: how many of the measured rows inside fail, with its 95 %
-    Clopper-Pearson interval.
+    **Fields:** `conditions`, which must all hold; `coverage`: share of the held-out failures
+    inside; `precision`: the share of held-out rows inside that fail, with its 95 % Clopper-Pearson
+    interval.
     """
 
     conditions: tuple[Condition, ...]
@@ -63,7 +63,7 @@ class Rule:
     region: Region = field(repr=False)
 
     def matches(self, frame: pd.DataFrame) -> Bool[np.ndarray, " n"]:
-        """Return the rows of a table (any DataFrame with these features) that lie inside."""
+        """Return which rows of a table (any DataFrame with these features) lie inside."""
         inside = np.ones(len(frame), bool)
         for condition in self.conditions:
             inside &= condition.matches(frame)
@@ -71,7 +71,7 @@ class Rule:
 
     @property
     def words(self) -> str:
-        """The conditions alone."""
+        """The conditions as text."""
         return " and ".join(map(str, self.conditions)) or "everywhere"
 
     def __repr__(self) -> str:
@@ -87,8 +87,8 @@ class Rules(Drawn, InNotebook):
     """Rules that together describe where a system fails, the best one first.
 
     **Fields:** `rules`; `coverage` and `precision` of all of them together, 0 and None without a
-    rule; `unsupported`: how many further boxes the measured rows do not support; `measured`: how
-    many rows were kept aside; `doubt`: why precision is no rate of failure, empty if it is;
+    rule; `unsupported`: number of further boxes that the held-out rows do not support; `measured`:
+    number of held-out rows; `doubt`: why precision is not a failure rate, empty if it is;
     `samples`: all rows with a verdict.
     """
 
@@ -103,7 +103,7 @@ class Rules(Drawn, InNotebook):
     samples: Samples
 
     def matches(self, frame: pd.DataFrame) -> Bool[np.ndarray, " n"]:
-        """Return the rows of a table that lie inside any of the rules."""
+        """Return which rows of a table lie inside at least one rule."""
         inside = np.zeros(len(frame), bool)
         for rule in self.rules:
             inside |= rule.matches(frame)
@@ -111,7 +111,7 @@ class Rules(Drawn, InNotebook):
 
     @property
     def table(self) -> pd.DataFrame:
-        """One row a rule: its words, coverage and precision as measured."""
+        """One row for each rule: its text, and its coverage and precision on held-out rows."""
         columns: dict[str, list[Any]] = {name: [] for name in _COLUMNS}
         for rule in self.rules:
             rate = rule.precision
@@ -155,7 +155,7 @@ class Rules(Drawn, InNotebook):
 
     @property
     def basis(self) -> str:
-        """The rows that the numbers were measured on, and their meaning."""
+        """A description of the rows on which the numbers were measured, and of their meaning."""
         measured = f"measured on {self.measured:,} rows kept aside"
         if self.doubt:
             return f"({measured}; precision is no rate of failure: {self.doubt})"
@@ -179,23 +179,23 @@ def rules(
 
     **Arguments:**
     - `source`: a run, its table, a DataFrame, or `Samples` of `"all"` rows.
-    - `depth`: features that a rule has conditions on at most.
-    - `cover`: share of the failures to cover; `max_rules` rules at most.
-    - `held_out`: share of the rows that are kept aside to measure coverage and precision, drawn by
-      `seed` among failing and safe rows alike.
-    - `seed`: the seed of the rows kept aside.
-    **Returns:** `Rules`; with fewer than 10 failing or safe rows there are no rules, and the result
-    says so. Nor does it have a box in which fewer than 3 of the failing rows kept aside lie, or
-    failures are not clearly denser (by the interval of its precision) than everywhere. A condition
-    is left out where failures are not clearly denser inside than beyond it, on the rows kept aside
-    (Fisher's exact test at 0.3 %; at one in a million for whole numbers with 65 536 values or more,
-    which may be a random key).
+    - `depth`: maximum number of features with conditions in a rule.
+    - `cover`: share of the failures to cover; `max_rules`: maximum number of rules.
+    - `held_out`: share of the rows that are held out to measure coverage and precision, drawn by
+      `seed` separately among failing and safe rows.
+    - `seed`: the seed of the held-out rows.
+    **Returns:** `Rules`. With fewer than 10 failing or safe rows there are no rules, and the result
+    says so. A box is left out if it holds fewer than 3 held-out failures, or if failures in it are
+    not clearly denser than overall (by the interval of its precision). A condition is left out if
+    failures are not clearly denser inside than outside it, on the held-out rows (Fisher's exact
+    test at 0.3 %; at one in a million for whole numbers with 65 536 values or more, which may be a
+    random key).
 
-    A rule is chosen for the share of the remaining failures that it covers times the square of its
-    precision among the remaining rows, so that a precise half is worth more than a vague whole.
-    Sources: trees of Breiman, Friedman, Olshen and Stone, Classification and regression
-    trees (1984), whose theorem also gives the subsets of unordered values; rules one after another
-    as in Clark and Niblett, The CN2 induction algorithm, Machine Learning 3 (1989).
+    The next rule maximises the share of the remaining failures that it covers times the square of
+    its precision among the remaining rows, so that precise rules are preferred to broad ones.
+    Sources: trees of Breiman, Friedman, Olshen and Stone, Classification and regression trees
+    (1984), whose theorem also gives the subsets of unordered values; sequential rules as in Clark
+    and Niblett, The CN2 induction algorithm, Machine Learning 3 (1989).
 
     **Raises:** `ValueError` without failing or without safe rows, or for options out of range.
     """
@@ -270,9 +270,9 @@ def _doubt(source: Source) -> str:
 
 
 def check_both(samples: Samples, purpose: str) -> None:
-    """Check that there are failing and safe rows, which `purpose` needs.
+    """Check that there are failing and safe rows; `purpose` says in the error what needs them.
 
-    **Raises:** `ValueError` where there are not.
+    **Raises:** `ValueError` if one kind is missing.
     """
     failures = int(samples.failing.sum())
     if failures == 0:
@@ -290,7 +290,7 @@ def check_both(samples: Samples, purpose: str) -> None:
 def rows_set_aside(
     failing: Bool[np.ndarray, " n"], share: float, seed: int
 ) -> Bool[np.ndarray, " n"]:
-    """Draw rows to keep aside: the same share of failing and of safe ones."""
+    """Draw rows to hold out: the same share of failing and of safe ones."""
     aside = np.zeros(len(failing), bool)
     generator = np.random.default_rng(seed)
     for part in (failing, ~failing):

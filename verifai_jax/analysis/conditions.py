@@ -17,9 +17,9 @@ from verifai_jax.analysis.data.columns import Column
 
 @dataclass(frozen=True)
 class Between:
-    """Numbers above `above` and up to `upto`, which is included; `integer`: only whole ones.
+    """A condition on numbers: greater than `above`, at most `upto`; `integer` for whole numbers.
 
-    An absent entry never fulfils a condition.
+    An absent entry never satisfies a condition.
     """
 
     feature: str
@@ -28,7 +28,7 @@ class Between:
     integer: bool = False
 
     def matches(self, frame: pd.DataFrame) -> Bool[np.ndarray, " n"]:
-        """Return the rows that fulfil the condition."""
+        """Return which rows satisfy the condition."""
         values = frame[self.feature].to_numpy(np.float64)
         return (values > self.above) & (values <= self.upto)
 
@@ -44,7 +44,7 @@ class Between:
 
 @dataclass(frozen=True)
 class OneOf:
-    """Choices that are at the `indices` of a column's `choices`."""
+    """A condition on choices: one of those at `indices` of a column's `choices`."""
 
     column: Column
     indices: tuple[int, ...]
@@ -55,7 +55,7 @@ class OneOf:
         return self.column.name
 
     def matches(self, frame: pd.DataFrame) -> Bool[np.ndarray, " n"]:
-        """Return the rows that fulfil the condition."""
+        """Return which rows satisfy the condition."""
         return np.isin(self.column.codes(frame[self.feature]), self.indices)
 
     def __str__(self) -> str:
@@ -73,10 +73,10 @@ Condition: TypeAlias = Between | OneOf
 
 @dataclass(frozen=True)
 class Region:
-    """A box: bounds on the ordered columns, allowed choices of the unordered ones.
+    """A box: bounds on the ordered columns, and allowed choices of the unordered ones.
 
-    **Fields:** `above` and `upto`, one a column of `Samples.values()`, infinite where there is no
-    bound; `allowed`: for each column of `Samples.codes()` the indices allowed, None for all.
+    **Fields:** `above` and `upto`: one bound for each column of `Samples.values()`, infinite for no
+    bound; `allowed`: for each column of `Samples.codes()` the allowed indices, None for all.
     """
 
     above: tuple[float, ...]
@@ -86,7 +86,7 @@ class Region:
     def covers(
         self, values: Float[np.ndarray, "n k"], codes: Int[np.ndarray, "n m"]
     ) -> Bool[np.ndarray, " n"]:
-        """Return the rows that lie inside; absent entries only in columns without a condition."""
+        """Return which rows lie inside; absent entries only fit columns without a condition."""
         inside = np.ones(len(values), bool)
         for j, (above, upto) in enumerate(zip(self.above, self.upto, strict=True)):
             if np.isfinite(above):
@@ -106,7 +106,7 @@ class Region:
         return bounded + sum(allowed is not None for allowed in self.allowed)
 
     def bound(self, j: int, above: float = -np.inf, upto: float = np.inf) -> "Region":
-        """Return the part of the region with a further bound on ordered column `j`."""
+        """Return the part of the region that satisfies a further bound on ordered column `j`."""
         return replace(
             self,
             above=_put(self.above, j, max(self.above[j], above)),
@@ -114,13 +114,13 @@ class Region:
         )
 
     def restrict(self, j: int, indices: frozenset[int]) -> "Region":
-        """Return the part of the region with these choices of unordered column `j` only."""
+        """Return the part of the region with only these choices of unordered column `j`."""
         before = self.allowed[j]
         indices = indices if before is None else before & indices
         return replace(self, allowed=_put(self.allowed, j, indices))
 
     def loosen(self) -> list["Region"]:
-        """Return the regions with one bound or restriction less."""
+        """Return the regions that have one bound or restriction fewer."""
         found = []
         for j in range(len(self.above)):
             if np.isfinite(self.above[j]):
@@ -138,11 +138,11 @@ class Region:
         codes: Int[np.ndarray, "n m"],
         integer: Sequence[bool],
     ) -> "Region":
-        """Round the bounds to short numbers, so that the region covers the same of these rows.
+        """Round the bounds to short numbers such that the region covers the same of these rows.
 
         **Arguments:**
-        - `values` and `codes` of the rows.
-        - `integer`: for each ordered column, whether it holds whole numbers only.
+        - `values` and `codes`: those of the rows.
+        - `integer`: for each ordered column, whether it holds only whole numbers.
         """
         region = self
         for j in range(len(self.above)):

@@ -45,7 +45,7 @@ class Neighbours(Drawn, InNotebook):
 
     **Fields:** `rows` `[k]`: row numbers of the table; `distances` `[k]` of each from the centre,
     in the coordinates of `samples.points`, NaN for rows drawn at random; `centre`: the row around
-    which they lie, None if that is not a row; `how`: how they were chosen, as text.
+    which they lie, None if it is not a row; `how`: how they were chosen, as text.
     """
 
     _picture = "clusters", "plot_neighbours"
@@ -58,7 +58,7 @@ class Neighbours(Drawn, InNotebook):
 
     @cached_property
     def table(self) -> pd.DataFrame:
-        """The rows of the error table, with their `distance` (`distance_` if a feature is it)."""
+        """The rows of the error table with their `distance` (`distance_` if that name is taken)."""
         own = pd.DataFrame({"distance": self.distances}, index=pd.Index(self.rows))
         return with_columns(self.samples.at(self.rows), own)
 
@@ -80,18 +80,17 @@ def k_closest(
     scale: Scale = "range",
     space: Problem | FeatureSpace | None = None,
 ) -> Neighbours:
-    """Select the tightest group: a row and its `k - 1` nearest, of the least sum of distances.
+    """Select the tightest group: the row and `k - 1` nearest ones with the least sum of distances.
 
     **Arguments:**
     - `source`: a run, its table, a DataFrame with feature columns, or `Samples`.
-    - `columns`, `which`, `space`: as in `Samples.of`.
-      Unordered columns count 1 where they differ; VerifAI leaves them out and includes `rho`:
-      name the columns for that.
-    - `k`: how many; None or more than there are gives all.
+    - `columns`, `which`, `space`: as in `Samples.of`. Unordered columns count 1 if they differ; to
+      compare as VerifAI, which leaves them out and includes `rho`, name the columns.
+    - `k`: number of rows; all rows if None, or if there are fewer.
     - `scale`: as in `Samples.scaling`; `"rows"` is VerifAI's.
     **Returns:** `Neighbours`, the nearest first.
 
-    Takes about `n log n` steps over up to 20 ordered columns, `n^2` over more.
+    The time grows with `n log n` for up to 20 ordered columns, with `n^2` for more.
 
     **Raises:** `ValueError` for a `k` below 1.
     """
@@ -129,12 +128,12 @@ def nearest(
     - `source`: a run, its table, a DataFrame with feature columns, or `Samples`.
     - `columns`, `which`, `space`: as in `Samples.of`.
     - `point`: features (a mapping with all analysed columns, or a row of a table), or the number of
-      a row of the table, which need not be among those looked at.
-    - `k`: how many; all rows if there are no more.
+      any row of the table.
+    - `k`: number of rows; all rows if there are fewer.
     - `scale`: as in `Samples.scaling`.
     **Returns:** `Neighbours`, the nearest first.
-    **Raises:** `ValueError` for a `k` below 1, or a feature that is missing or none of the choices;
-    `IndexError` for a row number that is not in the table.
+    **Raises:** `ValueError` for a `k` below 1, or a feature that is missing or not one of the
+    choices; `IndexError` for a row number that is not in the table.
     """
     samples = Samples.of(source, which, columns, space)
     k = min(check_count("k", k), len(samples))
@@ -163,12 +162,12 @@ def random_rows(
     columns: Sequence[str] | None = None,
     space: Problem | FeatureSpace | None = None,
 ) -> Neighbours:
-    """Draw `k` different rows, each as likely as any other; all of them if there are no more.
+    """Draw `k` different rows with equal probability; all of them if there are fewer.
 
     **Arguments:**
     - `source`: a run, its table, a DataFrame with feature columns, or `Samples`.
     - `columns`, `which`, `space`: as in `Samples.of`.
-    - `k`: how many.
+    - `k`: number of rows.
     - `seed`: an integer, a NumPy generator or a `jax.random` key.
     **Returns:** `Neighbours`, in the order drawn.
     **Raises:** `ValueError` for a `k` below 1.
@@ -186,9 +185,9 @@ _ENTRIES = 20_000_000
 
 
 def tightest(coordinates: Float[np.ndarray, "n p"], codes: Int[np.ndarray, "n m"], k: int) -> int:
-    """Return the index of a row whose `k` nearest, itself included, have the least summed distance.
+    """Return the index of the row whose `k` nearest, including itself, have the least sum.
 
-    The squared distance is that of the coordinates plus the number of different codes.
+    The squared distance is that of the coordinates plus the number of differing codes.
     """
     # Equal rows are one with a weight: they would all lie in one leaf of a tree.
     joined = np.concatenate([coordinates, codes.astype(np.float64)], axis=1)

@@ -48,9 +48,9 @@ Conversions: TypeAlias = Mapping[tuple[str, str], tuple[float, float]]
 
 
 def convert(value: float, unit: str, to: str, own: Conversions | None = None) -> float:
-    """Return a number in another unit, by a conversion of the file's `own` if there is one.
+    """Convert a number to another unit, preferring the file's `own` conversions.
 
-    **Raises:** `ValueError` for units that do not go together.
+    **Raises:** `ValueError` for incompatible units.
     """
     one, other = plain_unit(unit), plain_unit(to)
     for (source, target), (scale, offset) in (own or {}).items():
@@ -68,13 +68,13 @@ def convert(value: float, unit: str, to: str, own: Conversions | None = None) ->
 class Attribute:
     """An attribute of a domain, and the feature that varies it.
 
-    - `name`: with the concepts above it, `dynamic.ego_speed`.
+    - `name`: its name with those of the concepts that contain it, `dynamic.ego_speed`.
     - `kind`: `"float"`, `"integer"`, `"boolean"`, `"string"` or `"literal"`.
-    - `literals`: its possible values, where they are listed.
-    - `groups`: of these, by names that conditions may use for them.
-    - `feature`: that stands for it; empty for none.
-    - `unit`: of the feature; by default the SI unit of what it measures.
-    - `reason`, `source`: why it is so, and who says so.
+    - `literals`: its possible values, if they are listed.
+    - `groups`: named groups of literals, which conditions may use.
+    - `feature`: the feature that varies it; empty for none.
+    - `unit`: the unit of the feature; by default the SI unit of its quantity.
+    - `reason`, `source`: the reason for its values, and the source of that.
     """
 
     name: str
@@ -88,20 +88,20 @@ class Attribute:
 
     @property
     def everything(self) -> Hull:
-        """All values that it can have."""
+        """All possible values of the attribute."""
         return frozenset(range(len(self.literals))) if self.literals else EVERYTHING
 
 
 @dataclass(frozen=True)
 class Test:
-    """An attribute within an interval, without its ends if `strict`, or among literals."""
+    """A test of one attribute: in an interval, without its ends if `strict`, or among literals."""
 
     attribute: str
     hull: Hull
     strict: bool = False
 
     def holds(self, x: np.ndarray | jax.Array) -> Truth:
-        """Return for each value whether it fulfils the test."""
+        """Return which values satisfy the test."""
         if isinstance(self.hull, frozenset):
             allowed: Truth = x != x
             for code in sorted(self.hull):
@@ -113,7 +113,7 @@ class Test:
 
 @dataclass(frozen=True)
 class Group:
-    """Conditions that must hold: `every` one, or any."""
+    """A group of conditions of which `every` one must hold, or at least one."""
 
     every: bool
     parts: "tuple[Condition, ...]"
@@ -121,7 +121,7 @@ class Group:
 
 @dataclass(frozen=True)
 class Reference:
-    """A condition that holds where another module holds."""
+    """A condition that holds if another module holds."""
 
     module: str
     holds: bool
@@ -132,14 +132,14 @@ Condition: TypeAlias = Test | Group | Reference
 
 @dataclass(frozen=True)
 class Module:
-    """A module: it holds if what it includes holds, and what it excludes does not."""
+    """A module; it holds if its included conditions hold and its excluded ones do not."""
 
     include: Group | None
     exclude: Group | None
     active: bool = True
 
     def conditions(self) -> Iterator[Condition]:
-        """Yield all conditions, groups and those in them."""
+        """Yield all conditions and groups, including nested ones."""
         left: list[Condition] = [each for each in (self.include, self.exclude) if each]
         while left:
             yield (each := left.pop())
@@ -147,7 +147,7 @@ class Module:
 
 
 def module_holds(name: str, values: Values, modules: Mapping[str, Module], unknown: bool) -> Truth:
-    """Return whether a module holds; `unknown` is what a missing value counts as."""
+    """Return whether a module holds; a missing value counts as `unknown`."""
     module = modules[name]
     found: Truth = True
     if module.include is not None:
@@ -177,7 +177,7 @@ def _not(truth: Truth) -> Truth:
 
 
 def hull_of(attribute: Attribute, module: str, modules: Mapping[str, Module]) -> Hull:
-    """Return the values that an attribute can have where a module holds, as an interval or set."""
+    """Return the values that an attribute can have if a module holds, as an interval or set."""
     found, each = attribute.everything, modules[module]
     if each.include is not None:
         found = both(found, _hull(attribute, each.include, modules))
@@ -202,7 +202,7 @@ def _hull(attribute: Attribute, each: Condition, modules: Mapping[str, Module]) 
 
 
 def both(one: Hull, other: Hull) -> Hull:
-    """Return what two intervals, or two sets, have in common."""
+    """Return the intersection of two intervals, or of two sets."""
     if isinstance(one, frozenset) or isinstance(other, frozenset):
         assert isinstance(one, frozenset) and isinstance(other, frozenset)  # noqa: PT018
         return one & other
@@ -240,7 +240,7 @@ def read_group(
 ) -> Group:
     """Read a section of conditions: a mapping from names to expressions.
 
-    **Raises:** `ValueError` for text that is not a condition, with the position.
+    **Raises:** `ValueError` for a text that is not a condition, with the position.
     """
     if not isinstance(section, Mapping) or not section:
         raise ValueError(f"{where} maps attributes to expressions; got {section!r}")
@@ -294,5 +294,5 @@ def _read_test(attribute: Attribute, value: object, conversions: Conversions) ->
 
 
 def written(value: object) -> str:
-    """Return a literal as a file writes it."""
+    """Return a literal as written in a file."""
     return str(value).lower() if isinstance(value, bool | np.bool_) else str(value)

@@ -39,12 +39,12 @@ Codes = dict[str, np.ndarray]
 class OddCoverage(Tabular):
     """Coverage of a domain, as `odd_coverage` measures it.
 
-    - `table`: one row an attribute: its `feature`, `inside` (what the domain allows), `cells`,
-      those `occupied` by a row, the shares of the domain's `volume` and of the prior's `mass` in
-      occupied cells. The mass is NaN where no prior is known.
-    - `pairs`: the same of pairs of attributes.
-    - `rows`, `outside`: rows, and those that are outside of the domain.
-    - `prior_inside`: share of the prior that is inside.
+    - `table`: one row for each attribute: its `feature`, `inside` (the values the domain allows),
+      `cells`, the number `occupied` by a row, and the shares of the domain's `volume` and of the
+      prior's `mass` in occupied cells. The mass is NaN if no prior is known.
+    - `pairs`: the same for pairs of attributes.
+    - `rows`, `outside`: number of rows, and of those outside the domain.
+    - `prior_inside`: share of the prior inside the domain.
     """
 
     domain: OperationalDomain = field(repr=False)
@@ -58,11 +58,12 @@ class OddCoverage(Tabular):
     _drawn: Codes = field(repr=False)
 
     def next_points(self, count: int = 10) -> pd.DataFrame:
-        """Return points inside the domain that occupy the most empty cells and pairs of cells.
+        """Return points inside the domain that occupy many empty cells and pairs of cells.
 
         **Arguments:**
         - `count`: number of points.
-        **Returns:** their features, a row each, with `new`, the cells and pairs that each occupies.
+        **Returns:** their features, a row each, with `new`, the number of cells and pairs that each
+        occupies first.
         """
         check_count("count", count)
         drawn = {name: codes[:CANDIDATES] for name, codes in self._drawn.items()}
@@ -115,16 +116,18 @@ class OddCoverage(Tabular):
 def odd_coverage(
     domain: OperationalDomain, source: Source, *, cells: int = 10, seed: int = 0
 ) -> OddCoverage:
-    """Measure how much of a domain rows cover: by attribute, by pairs, by volume, by prior mass.
+    """Measure how much of a domain rows cover: by attribute, pair, volume and prior mass.
 
     **Arguments:**
-    - `domain`: the domain; its attributes are cut into cells of equal width, not the features.
-    - `source`: a run, its table, or a DataFrame; all rows with a verdict.
-    - `cells`: cells of a range; an integer of up to 20 values and literals have one a value.
-    - `seed`: the seed of the points by which shares of a domain are measured whose conditions
-      couple attributes, and of those of the prior.
+    - `domain`: the domain; its attributes, not the features, are cut into cells of equal width.
+    - `source`: a run, its table, or a DataFrame; all rows with a verdict are used.
+    - `cells`: number of cells of a range; literals, and integers of up to 20 values, have a cell
+      for each value.
+    - `seed`: the seed of the points of the prior, and of those that measure shares of a domain
+      whose conditions couple attributes.
     **Returns:** an `OddCoverage`.
-    **Raises:** `ValueError` for no rows, and an attribute with a feature and without a range.
+    **Raises:** `ValueError` if there are no rows, and for an attribute that has a feature but no
+    range.
     """
     check_count("cells", cells, 2)
     samples = Samples.of(source, "all")

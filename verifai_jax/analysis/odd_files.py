@@ -39,14 +39,15 @@ KINDS = {"number": "float", "real": "float", "int": "integer", "bool": "boolean"
 
 
 def read_odd(path: str | Path) -> OperationalDomain:
-    """Read an operational design domain from a file of ASAM OpenODD 1.0, or one that names such.
+    """Read an operational design domain from a file of ASAM OpenODD 1.0, or a file that names one.
 
     Attributes are floats and integers with a unit, booleans and literals. A condition is a range,
     `"[0 .. 50] km/h"`, a comparison, a literal or a list of them, a group `AND` or `OR`, or a
-    module that holds or not. Units are converted into that of the feature.
+    module that must or must not hold. Values are converted to the unit of the feature.
 
     **Arguments:**
-    - `path`: the file. Without `features` each attribute is a feature of its last name.
+    - `path`: the file. Without an entry `features` each attribute is a feature, named by its last
+      part.
     **Raises:** `FileNotFoundError`; `ValueError` naming the entry, for any other file.
     """
     path = Path(path)
@@ -70,7 +71,7 @@ def read_odd(path: str | Path) -> OperationalDomain:
 def odd_of(
     space: FeatureSpace, name: str = "odd", units: Mapping[str, str] | None = None
 ) -> OperationalDomain:
-    """Return the domain that a space of features spans, for `write`.
+    """Return the domain spanned by a space of features, for `write`.
 
     **Raises:** `ValueError` for a feature that is neither a range nor a choice, and for a
     constraint.

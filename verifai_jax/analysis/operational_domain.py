@@ -35,10 +35,10 @@ from verifai_jax.features import Box, Categorical, DiscreteBox, Domain, FeatureS
 class OperationalDomain:
     """An operational design domain, as `read_odd` reads it.
 
-    - `name`: of the domain.
-    - `attributes`: in the order of the taxonomy.
-    - `modules`: by name; those of `roots` have to hold.
-    - `document`: the tree of the file, which `write` writes.
+    - `name`: the name of the domain.
+    - `attributes`: its attributes, in the order of the taxonomy.
+    - `modules`: its modules by name; those in `roots` have to hold.
+    - `document`: the tree of the file, from which `write` writes.
     """
 
     name: str
@@ -49,7 +49,7 @@ class OperationalDomain:
 
     @property
     def features(self) -> dict[str, odd_conditions.Attribute]:
-        """The attributes that features stand for, by feature."""
+        """The attributes that features vary, by feature."""
         return {each.feature: each for each in self.attributes if each.feature}
 
     @property
@@ -64,18 +64,18 @@ class OperationalDomain:
         return {name: ", ".join(filter(None, each)) for name, each in said.items() if any(each)}
 
     def hull(self, attribute: odd_conditions.Attribute) -> odd_conditions.Hull:
-        """Return the interval, or the indices of literals, that an attribute has inside."""
+        """Return the interval, or the indices of literals, of an attribute inside the domain."""
         hulls = (odd_conditions.hull_of(attribute, name, self.modules) for name in self.roots)
         return reduce(odd_conditions.both, hulls, attribute.everything)
 
     def holds(self, rows: pd.DataFrame | Mapping[str, Any]) -> Bool[np.ndarray, " n"]:
-        """Return which rows of features lie inside. What a row does not have is not asked for."""
+        """Return which rows of features lie inside; conditions on missing columns are ignored."""
         frame = rows if isinstance(rows, pd.DataFrame) else pd.DataFrame([dict(rows)])
         found = self._inside(self.values(frame))
         return np.broadcast_to(np.asarray(found, bool), len(frame))
 
     def values(self, frame: pd.DataFrame) -> dict[str, Float[np.ndarray, " n"]]:
-        """Return the values of attributes in rows of features; literals by index, -1 for others."""
+        """Return the attributes' values in rows of features; literals by index, -1 if unknown."""
         found = {}
         for name, each in self.features.items():
             if name not in frame:
@@ -97,7 +97,7 @@ class OperationalDomain:
 
     @property
     def is_box(self) -> bool:
-        """True if no condition couples attributes, so that each has its own values."""
+        """True if no condition couples attributes, so that the domain is a product."""
         each = [condition for name in self.roots for condition in self.modules[name].conditions()]
         groups = [condition for condition in each if isinstance(condition, odd_conditions.Group)]
         tests = [condition for condition in each if isinstance(condition, odd_conditions.Test)]
@@ -108,7 +108,7 @@ class OperationalDomain:
     def space(self) -> FeatureSpace:
         """Return the features, uniform over the domain.
 
-        **Raises:** `ValueError` for an attribute that the domain does not bound, or leaves empty.
+        **Raises:** `ValueError` for an attribute that the domain leaves unbounded or empty.
         """
         domains: dict[str, Domain] = {}
         for name, each in self.features.items():
@@ -131,7 +131,7 @@ class OperationalDomain:
         return self._inside(values)
 
     def coverage(self, source: Source, *, cells: int = 10, seed: int = 0) -> Any:
-        """Measure how much of the domain rows cover, as `odd_coverage.odd_coverage` does."""
+        """Measure how much of the domain rows cover; see `odd_coverage.odd_coverage`."""
         measure = lazy_import("verifai_jax.analysis.odd_coverage", "odd_coverage")
         return measure(self, source, cells=cells, seed=seed)
 
@@ -155,7 +155,7 @@ def choices_of(
 ) -> tuple[float, float] | list[str] | list[bool]:
     """Return the ends of an attribute's interval, or its literals.
 
-    **Raises:** `ValueError` for an interval without an end, and for nothing.
+    **Raises:** `ValueError` for an unbounded interval, and for an empty one.
     """
     if isinstance(hull, frozenset):
         found = [attribute.literals[code] for code in sorted(hull)]

@@ -50,7 +50,7 @@ TITLES = {
 
 @dataclass(frozen=True, eq=False)
 class Part:
-    """An analysis: `name`, `words` of it, `result`; None if it was skipped."""
+    """One analysis: `name`, text `words`, `result`; None if it was skipped."""
 
     name: str
     words: str
@@ -89,7 +89,7 @@ class Analysis(Drawn):
 
     @property
     def representatives(self) -> list[int]:
-        """Row numbers of failures that stand for a cluster each, the largest cluster first."""
+        """Row numbers of failures that each represent a cluster, the largest cluster first."""
         found = self["clusters"] if self.samples is not None else None
         if found is None:
             return []
@@ -98,14 +98,14 @@ class Analysis(Drawn):
 
     @property
     def table(self) -> pd.DataFrame:
-        """One row a feature: importance, range over the failures, cells covered."""
+        """One row for each feature: its importance, range over the failures, and cells covered."""
         return _features(self)
 
     def save(self, folder: str | Path) -> Path:
         """Write `report.md` and pictures to a folder; return the path of the report.
 
-        **Raises:** `OSError` for what the file system refuses, such as a folder whose name is
-        that of a file.
+        **Raises:** `OSError` if the file system refuses, for example because a file has the
+        folder's name.
         """
         path = Path(folder)
         lines = [f"# {html.escape(one_line(self.name))}", ""]
@@ -149,17 +149,17 @@ class Analysis(Drawn):
 def analyze(
     source: Run | ErrorTable | pd.DataFrame, *, seed: int = 0, progress: bool | None = None
 ) -> Analysis:
-    """Apply every analysis of the error table that fits it, and say why others do not.
+    """Apply every analysis that fits the error table, and say why others do not.
 
     **Arguments:**
     - `source`: a run, its table, or a DataFrame with feature columns.
-    - `seed`: the seed of everything that is drawn at random.
+    - `seed`: the seed of all random draws.
     - `progress`: whether to show one line of progress; see `core.display.progress` for the default.
     **Returns:** an `Analysis`.
 
-    Failures, rules, importance of features, clusters, principal components, frequent patterns,
-    coverage; nothing is simulated. More than 2000 failures are thinned out, by `seed`, before they
-    are clustered.
+    The analyses are: failures, rules, importance of features, clusters, principal components,
+    frequent patterns, coverage; nothing is simulated. If there are more than 2000 failures, 2000
+    drawn by `seed` are clustered.
 
     **Raises:** `TypeError` for another source.
     """

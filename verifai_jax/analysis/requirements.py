@@ -27,10 +27,10 @@ TAKEN = 16
 
 
 def simulated(problem: Problem, count: int = SIMULATED, seed: int = 0) -> tuple[Trace, ...]:
-    """Simulate a problem from its prior.
+    """Simulate samples of a problem's prior.
 
-    **Returns:** the traces that have a verdict, `count` at most.
-    **Raises:** as `falsify`; `ValueError` where no simulation has a verdict.
+    **Returns:** at most `count` traces that have a verdict.
+    **Raises:** the errors of `falsify`; `ValueError` if no simulation has a verdict.
     """
     run = falsify(problem, "uniform", count, seed=seed, confirm=False, progress=False)
     rows = np.flatnonzero(~np.isnan(run.table.all["rho"].to_numpy())).tolist()
@@ -48,11 +48,11 @@ def mine_by_search(
     confidence: float = 0.95,
     progress: bool | None = None,
 ) -> Mined:
-    """Find the tightest parameters that no search breaks: each counterexample loosens them.
+    """Find the tightest parameters that no search breaks; each counterexample loosens them.
 
     **Arguments:**
-    - `budget`: simulations in all. A search that finds nothing ends the work.
-    **Raises:** as `mine` and `falsify`.
+    - `budget`: simulations in all. A search that finds nothing ends the mining.
+    **Raises:** the errors of `mine` and `falsify`.
     """
     traces = list(simulated(problem, min(SIMULATED, budget), seed))
     spent, unbroken = len(traces), 0
@@ -76,10 +76,10 @@ def distinguish_by_search(
 ) -> Distinction:
     """Search for a simulation on which one of two formulas holds and the other does not.
 
-    Simulations from the prior are looked at first. Then each formula is asked to imply the other:
-    what breaks that tells them apart.
+    Simulations from the prior are tried first. Then `falsify` is applied to each formula implying
+    the other: a counterexample distinguishes them.
 
-    **Raises:** as `falsify`.
+    **Raises:** the errors of `falsify`.
     """
     source, end = f"a simulation of {problem.name}", problem.end
     some = simulated(problem, min(SIMULATED, budget), seed)

@@ -25,7 +25,7 @@ def propose_regions(
     unordered: tuple[Column, ...],
     depth: int,
 ) -> list[Region]:
-    """Propose parts of `start`: all nodes of trees that weigh failing rows as they are, or evenly.
+    """Propose parts of `start`: all nodes of trees with failing rows weighted evenly or not.
 
     The rows are those inside `start`.
     """

@@ -79,38 +79,39 @@ def estimate(
 
     A failure is a simulation that breaks a formula of the problem.
 
-    The prior is uniform on the unit cube, that is, the distributions of the features, given that
-    the constraint holds; a system's own randomness counts as well.
+    The prior is the distribution of the features, given that the constraint holds (uniform on the
+    unit cube, from which features are computed). If the system draws random numbers, the
+    probability is over these too.
 
     **Arguments:**
     - `problem`: the system with its feature space and formulas.
-    - `method`: `"monte_carlo"`, `"importance"`, `"splitting"` or `"surrogate"`; the first samples
-      choose when left out.
-    - `budget`: simulations at most, pilot and fit included.
-    - `batch`: simulations at once; by default as many as the method asks for at a time.
+    - `method`: `"monte_carlo"`, `"importance"`, `"splitting"` or `"surrogate"`; when left out, it
+      is chosen from the first samples.
+    - `budget`: maximum number of simulations, including those of pilot runs and fits.
+    - `batch`: simulations at once; by default as many as the method needs at a time.
     - `seed`: the same seed gives the same estimate on the same machine.
     - `confidence`: the confidence of the interval and of the bound, between 0 and 1.
-    - `p0`: a wanted upper limit of the probability, between 0 and 1; the result says whether it is
-      shown, and how many further simulations without a failure would show it.
+    - `p0`: an upper limit of the probability to be shown, between 0 and 1; the result says whether
+      it is shown, and otherwise how many more simulations without a failure would show it.
     - `precision`, `backend`: as in `falsify`.
-    - `max_seconds`: wall-clock seconds after which finished simulations give the estimate.
+    - `max_seconds`: wall-clock seconds after which the estimate is made from finished simulations.
     - `progress`: True draws a progress bar, False none; None draws one on a terminal and in a
       notebook.
-    - `executor`: whose workers simulate, as in `falsify`; the estimate is the same.
-    - `simulations_are`: `"slow"` for a few hundred simulations: the method is then `"surrogate"`,
-      which spends arithmetic to save them. `"auto"` takes it for a black box of which a simulation
-      takes half a second or longer, if the budget is 200 or more.
-    - `within`: with slow simulations, the factor from the estimate to the ends of the interval at
-      which they may end before the budget, such as 1.5.
-    - `cheap`: a cheap model of the same features, which says where failures may be. It is simulated
-      some 100 000 times; every claim rests on simulations of `problem` alone. Simulations are
-      `"slow"` then, and end at `within=1.5` where nothing else is said.
-    - `proved`: what `verify` found of this problem, or the file of it. Where it showed that no
-      point fails, or that all do, nothing is estimated, and all simulations are of the rest.
+    - `executor`: an executor whose workers simulate, as in `falsify`; the estimate is the same.
+    - `simulations_are`: `"slow"` if only a few hundred simulations are affordable: the method is
+      then `"surrogate"`, which computes more to simulate less. `"auto"` assumes this for a black
+      box whose simulation takes at least half a second, if the budget is 200 or more.
+    - `within`: for slow simulations: stop before the budget is spent once the ends of the interval
+      lie within this factor of the estimate, such as 1.5.
+    - `cheap`: a cheap model of the same features, which shows where failures may be. It is
+      simulated some 100 000 times; every claim rests on simulations of `problem` alone.
+      `simulations_are` is then `"slow"`, and `within` 1.5 by default.
+    - `proved`: the result of `verify` for this problem, or its file. Where it proved that no point
+      fails, or that all do, nothing is estimated; all simulations are in the rest of the space.
     **Returns:** the estimate with its interval and a guaranteed bound. Ctrl-C gives the estimate
     from the finished simulations. A simulation without a verdict (not finite, raised, out of time)
-    is no failure in the estimate, and counts as one at the upper ends of interval and bound.
-    **Raises:** before anything compiles, `TypeError` for something that is no `Problem`, and
+    counts as safe in the estimate, and as a failure at the upper ends of interval and bound.
+    **Raises:** before anything compiles, `TypeError` for an argument that is no `Problem`, and
     `ValueError` for options out of range, unknown names, a problem whose parts do not fit, a
     constraint that refuses every sample, or a verification of another problem.
     """
@@ -330,7 +331,7 @@ def _with_decided(found: Estimate, rest: "Rest", limit_state: LimitState, seed: 
 def one_thread() -> AbstractContextManager[object]:
     """Limit linear algebra to one thread.
 
-    Small matrices take ten times as long on threads that other work keeps waiting.
+    Small matrices take ten times as long on several threads if other work occupies the cores.
     """
     try:
         from threadpoolctl import threadpool_limits

@@ -51,23 +51,24 @@ def sequence(
 ) -> SequenceEstimate:
     """Estimate how often a sequence of scenarios fails, part by part.
 
-    Samples of the first part come from its prior. Each of them that does not fail gives one sample
-    of the next part: it begins with the values that `handover` names, its other features are drawn
-    from their own prior. So the samples of a part are independent, its interval is the exact one of
-    Clopper and Pearson, and the product of the intervals is one of the whole (Bonferroni).
+    Samples of the first part come from its prior. Each sample that does not fail starts one sample
+    of the next part: the features named in `handover` take their values from it, the others are
+    drawn from their own prior. So the samples of a part are independent, its interval is the exact
+    one of Clopper and Pearson, and the product of the intervals covers the whole sequence
+    (Bonferroni).
 
-    The verdicts of a `Run` are used again. Those of the first part are samples of it as they are.
-    Those of the last part began elsewhere: each sample takes the verdict of the nearest beginning
-    among the run's rows, which weighs rows by how often the sequence comes there. That interval is
-    approximate, and a note says so. Where rows have ended is not stored, so rows of the first part
-    are simulated again for it, and parts in between are simulated.
+    The verdicts of a `Run` are reused. Rows of the first part are already samples of it. Rows of
+    the last part started from other values: each sample takes the verdict of the row with the
+    nearest start, so rows are weighted by how often the sequence reaches them. That interval is
+    approximate, and a note says so. Final states are not stored, so rows of the first part are
+    simulated again to obtain them, and parts in between are always simulated.
 
     **Arguments:**
     - `parts`: problems, or runs with `search="uniform"`, in their order.
-    - `handover`: for a feature of a part, the signal of the part before whose last value it begins
-      with (`"x"`, or `"position[1]"`), or the feature of that part that it keeps. One for all
-      joints, or one for each.
-    - `samples`: of the first part.
+    - `handover`: a dictionary from a feature of a part to the signal of the previous part whose
+      last value it takes (`"x"`, or `"position[1]"`), or to the feature of that part whose value it
+      keeps. Give one dictionary for all transitions, or one for each.
+    - `samples`: samples of the first part.
     - `confidence`: the confidence of all intervals together.
     - `seed`: the seed of samples and random keys.
     - `batch`: simulations at once.
@@ -75,7 +76,7 @@ def sequence(
     - `progress`: whether to show one line of progress; see `core.display.progress` for the default.
     **Returns:** a `SequenceEstimate`.
     **Raises:** before anything is simulated, `ValueError` for fewer than two parts, for a run whose
-    rows are no samples of the prior and for numbers out of range; `UnknownNameError` for features
+    rows are not samples of the prior and for numbers out of range; `UnknownNameError` for features
     and signals that do not exist.
     """
     check_count("samples", samples)

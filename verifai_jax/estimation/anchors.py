@@ -38,22 +38,23 @@ Around: TypeAlias = tuple[Gaussian, Gaussian, *tuple[Gaussian | Marginals, ...]]
 
 
 class WeightedFailures(NamedTuple):
-    """Failures `z` `[n, d]`, and the part `[n]` of their distribution that each stands for."""
+    """Failures `z` `[n, d]`, and the share `[n]` of their distribution that each represents."""
 
     z: Float[np.ndarray, "n d"]
     weight: Float[np.ndarray, " n"]
 
     def of(self, rows: Bool[np.ndarray, " n"]) -> "WeightedFailures":
-        """Return some of them."""
+        """Return the failures at these indices."""
         return WeightedFailures(self.z[rows], self.weight[rows])
 
 
 @dataclass(frozen=True)
 class Anchors:
-    """Components around the regions that explorations found, one part of every proposal.
+    """Mixture components around the regions that explorations found, kept in every proposal.
 
-    Regions have about equal parts, so that samples of this mixture say how probable each of them
-    is, whatever the first ones said; and a region keeps its own, however small it turns out.
+    Regions have about equal shares, so that samples of this mixture tell how probable each region
+    is, whatever earlier samples said. A region keeps its share even if it turns out to be
+    improbable.
 
     - `chains`: all explorations together.
     - `regions`: the chains of each region.
@@ -65,10 +66,9 @@ class Anchors:
     defensive: float
 
     def fit(self, samples: WeightedFailures | None = None) -> Mixture:
-        """Fit the components to the states of chains, and to samples where there are any.
+        """Fit the components to the states of chains, and to samples if there are any.
 
-        **Returns:** the mixture; for every fit it has the same kinds of components in the same
-        order.
+        **Returns:** the mixture; every fit has the same kinds of components in the same order.
         """
         d, of_chain = self.chains.nearest.shape[1], weigh_chains(self.chains)
         fitted = list(self._by_chains)
@@ -137,7 +137,7 @@ def _span(normals: Float[np.ndarray, "m d"]) -> Float[np.ndarray, "d p"] | None:
 
 
 def anchors_of(explorations: Sequence[Exploration], defensive: float) -> Anchors:
-    """Return the anchors of explorations: their regions, the least distant ones if many."""
+    """Return the anchors of explorations: their regions; of many, those nearest to the origin."""
     joined = join_explorations(explorations)
     return Anchors(joined, tuple(_regions(joined)[:MAX_CENTRES]), defensive)
 
@@ -178,6 +178,6 @@ def _regions(exploration: Exploration) -> list[Int[np.ndarray, " chains"]]:
 
 
 def weigh_chains(exploration: Exploration) -> Float[np.ndarray, " m"]:
-    """Weigh chains by the prior at their least distant failure, tempered and bounded below."""
+    """Weight chains by the prior at their failure nearest to the origin, bounded below."""
     norms = np.sum(exploration.nearest**2, axis=1)
     return np.maximum(np.exp((norms.min() - norms) / 4), MIN_WEIGHT)

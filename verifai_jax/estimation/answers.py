@@ -30,13 +30,13 @@ Cheap: TypeAlias = Callable[[Float[np.ndarray, "n d"]], Float[np.ndarray, " n"]]
 
 @dataclass(frozen=True)
 class Plan:
-    """Requirements of an answer.
+    """Requirements on an answer.
 
     - `confidence`: the confidence of the interval and the bound.
-    - `chains`: splitting chains of a level.
-    - `clamped`: True at coordinates whose domain ends in an outermost value.
-    - `within`: factor from the estimate to an end of the interval that is short enough; None to
-      spend the budget.
+    - `chains`: number of splitting chains in a level.
+    - `clamped`: True at coordinates whose domain has an outermost value.
+    - `within`: factor from the estimate to the ends of the interval at which to stop; None to spend
+      the whole budget.
     - `cheap`: the robustness of a cheap model at points of the unit cube; None without one.
     """
 
@@ -78,14 +78,14 @@ class Answer:
 
 
 def chains_for(budget: int, share: float) -> int:
-    """Return the chains of a level that takes this share of the budget, in multiples of 32."""
+    """Return the number of chains for a level with this share of the budget, a multiple of 32."""
     return 32 * max(1, round(budget * share / CHAIN / 32))
 
 
 def estimate_by_monte_carlo(
     limit_state: LimitState, rng: np.random.Generator, plan: Plan
 ) -> Answer:
-    """Estimate by Monte Carlo with all simulations that are left."""
+    """Estimate by Monte Carlo with all remaining simulations."""
     return monte_carlo_answer(monte_carlo.sample_prior(limit_state, rng, limit_state.left), plan)
 
 
@@ -213,10 +213,10 @@ def splitting_answer(
     runs: list[SplittingRun],
     counts: Counts,
 ) -> Answer:
-    """Answer by the mean of these runs and of as many more as the budget allows.
+    """Answer with the mean of these runs and of as many more as the budget allows.
 
-    Where the first level of each is that of the failures, it counts samples of the prior: these
-    are counted, since that is more precise, and certain where all of them fail.
+    If the first level of each run already consists of failures, the runs only count samples of the
+    prior. Then these are counted, which is more precise, and exact if all of them fail.
     """
     if all(run.levels == [-np.inf] for run in runs):
         counts = counts + monte_carlo.sample_prior(limit_state, rng, limit_state.left)
@@ -266,7 +266,7 @@ def splitting_answer(
 def bound_answer(
     limit_state: LimitState, rng: np.random.Generator, plan: Plan, run: SplittingRun, counts: Counts
 ) -> Answer:
-    """Answer by a bound alone: the simulations that are left sample the prior."""
+    """Answer with a bound only: the remaining simulations sample the prior."""
     reached = float(np.prod(run.fractions)) if run.fractions else 1.0
     level = run.levels[-1] if run.levels else np.inf
     why = {
@@ -290,7 +290,7 @@ def bound_answer(
 
 
 def bound_from_pilot(limit_state: LimitState, plan: Plan) -> Answer:
-    """Answer by the pilot samples of the prior that were finished before an early end."""
+    """Answer from the pilot samples of the prior that were finished before an early end."""
     answer = monte_carlo_answer(Counts(*limit_state.pilot), plan)
     answer.notes.insert(0, f"ended early ({limit_state.ended})")
     return answer

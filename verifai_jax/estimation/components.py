@@ -24,7 +24,7 @@ class Component(Protocol):
         ...
 
     def log_ratio(self, z: Float[np.ndarray, "n d"]) -> Float[np.ndarray, " n"]:
-        """Return the logarithm of this density over the standard normal one."""
+        """Return the logarithm of this density divided by the standard normal one."""
         ...
 
 
@@ -55,7 +55,7 @@ class Gaussian:
     stds: Float[np.ndarray, " d"]
 
     def widened(self, factor: float) -> "Gaussian":
-        """Return it with standard deviations below the prior's enlarged, up to the prior's."""
+        """Return it with standard deviations below the prior's enlarged towards the prior's."""
         stds = np.where(self.stds < 1, np.minimum(factor * self.stds, 1.0), self.stds)
         return Gaussian(self.mean, self.axes, stds)
 
@@ -74,7 +74,7 @@ class Marginals:
     """Independent coordinates, each the prior times a step function of the coordinate.
 
     - `edges`: for each coordinate, borders of the steps in normal space, from -inf to inf.
-    - `log_steps`: for each coordinate, logarithms of the density over the prior's.
+    - `log_steps`: for each coordinate, logarithms of the density divided by the prior's.
     - `masses`: for each coordinate, probabilities of the steps.
     """
 
@@ -100,7 +100,7 @@ class Marginals:
 
 @dataclass(frozen=True)
 class Copula:
-    """Coordinates with given marginals, dependent as those of a normal vector.
+    """A density with given marginals and the dependence of a normal vector.
 
     - `marginals`: densities of the coordinates.
     - `axes`: eigenvectors of the correlation matrix, one a column.
@@ -152,7 +152,7 @@ def rank_scores(marginals: Marginals, z: Float[np.ndarray, "n d"]) -> Float[np.n
 
 @dataclass(frozen=True)
 class Shell:
-    """A density alike in every direction, with the prior's distance times a step function.
+    """A rotationally symmetric density: the prior times a step function of the distance.
 
     - `dim`: number of coordinates.
     - `steps`: the step function over normal scores of the distance from the origin.
@@ -201,7 +201,7 @@ def _between(low: np.ndarray, high: np.ndarray, uniform: np.ndarray) -> np.ndarr
 def log_ratios(
     components: Sequence[Component], z: Float[np.ndarray, "n d"]
 ) -> Float[np.ndarray, "n k"]:
-    """Return logarithms of each component's density over the prior's, cut where they overflow."""
+    """Return logarithms of each component's density over the prior's, clipped to be finite."""
     if not len(z):
         return np.zeros((0, len(components)))
     columns = [np.clip(component.log_ratio(z), -700, 700) for component in components]

@@ -36,8 +36,8 @@ class ControlledMean(NamedTuple):
 class Control:
     """The surrogate as a control variate of the samples of a proposal.
 
-    How often it sees a failure is known from samples that cost nothing; what simulations have to
-    tell is how often it is wrong. Where that is too often, they are taken by themselves.
+    How often it predicts a failure is known from samples that need no simulation; simulations only
+    tell how often it is wrong. If it is wrong too often, the simulations are used alone.
     """
 
     def __init__(
@@ -55,11 +55,11 @@ class Control:
             self.mean, self.error = float(weights.mean()), float(weights.std() / len(z) ** 0.5)
 
     def sees(self, z: Float[np.ndarray, "n d"]) -> Bool[np.ndarray, " n"]:
-        """Return where the surrogate sees a failure that the constraint accepts."""
+        """Return where the surrogate predicts a failure that the constraint accepts."""
         return (self._surrogate.predict(z)[0] < 0) & self._accepts(z)
 
     def estimate(self, samples: ImportanceSamples, confidence: float) -> ControlledMean:
-        """Return the better one of the two means of samples."""
+        """Return the more precise of the two means of samples."""
         mean = samples.mean
         low, high = samples.interval(confidence)
         alone = ControlledMean(mean.mean, mean.cv, low, high)

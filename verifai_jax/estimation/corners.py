@@ -30,18 +30,18 @@ def approach_corner(
     planes: int = PLANES,
     halvings: int = HALVINGS,
 ) -> tuple[Float[np.ndarray, "n d"], list[Float[np.ndarray, "_ d"]]]:
-    """Move failures to the least distant ones near them, by all their tangent planes together.
+    """Move failures to nearby ones closest to the origin, using all their tangent planes.
 
-    The way to the point that all planes allow is followed as far as it fails. What ends it there is
-    the next plane.
+    The path to the closest point that all planes allow is followed as long as it fails. Where it
+    stops failing, the next plane is added.
 
     **Arguments:**
-    - `limit_state`: one with gradients.
-    - `z`: failures.
-    - `planes`: planes of a failure, at most.
-    - `halvings`: halvings of each way.
-    **Returns:** failures, none farther from the origin than its start, and the unit normals of the
-    planes of each.
+    - `limit_state`: a limit state with gradients.
+    - `z`: the failures.
+    - `planes`: maximum number of planes of a failure.
+    - `halvings`: number of bisection steps on each path.
+    **Returns:** failures, none farther from the origin than its start, and the unit normals of each
+    failure's planes.
     """
     best, beyond, rows = z.copy(), z.copy(), np.arange(len(z))
     touching: list[list[tuple[Float[np.ndarray, " d"], float]]] = [[] for _ in z]
@@ -69,7 +69,7 @@ def approach_corner(
 
 
 def cost_of_corner(planes: int = PLANES, halvings: int = HALVINGS) -> int:
-    """Return the simulations that a failure takes, at most."""
+    """Return the maximum number of simulations for one failure."""
     return planes * (halvings + 3)
 
 

@@ -58,11 +58,12 @@ from which the next one goes the same way."""
 
 @dataclass(frozen=True)
 class Ends:
-    """Failures where descents ended.
+    """Failures at which descents ended.
 
     - `points`: the failures `[n, d]`.
-    - `feet`: the point `[n, d]` nearest to the origin of the plane that touches the limit state
-      there, where there are gradients; descents to one flat region share it. Else the failure.
+    - `feet`: for each failure, the point `[n, d]` nearest to the origin on the tangent plane of the
+      limit state there, if there are gradients; descents to one flat region share it. Otherwise the
+      failure itself.
     """
 
     points: Float[np.ndarray, "n d"]
@@ -70,13 +71,13 @@ class Ends:
 
     @cached_property
     def planes(self) -> Float[np.ndarray, "n coordinates"]:
-        """Points as near to one another as the tangent planes are alike."""
+        """Points whose distances reflect how similar the tangent planes are."""
         return _planes(self.feet)
 
 
 @dataclass
 class Descents:
-    """Descents side by side: their points, scores, and slopes where there are gradients."""
+    """Simultaneous descents: their points, scores, and slopes if there are gradients."""
 
     z: Float[np.ndarray, "n d"]
     score: Float[np.ndarray, " n"]
@@ -85,7 +86,7 @@ class Descents:
 
     @property
     def feet(self) -> Float[np.ndarray, "n d"]:
-        """The points of the linearised limit state nearest to the origin, or `z` without one."""
+        """The points nearest to the origin on the linearised limit state; `z` without gradients."""
         square = np.sum(self.gradient * self.gradient, axis=1)
         known = np.isfinite(self.rho) & (square > 0)
         inner = np.sum(self.gradient * self.z, axis=1) - np.where(known, self.rho, 0.0)
@@ -93,20 +94,20 @@ class Descents:
         return np.where(known[:, None], foot, self.z)
 
     def of(self, rows: Int[np.ndarray, " m"]) -> "Descents":
-        """Return some of them."""
+        """Return the descents at these indices."""
         return Descents(self.z[rows], self.score[rows], self.rho[rows], self.gradient[rows])
 
     def replace(self, rows: Int[np.ndarray, " m"], others: "Descents") -> None:
-        """Put others in the place of some of them."""
+        """Replace the descents at these indices by others."""
         self.z[rows], self.score[rows] = others.z, others.score
         self.rho[rows], self.gradient[rows] = others.rho, others.gradient
 
 
 def descend_from_many(limit_state: LimitState, rng: np.random.Generator, simulations: int) -> Ends:
-    """Descend from as many starts as the simulations allow, a few more at most.
+    """Descend from as many starts as the simulations allow; the number may be exceeded slightly.
 
     **Returns:** the failures; empty if no descent found one.
-    **Raises:** `Ended` where time is over.
+    **Raises:** `Ended` when the time is over.
     """
     begin = limit_state.simulations
     share = DRAWN if limit_state.gradient is None else DRAWN_WITH_SLOPES
@@ -146,7 +147,7 @@ def descend_from_many(limit_state: LimitState, rng: np.random.Generator, simulat
 
 
 def begin_descents(limit_state: LimitState, z: Float[np.ndarray, "n d"]) -> Descents:
-    """Simulate points that the constraint accepts, with their slopes where there are gradients."""
+    """Simulate points that the constraint accepts, with their slopes if there are gradients."""
     if limit_state.gradient is not None:
         return Descents(z, *limit_state.linearize(z))
     return Descents(z, limit_state(z).score, np.full(len(z), np.nan), np.zeros_like(z))
@@ -155,7 +156,7 @@ def begin_descents(limit_state: LimitState, z: Float[np.ndarray, "n d"]) -> Desc
 def draw_starts(
     limit_state: LimitState, rng: np.random.Generator, count: int
 ) -> Float[np.ndarray, "n d"]:
-    """Draw starts that the constraint accepts; fewer where it refuses nearly all."""
+    """Draw starts that the constraint accepts; fewer if it refuses nearly all."""
     accepted = np.zeros((0, limit_state.dim))
     for _ in range(20):
         spread = rng.uniform(0.5, WIDEST, (count, 1))
@@ -178,9 +179,9 @@ def _planes(feet: Float[np.ndarray, "n d"]) -> Float[np.ndarray, "n coordinates"
 
 
 def points_ahead(limit_state: LimitState, descents: Descents) -> Float[np.ndarray, "n d"]:
-    """Return where the slope at each point says that the limit state is; the point without one.
+    """Return where the slope at each point predicts the limit state; without it, the point itself.
 
-    It is looked for no farther than one step leads.
+    The prediction is limited to the length of one step.
     """
     direction, norm, rows = _downhill(limit_state, descents)
     steps = np.zeros_like(descents.z)

@@ -76,16 +76,15 @@ class FlattenedFeatures(FeatureSpace):
 class DoublePrecisionEvaluator:
     """An evaluator of points in double precision; see the module's docstring.
 
-    `clamped` is True at coordinates `[d]` whose domain ends in one outermost value, which hides
-    everything beyond it from a simulation. `uniform` is True at those of which the features are
-    linear functions.
+    `clamped` is True at coordinates `[d]` whose domain has an outermost value, beyond which a
+    simulation cannot see. `uniform` is True at coordinates on which the features depend linearly.
 
     **Arguments:**
-    - `problem`: a checked one, on the backend that it is to run on.
+    - `problem`: a checked problem, on the backend on which it should run.
     - `batch`: simulations at once.
     - `precision`: the precision of the simulations, `"float32"` or `"float64"`.
     - `seed`: the seed of the random keys of simulations; as in `falsify`.
-    - `executor`: whose workers simulate; this process when left out.
+    - `executor`: an executor whose workers simulate; this process when left out.
     """
 
     def __init__(
@@ -124,7 +123,7 @@ class DoublePrecisionEvaluator:
         return verdicts.lowest, verdicts.violated, verdicts.proper
 
     def begin(self, u: Float[np.ndarray, "n d"]) -> Sent | None:
-        """Send points to the workers of the executor, if there is one, to be waited for later."""
+        """Send points to the executor's workers, if there is one; results are fetched later."""
         return self._evaluator.begin(self._plain(u)) if self._sends else None
 
     def gradient(
@@ -135,10 +134,10 @@ class DoublePrecisionEvaluator:
         Bool[np.ndarray, " n"],
         Float[np.ndarray, "n d"],
     ]:
-        """Evaluate points, and differentiate their robustness by the coordinates of the cube.
+        """Evaluate points, and differentiate their robustness with respect to the unit cube.
 
-        The derivative is that of the smooth robustness at a temperature so low that only ties
-        between predicates are smoothed.
+        It differentiates the smooth robustness at so low a temperature that only ties between
+        predicates are smoothed.
         """
         if self._differentiated is None:
             self._differentiated = Evaluator(
@@ -154,7 +153,7 @@ class DoublePrecisionEvaluator:
     def held(
         self, u: Float[np.ndarray, "n d"], numbers: Int[np.ndarray, " n"]
     ) -> tuple[Float[np.ndarray, " n"], Bool[np.ndarray, " n"], Bool[np.ndarray, " n"]]:
-        """Evaluate points, each with the random key of an earlier simulation by its number."""
+        """Evaluate points, each with the random key of the earlier simulation with this number."""
         verdicts = self._held_keys(self._plain(u), numbers)
         return verdicts.lowest, verdicts.violated, verdicts.proper
 
@@ -227,9 +226,9 @@ class DoublePrecisionEvaluator:
 
 
 class HeldKeys:
-    """Evaluates points with random keys of a run by their numbers; those of `Evaluator`.
+    """An evaluator of points with the random keys of earlier simulations, given by their numbers.
 
-    **Arguments:** as of `Evaluator`.
+    **Arguments:** those of `Evaluator`.
     """
 
     def __init__(

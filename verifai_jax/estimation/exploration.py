@@ -73,12 +73,12 @@ COMPARED, MAX_COMPARED = 0.4, 512
 class Exploration:
     """Failures found by independent chains.
 
-    - `points`: failures `[n, d]`, several of each chain.
+    - `points`: failures `[n, d]`, several for each chain.
     - `chain_ids`: the chain `[n]` of each.
     - `nearest`: for each chain the failure `[m, d]` nearest to the origin.
     - `regions`: for each chain the number `[m]` of its region.
     - `normals`: for each chain the unit normals `[_, d]` of planes that touch its region near its
-      least distant failure; empty without gradients.
+      failure nearest to the origin; empty without gradients.
     """
 
     points: Float[np.ndarray, "n d"]
@@ -89,12 +89,12 @@ class Exploration:
 
 
 def explore(limit_state: LimitState, rng: np.random.Generator, simulations: int) -> Exploration:
-    """Search for failures, by descents and by chains among what they find.
+    """Search for failures with descents, and with chains that start from what these find.
 
     **Arguments:**
-    - `simulations`: number of them, about.
+    - `simulations`: approximate number of simulations.
     **Returns:** the failures; empty if no descent found one.
-    **Raises:** `Ended` where time is over.
+    **Raises:** `Ended` when the time is over.
     """
     begin = limit_state.simulations
     ends = descend_from_many(limit_state, rng, round(DESCENTS * simulations))
@@ -230,7 +230,7 @@ def _joined(
 
 
 def spread_out(ends: Ends, maximum: int) -> Int[np.ndarray, " k"]:
-    """Return ends far from one another, the least distant first; no two that are one."""
+    """Return ends that are distinct and far from one another, nearest to the origin first."""
     everything = np.arange(len(ends.points))
     nearest = int(np.linalg.norm(ends.points, axis=1).argmin())
 

@@ -37,7 +37,7 @@ CELLS = 48
 
 
 def effective_size(weight: Float[np.ndarray, " n"]) -> float:
-    """Return the number of equally weighted points that these weights are worth."""
+    """Return the effective number of equally weighted points for these weights."""
     maximum = weight.max(initial=0.0)
     if not maximum > 0:
         return 0.0
@@ -49,11 +49,11 @@ def effective_size(weight: Float[np.ndarray, " n"]) -> float:
 def weigh_together(
     states: int, worth: float, weight: Float[np.ndarray, " n"]
 ) -> Float[np.ndarray, " k"]:
-    """Weigh states of chains and weighted samples of the same failures, each for its worth.
+    """Weight states of chains and weighted samples of the same failures by their information.
 
     **Arguments:**
-    - `states`: number of states, which are alike and so worth less than they count.
-    - `worth`: independent points that all of them are worth.
+    - `states`: number of states; they are correlated, and so worth less than their number.
+    - `worth`: number of independent points that all of them are worth.
     - `weight`: the weight of the samples.
     **Returns:** weights of the states, then of the samples; the more the samples are worth, the
     less the states count.
@@ -66,10 +66,10 @@ def weigh_together(
 def fit_gaussian(
     z: Float[np.ndarray, "n d"], weight: Float[np.ndarray, " n"], worth: float = 1.0
 ) -> Gaussian:
-    """Fit a Gaussian; its covariance departs from the prior's only beyond sampling noise.
+    """Fit a Gaussian whose covariance differs from the prior's only beyond sampling noise.
 
-    Eigenvalues within the range that those of white noise have (Marchenko and Pastur, 1967) are
-    replaced by their mean.
+    Eigenvalues within the range of white noise (Marchenko and Pastur, 1967) are replaced by their
+    mean.
     """
     d = z.shape[1]
     size = max(effective_size(weight) * worth, 1.0)
@@ -101,7 +101,8 @@ def fit_diagonal(
 ) -> Gaussian:
     """Fit a Gaussian without correlations, a little wider than the points.
 
-    A coordinate that differs from the prior's by no more than sampling noise is the prior's.
+    A coordinate that differs from the prior by no more than sampling noise keeps the prior's
+    distribution.
     """
     size = max(effective_size(weight) * worth, 2.0)
     mean = weight @ z
@@ -118,7 +119,7 @@ def fit_across(
     directions: Float[np.ndarray, "d p"],
     worth: float = 1.0,
 ) -> Gaussian:
-    """Fit a Gaussian in orthonormal directions, a little wider; across them it is the prior."""
+    """Fit a slightly widened Gaussian in orthonormal directions; across them it is the prior."""
     within = fit_gaussian(z @ directions, weight, worth)
     others = np.linalg.qr(directions, mode="complete")[0][:, directions.shape[1] :]
     axes = np.concatenate([directions @ within.axes, others], axis=1)
@@ -193,7 +194,7 @@ def fit_copula(
     steps: Marginals,
     worth: float = 1.0,
 ) -> Copula | None:
-    """Join marginals by the correlations beyond sampling noise; None if there are none."""
+    """Join marginals by those correlations that exceed sampling noise; None if there are none."""
     d, size = z.shape[1], effective_size(weight) * worth
     v = rank_scores(steps, z)
     centred = v - weight @ v
@@ -216,11 +217,11 @@ def fit_marginals(
     wider: float = 1.0,
     worth: float = 1.0,
 ) -> Marginals:
-    """Fit the density of each coordinate by kernels, reflected at the ends, in fine steps.
+    """Fit each coordinate's density by kernels with reflected ends, as a fine step function.
 
     **Arguments:**
-    - `wider`: width of the kernels over that of Silverman's rule (Density estimation, 1986,
-      equation 3.31).
+    - `wider`: factor on the kernels' width by Silverman's rule (Density estimation, 1986, equation
+      3.31).
     """
     from scipy.special import ndtr, ndtri
 
@@ -265,7 +266,7 @@ def fit_marginals(
 def fit_common_marginal(
     z: Float[np.ndarray, "n d"], weight: Float[np.ndarray, " n"], worth: float = 1.0
 ) -> Marginals:
-    """Fit one step function for all coordinates, from all of them together."""
+    """Fit one step function to all coordinates together."""
     from scipy.special import ndtr
 
     d = z.shape[1]
@@ -301,7 +302,7 @@ def _steps(
 def fit_shell(
     z: Float[np.ndarray, "n d"], weight: Float[np.ndarray, " n"], worth: float = 1.0
 ) -> Shell:
-    """Fit shells to the distances of the points from the origin, in steps narrow in probability."""
+    """Fit shells to the points' distances from the origin, in steps of small probability."""
     from scipy.special import ndtr
 
     score = radial_score(z)

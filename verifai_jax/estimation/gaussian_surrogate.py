@@ -28,12 +28,12 @@ STEPS = 30
 
 
 class Surrogate:
-    """A Gaussian process on the robustness over normal space.
+    """A Gaussian process for the robustness over normal space.
 
-    With a cheap model of the same features it is a process on what a multiple of the cheap
-    robustness leaves over (Kennedy, O'Hagan, Predicting the output from a complex computer code
-    when fast approximations are available, Biometrika 87, 2000). A cheap model of no use has the
-    multiple zero.
+    With a cheap model of the same features it models the difference to a multiple of the cheap
+    robustness (Kennedy, O'Hagan, Predicting the output from a complex computer code when fast
+    approximations are available, Biometrika 87, 2000). For a useless cheap model the multiple is
+    zero.
 
     **Arguments:**
     - `dim`: number of coordinates.
@@ -49,7 +49,7 @@ class Surrogate:
         """Constant, and multiple of the cheap robustness."""
 
     def learn(self, z: Float[np.ndarray, "n d"], rho: Float[np.ndarray, " n"]) -> None:
-        """Learn the robustness of all points so far; the last ones count if they are too many."""
+        """Fit the robustness of all points so far; only the last ones if they are too many."""
         z, rho = z[-CAPACITY:], rho[-CAPACITY:]
         # Linear near zero, where the sign is, and logarithmic where it is far away.
         y = np.arcsinh(rho / max(float(np.median(np.abs(rho))), 1e-30))
@@ -68,7 +68,7 @@ class Surrogate:
     def predict(
         self, z: Float[np.ndarray, "n d"]
     ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
-        """Return means and standard deviations, in units in which a failure is below zero."""
+        """Return means and standard deviations, in units in which failures are below zero."""
         parts = []
         for start in range(0, len(z), CHUNK):
             part = _boxed(z[start : start + CHUNK])

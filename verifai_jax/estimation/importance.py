@@ -62,15 +62,15 @@ class ImportanceSamples:
 
     - `x`: prior density over proposal density at failures, zero elsewhere.
     - `without`: the same at simulations without a verdict, zero elsewhere.
-    - `edge`: weight that may hide beyond the outermost values of a domain, which no simulation
+    - `edge`: weight that may lie beyond the outermost values of a domain, which no simulation
       reaches.
     - `origin`: the component of the proposal that each sample came from; 0 is the prior.
     - `failing`: True where a simulation breaks a formula.
     - `points`: the points of the samples.
     - `failures`: the points among them that fail.
-    - `keys`: numbers of the random keys with which these do.
+    - `keys`: numbers of the random keys of these failures.
     - `proposal`: the mixture that was sampled.
-    - `coarse`: relative error by single precision at the end of a coordinate.
+    - `coarse`: relative error from single precision near the ends of a coordinate.
     - `acceptance`: share of the prior that the constraint accepts, and its relative error.
     - `simulations`: number of simulations that these samples took.
     """
@@ -97,12 +97,12 @@ class ImportanceSamples:
 
     @property
     def unresolved(self) -> float:
-        """Relative error by the failures that single precision and outermost values may hide."""
+        """Relative error from failures that single precision and outermost values may hide."""
         total = float(self.x.sum())
         return min(self.coarse + float(self.edge.sum()) / total, 1.0) if total > 0 else 0.0
 
     def interval(self, confidence: float) -> tuple[float, float]:
-        """Return the interval; a missing verdict counts as a failure at its upper end."""
+        """Return the interval; its upper end counts a missing verdict as a failure."""
         share, error = self.acceptance
         low, high = self._widened(self.x, confidence)
         if self.without.any():
@@ -111,7 +111,7 @@ class ImportanceSamples:
         return low / share / widened, min(high / share * widened, 1.0)
 
     def join(self, other: "ImportanceSamples") -> "ImportanceSamples":
-        """Return these samples and further ones of the same proposal."""
+        """Return these samples joined with further ones of the same proposal."""
         rows = ("x", "without", "edge", "origin", "failing", "points", "failures", "keys")
         both = {n: np.concatenate([getattr(self, n), getattr(other, n)]) for n in rows}
         coarse, simulations = (max(self.coarse, other.coarse), self.simulations + other.simulations)
@@ -127,25 +127,25 @@ class ImportanceSamples:
 
     @property
     def counts(self) -> Counts:
-        """Counts of these samples, where the proposal is the prior."""
+        """Counts of these samples, if the proposal is the prior."""
         missing = int(np.count_nonzero(self.without))
         return Counts(self.simulations, int(self.failing.sum()), missing)
 
     @property
     def defensive_counts(self) -> tuple[int, int]:
-        """Failures among the samples of the defensive part, and the number of these samples."""
+        """Number of failures among the samples of the defensive part, and of these samples."""
         own = self.origin == 0
         return int(self.failing[own].sum()), int(own.sum())
 
 
 @dataclass(frozen=True)
 class FittedProposal:
-    """A proposal, and the quality that its last samples promise.
+    """A proposal, and the quality predicted by its last samples.
 
     - `proposal`: the fitted mixture.
     - `effective`: effective failures per simulation.
     - `tail`: tail index of their weights.
-    - `probability`: the probability of a failure, by these samples.
+    - `probability`: the probability of a failure, estimated from these samples.
     """
 
     proposal: Mixture
@@ -154,7 +154,7 @@ class FittedProposal:
     probability: float = 0.0
 
     def promise(self, simulations: int) -> float:
-        """Return the failures that so many samples are worth, once a heavy tail has widened."""
+        """Return the effective failures expected from so many samples, less for a heavy tail."""
         return self.effective * simulations / widening(self.tail) ** 2
 
 
@@ -168,14 +168,14 @@ def fit_proposal(
     anchors: Anchors | None = None,
     defensive: float = DEFENSIVE,
 ) -> FittedProposal:
-    """Fit a proposal to failures, and improve it by samples of itself.
+    """Fit a proposal to failures, and improve it with its own samples.
 
     **Arguments:**
-    - `points`: failures `[n, d]`, distributed about as the prior's.
+    - `points`: failures `[n, d]`, distributed approximately as under the prior.
     - `chain_ids`: the splitting chain `[n]` that each failure comes from.
-    - `simulations`: number of simulations left; each stage takes a share of them.
+    - `simulations`: number of simulations left, of which each stage takes a share.
     - `initial`: proposal of the first stage; fitted to the failures when left out.
-    - `anchors`: regions, whose components keep a share of every proposal.
+    - `anchors`: regions whose components keep a share of every proposal.
     - `defensive`: share of the prior in the proposal.
     """
     proposal = initial or fit_mixture(points, np.ones(len(points)), chain_ids, rng, defensive)
@@ -257,8 +257,8 @@ def sample_proposal(
     """Simulate fresh samples of a frozen proposal.
 
     **Arguments:**
-    - `simulations`: number of them, about; fewer where time ends.
-    - `clamped`: True at coordinates `[d]` whose domain ends in an outermost value.
+    - `simulations`: approximate number of samples; fewer if the time ends.
+    - `clamped`: True at coordinates `[d]` whose domain has an outermost value.
     """
     started = limit_state.simulations
     acceptance = limit_state.acceptance(rng)
@@ -281,7 +281,7 @@ def draw(
     """Draw about `n` points of the proposal and simulate those that the constraint accepts.
 
     **Returns:** points, components, scores, densities over the prior's, and numbers of random keys;
-    fewer where time ends.
+    fewer if the time ends.
     """
     if limit_state.constraint is not None and n:
         share = max(float(np.mean(limit_state.accepts(proposal.sample(rng, 4096)[0]))), 0.01)

@@ -43,10 +43,10 @@ MAX_UNSEEN = 0.9
 
 @dataclass(frozen=True)
 class Agreement:
-    """Agreement of explorations about where the failures are.
+    """Agreement of explorations on where the failures are.
 
     - `reached`: for each exploration the share `[k]` of the failure probability that it reached.
-    - `alone`: share of the probability that no more than one exploration reached.
+    - `alone`: share of the probability that at most one exploration reached.
     - `unseen`: estimated share of the failures that none of them has reached.
     """
 
@@ -56,7 +56,7 @@ class Agreement:
 
 
 def proposal_from(exploration: Exploration, rng: np.random.Generator, defensive: float) -> Mixture:
-    """Make a proposal of an exploration's failures: fitted ones, and some around each region."""
+    """Make a proposal from an exploration's failures, with components around each region."""
     weight = weigh_chains(exploration)[exploration.chain_ids]
     fitted = fit_mixture(exploration.points, weight, exploration.chain_ids, rng, defensive)
     return fitted.join(anchors_of([exploration], defensive).fit(), 0.5)
@@ -78,15 +78,15 @@ def compare_explorations(
     proposals: Sequence[Mixture],
     found: Sequence[Float[np.ndarray, "_ d"]],
 ) -> Agreement:
-    """Compare what each exploration had reached by itself.
+    """Compare what each exploration reached on its own.
 
-    A failure counts as reached where the exploration's own proposal is dense, or where a path of
-    failures leads to what it found; the second is simulated, within what is left of the budget.
+    A failure counts as reached if the exploration's own proposal is dense there, or if a path of
+    failures leads to one of its failures; the path is simulated within the remaining budget.
 
     **Arguments:**
     - `z`: failures `[n, d]`, drawn from the final proposal.
     - `x`: their weights `[n]`, prior over proposal density.
-    - `proposals`: one of each exploration.
+    - `proposals`: the proposal of each exploration.
     - `found`: failures `[m, d]` of each exploration.
     """
     share = x / x.sum()

@@ -13,10 +13,10 @@ class WeightedMean(NamedTuple):
     - `mean`: their arithmetic mean.
     - `cv`: relative standard error of the mean.
     - `skewness`: skewness of the samples.
-    - `effective`: number of equally weighted samples that they are worth.
+    - `effective`: effective number of equally weighted samples.
     - `largest`: share of the largest sample in the sum.
-    - `tail`: index of the generalised Pareto distribution of the largest ones (k-hat); the variance
-      is infinite from 0.5 on, and the mean beyond 0.7 not to be relied on.
+    - `tail`: shape of the generalised Pareto distribution fitted to the largest ones (k-hat); the
+      variance is infinite from 0.5 on, and the mean is unreliable beyond 0.7.
     """
 
     mean: float
@@ -46,7 +46,7 @@ def weighted_mean(x: Float[np.ndarray, " n"]) -> WeightedMean:
 
 
 def skewed_interval(x: Float[np.ndarray, " n"], confidence: float) -> tuple[float, float]:
-    """Return Student's interval of the mean of skewed samples, with the skewness removed.
+    """Return Student's interval of the mean of skewed samples, corrected for skewness.
 
     Source: Hall, On the removal of skewness by transformation, Journal of the Royal Statistical
     Society B 54 (1992), equation 2.3 (the cubic one, which is monotone).

@@ -91,7 +91,7 @@ def estimate_automatically(limit_state: LimitState, rng: np.random.Generator, pl
 def estimate_by_importance_sampling(
     limit_state: LimitState, rng: np.random.Generator, plan: Plan, first: FirstLevel | None = None
 ) -> Answer:
-    """Estimate by importance sampling; splitting and independent searches make the proposal."""
+    """Estimate by importance sampling, with a proposal from splitting and independent searches."""
     first = _first_level(limit_state, rng, plan) if first is None else first
     if first is None:
         return bound_from_pilot(limit_state, plan)

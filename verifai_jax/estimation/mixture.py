@@ -37,7 +37,7 @@ class Mixture:
     """A mixture of components; the first is the prior.
 
     - `components`: the densities.
-    - `shares`: their probabilities, of sum one.
+    - `shares`: their probabilities, which sum to one.
     """
 
     components: tuple[Component, ...]
@@ -48,7 +48,7 @@ class Mixture:
     ) -> tuple[Float[np.ndarray, "n d"], Int[np.ndarray, " n"]]:
         """Draw points in random order; return them and the component of each.
 
-        Counts of the components are as near their shares as possible.
+        The counts of the components are as close to their shares as possible.
         """
         # Systematic: the counts are off by less than one, and right on average.
         borders = np.floor(n * np.append(0, np.cumsum(self.shares)) + rng.random())
@@ -62,7 +62,7 @@ class Mixture:
         return z[order], origin[order]
 
     def join(self, other: "Mixture", share: float) -> "Mixture":
-        """Mix this mixture with a `share` of the other."""
+        """Mix this mixture with a `share` of another one."""
         shares = np.concatenate(
             [
                 [(1 - share) * self.shares[0] + share * other.shares[0]],
@@ -78,7 +78,7 @@ class Mixture:
         )
 
     def with_shares(self, shares: Float[np.ndarray, " k"]) -> "Mixture":
-        """Return this mixture with other shares in these proportions; the prior keeps its own."""
+        """Return this mixture with shares in these proportions; the prior keeps its own."""
         prior = float(self.shares[0])
         rest = shares * (1 - prior) / max(float(shares.sum()), 1e-12)
         return Mixture(self.components, np.append(prior, rest))
@@ -103,9 +103,9 @@ def fit_mixture(
 
     **Arguments:**
     - `z`: failures `[n, d]` in normal space.
-    - `weight`: parts `[n]` of the failures' distribution that they stand for.
-    - `chain_ids`: the chain `[n]` of each; points of one chain stay in one half.
-    - `defensive`: least share of the prior.
+    - `weight`: share `[n]` of the failures' distribution that each represents.
+    - `chain_ids`: the chain `[n]` of each; cross-validation keeps points of one chain in one half.
+    - `defensive`: minimum share of the prior.
     """
     d = z.shape[1]
     weight = weight / weight.sum()
@@ -137,16 +137,16 @@ def fit_mixture(
 def optimal_shares(
     table: Float[np.ndarray, "n k"], weight: Float[np.ndarray, " n"], defensive: float
 ) -> Float[np.ndarray, " k"]:
-    """Minimise the mean of prior over proposal density by the shares of the components.
+    """Choose the components' shares to minimise the mean ratio of prior to proposal density.
 
-    The multiplicative steps have the minima as fixed points.
+    The fixed points of the multiplicative steps are the minima.
 
     **Arguments:**
     - `table`: densities of the components over the prior's, at failures; without the defensive
       part, which is 1.
-    - `weight`: weights of the failures, of sum one.
+    - `weight`: weights of the failures, which sum to one.
     - `defensive`: share of the defensive part.
-    **Returns:** shares of the components, of sum one.
+    **Returns:** shares of the components, which sum to one.
     """
     k = table.shape[1]
     share = np.full(k, 1 / k)
@@ -168,7 +168,7 @@ def fit_components(
     rng: np.random.Generator,
     worth: float = 1.0,
 ) -> list[Component]:
-    """Fit components of all kinds to points, each of which is worth `worth` independent ones."""
+    """Fit components of all kinds to points that are each worth `worth` independent ones."""
     d = z.shape[1]
     components: list[Component] = []
     size = fitting.effective_size(weight) * worth

@@ -38,7 +38,8 @@ class Counts:
     def interval(self, confidence: float) -> tuple[float, float]:
         """Return the Clopper-Pearson interval of the failure probability.
 
-        A sample without a verdict is no failure at the lower end, and one at the upper end.
+        A sample without a verdict counts as safe at the lower end, and as a failure at the upper
+        end.
         """
         if not self.simulations:
             return 0.0, 1.0
@@ -52,7 +53,7 @@ class Counts:
 
 
 def sample_prior(limit_state: LimitState, rng: np.random.Generator, simulations: int) -> Counts:
-    """Simulate independent samples of the prior; fewer than asked for where time ends."""
+    """Simulate independent samples of the prior; fewer than asked for if the time ends."""
     total = Counts(0, 0, 0)
     size = limit_state.batch * AT_ONCE
     try:

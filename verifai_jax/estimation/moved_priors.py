@@ -49,9 +49,9 @@ EVEN = 0.5
 
 
 def notice_own_chance(limit_state: LimitState, rng: np.random.Generator) -> None:
-    """Simulate a few samples of the prior twice, and note where they come otherwise.
+    """Simulate a few samples of the prior twice, and note differing results.
 
-    A function on the host may draw numbers that do not come from the random key, or keep state.
+    A function on the host may draw numbers that do not depend on the random key, or keep state.
     """
     samples = min(TWICE, limit_state.budget // 200)
     if limit_state.draws or not samples:
@@ -71,7 +71,7 @@ def notice_own_chance(limit_state: LimitState, rng: np.random.Generator) -> None
 def notice_lost_failures(
     limit_state: LimitState, rng: np.random.Generator, failures: Float[np.ndarray, "n d"]
 ) -> None:
-    """Simulate a few failures again, and note that some do not fail, as chance may be rare."""
+    """Simulate a few failures again, and note if some do not fail: the system may be random."""
     if limit_state.left < TWICE:
         return
     with suppress(Ended):
@@ -86,7 +86,7 @@ def notice_lost_failures(
 def share_failing_again(
     limit_state: LimitState, rng: np.random.Generator, failures: Float[np.ndarray, "n d"]
 ) -> float:
-    """Simulate failures again with other random keys; return the share that fails again."""
+    """Simulate failures again with other random keys; return the share that fails."""
     count = min(TRIED_AGAIN, limit_state.left)
     if not limit_state.draws or not count:
         return 1.0
@@ -95,7 +95,7 @@ def share_failing_again(
 
 
 def moved_priors(ends: Float[np.ndarray, "m d"]) -> Mixture:
-    """Return the prior, and the prior moved by parts of the ways to failures, in equal parts."""
+    """Return equal parts of the prior and of priors moved some of the way towards failures."""
     d = ends.shape[1]
     if len(ends) > ENDS:
         nearest = int(np.sum(ends**2, axis=1).argmin())
@@ -109,12 +109,12 @@ def moved_priors(ends: Float[np.ndarray, "m d"]) -> Mixture:
 def share_out(
     limit_state: LimitState, rng: np.random.Generator, moves: Mixture, simulations: int
 ) -> FittedProposal:
-    """Sample a mixture of moved priors in stages, and give more to the moves that are best.
+    """Sample a mixture of moved priors in stages, increasing the share of the best moves.
 
     **Arguments:**
-    - `moves`: the mixture, in which all have equal parts.
-    - `simulations`: number of simulations left; each stage takes a share of them.
-    **Returns:** the proposal, with the promise of all stages together.
+    - `moves`: the mixture, with equal shares.
+    - `simulations`: number of simulations left, of which each stage takes a share.
+    **Returns:** the proposal, with the quality predicted from all stages together.
     """
     size = max(1, int(SHARE_OF_STAGE * simulations))
     proposal, counts = moves, []

@@ -27,10 +27,10 @@ _MIN_DENSITY = 1e-300
 def natural_slopes(
     z: Float[np.ndarray, "n d"], gradient: Float[np.ndarray, "n d"], uniform: Bool[np.ndarray, " d"]
 ) -> Float[np.ndarray, "n d"]:
-    """Return derivatives by natural coordinates from those by coordinates of normal space.
+    """Convert derivatives from coordinates of normal space to natural coordinates.
 
     **Arguments:**
-    - `gradient`: at these points.
+    - `gradient`: the gradient at these points.
     - `uniform`: True at coordinates of a uniform feature.
     """
     density = np.exp(-z * z / 2) / np.sqrt(2 * np.pi)
@@ -42,7 +42,7 @@ def move_naturally(
 ) -> Float[np.ndarray, "n d"]:
     """Move points of normal space by steps in natural coordinates.
 
-    A uniform feature stays within its interval: a step leaves some of the way to the end.
+    A uniform feature stays within its interval: a step never reaches the end.
     """
     if not uniform.any():
         return z + steps

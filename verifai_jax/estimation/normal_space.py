@@ -43,7 +43,7 @@ class Scores(NamedTuple):
     """Scores of points, one row each.
 
     - `score`: the number that splitting lowers: minus infinity for a failure, infinity without a
-      verdict, else the robustness, which is not negative.
+      verdict, otherwise the robustness, which is not negative.
     - `failing`: True where the simulation ended properly and breaks a formula.
     - `proper`: True where the simulation has a verdict.
     """
@@ -57,7 +57,7 @@ class Linearized(NamedTuple):
     """Robustness and gradient at points of normal space, one row each.
 
     - `score`: as in `Scores`.
-    - `rho`: the robustness itself; NaN without a verdict.
+    - `rho`: the robustness; NaN without a verdict.
     - `gradient`: by the coordinates of normal space; zero where it is not finite.
     """
 
@@ -76,7 +76,7 @@ busy until the last one ends."""
 
 
 class Ended(Exception):
-    """Time is over, or the user has interrupted; finished simulations count."""
+    """The time is over, or the user has interrupted; finished simulations count."""
 
 
 class Spent(Ended):
@@ -87,25 +87,26 @@ class LimitState:
     """Scores of points of standard normal space, within a budget of simulations.
 
     **Arguments:**
-    - `evaluate`: from points `u [n, d]` of the unit cube to `(rho, failing, proper)`, each `[n]`.
+    - `evaluate`: a function from points `u [n, d]` of the unit cube to `(rho, failing, proper)`,
+      each `[n]`.
     - `dim`: number of unit coordinates.
-    - `budget`: simulations in all; a method has to plan with `left`.
+    - `budget`: number of simulations in all; methods plan with `left`.
     - `batch`: points that are simulated together.
-    - `constraint`: from points `u [n, d]` to the accepted ones `[n]`; none when left out.
-    - `deadline`: on the clock of `time.perf_counter`, after which `Ended` is raised.
+    - `constraint`: a function from points `u [n, d]` to whether each is accepted `[n]`; none when
+      left out.
+    - `deadline`: time on the clock of `time.perf_counter` after which `Ended` is raised.
     - `report`: called after each batch with simulations, failures and the least robustness so far.
-    - `together`: batches that are simulated at a time, where there are several workers.
-    - `one_by_one`: whether simulations take their time one after another, so that fewer are asked
-      for at a time where they take long: whoever interrupts loses no more than these.
-    - `workers`: of these simulations, how many run side by side.
-    - `gradient`: as `evaluate`, with the gradient by the coordinates of the cube; none when left
-      out. A simulation with its gradient counts 2.
-    - `uniform`: True at coordinates `[dim]` of uniform features; none of them when left out.
-    - `rest`: what is left of the prior beside a proof; the constraint has to refuse what is proved.
-    - `draws`: whether the system draws from the random key of its simulation, so that a point fails
-      with a probability.
+    - `together`: number of batches that are simulated at a time, if there are several workers.
+    - `one_by_one`: whether simulations run one after another. If they are slow, fewer are then
+      requested at a time, so that an interrupt loses only these.
+    - `workers`: how many of these simulations run side by side.
+    - `gradient`: like `evaluate`, but also returns the gradient with respect to the cube; none when
+      left out. A simulation with its gradient counts as 2.
+    - `uniform`: True at coordinates `[dim]` of uniform features; all False when left out.
+    - `rest`: share of the prior that is not proved; the constraint has to refuse proved points.
+    - `draws`: whether the system uses its random key, so that a point fails with a probability.
 
-    `evaluated` counts simulations, one with its gradient once: it is the number of the next random
+    `evaluated` counts simulations, one with its gradient as 1: it is the number of the next random
     key.
     """
 
@@ -152,7 +153,7 @@ class LimitState:
 
     @property
     def left(self) -> int:
-        """Simulations that may still be done."""
+        """Number of simulations that may still be made."""
         return 0 if self.ended else self.budget - self.simulations
 
     def accepts(self, z: Float[np.ndarray, "n d"]) -> Bool[np.ndarray, " n"]:
@@ -170,7 +171,7 @@ class LimitState:
     def sample_prior(self, rng: np.random.Generator, n: int) -> Float[np.ndarray, "n d"]:
         """Draw `n` independent points of the prior, given that the constraint accepts them.
 
-        **Raises:** `ValueError` where the constraint refuses almost every point.
+        **Raises:** `ValueError` if the constraint refuses almost every point.
         """
         if self.constraint is None:
             return rng.standard_normal((n, self.dim))
@@ -209,16 +210,17 @@ class LimitState:
         return Scores(*self._in_batches(self._score, z))
 
     def begin(self, z: Float[np.ndarray, "n d"]) -> "Begun":
-        """Begin to simulate points, and return what waits for their scores.
+        """Start simulating points, and return an object that waits for their scores.
 
-        Workers of an executor begin at once; without them all waits for whoever waits for it.
+        Workers of an executor start at once; without workers the simulation starts when its result
+        is requested.
         """
         return Begun(self, z)
 
     def linearize(self, z: Float[np.ndarray, "n d"]) -> Linearized:
         """Simulate points of normal space, and differentiate their robustness.
 
-        **Raises:** `Ended` as for a call; `ValueError` for a limit state without gradients.
+        **Raises:** `Ended` as in a call; `ValueError` for a limit state without gradients.
         """
         if self.gradient is None:
             raise ValueError("this limit state has no gradient")
@@ -296,10 +298,10 @@ class LimitState:
 
 
 class Begun:
-    """Simulations on their way; `result` waits for them, once, in the order in which they began.
+    """Simulations in progress; call each `result` once, in the order in which they were started.
 
     **Arguments:**
-    - `limit_state`: which counts them when they are waited for.
+    - `limit_state`: the limit state, which counts them when their result is fetched.
     - `z`: their points.
     """
 
@@ -310,9 +312,9 @@ class Begun:
         self._waits: Any = begin(to_unit_cube(z)) if together and begin is not None else None
 
     def result(self) -> Scores:
-        """Return the scores.
+        """Wait for the scores and return them.
 
-        **Raises:** as a call of the limit state.
+        **Raises:** the errors of a call of the limit state.
         """
         if self._waits is None:
             return self._limit_state(self.z)
@@ -323,7 +325,7 @@ class Begun:
         return self._limit_state._counted(z, verdicts.lowest, verdicts.violated, verdicts.proper)
 
     def cancel(self) -> None:
-        """Take what has not begun out of the queue of the workers."""
+        """Remove simulations that have not started from the workers' queue."""
         if self._waits is not None:
             self._waits.cancel()
 
@@ -331,7 +333,7 @@ class Begun:
 def to_unit_cube(z: Float[np.ndarray, "n d"]) -> Float[np.ndarray, "n d"]:
     """Map points of normal space to the unit cube, in double precision.
 
-    Single precision has no probabilities near one.
+    Single precision cannot represent probabilities near one.
     """
     from scipy.special import ndtr
 
@@ -339,14 +341,14 @@ def to_unit_cube(z: Float[np.ndarray, "n d"]) -> Float[np.ndarray, "n d"]:
 
 
 def to_normal_space(u: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
-    """Map probabilities to standard normal numbers, which are finite at 0 and 1, too."""
+    """Map probabilities to standard normal numbers, which stay finite for 0 and 1."""
     from scipy.special import ndtri
 
     return ndtri(np.clip(u, 1e-300, 1 - 1e-16))
 
 
 def scores_of(limit_state: LimitState, z: Float[np.ndarray, "n d"]) -> Float[np.ndarray, " n"]:
-    """Return the scores of points; infinity where the constraint refuses one."""
+    """Return the scores of points; infinity for a point that the constraint refuses."""
     fits: Bool[np.ndarray, " n"] = limit_state.accepts(z)
     score = np.full(len(z), np.inf)
     if fits.any():
@@ -355,14 +357,14 @@ def scores_of(limit_state: LimitState, z: Float[np.ndarray, "n d"]) -> Float[np.
 
 
 def fails_at(limit_state: LimitState, z: Float[np.ndarray, "n d"]) -> Bool[np.ndarray, " n"]:
-    """Simulate points, and return which fail; none does where the constraint refuses it."""
+    """Simulate points, and return which fail; points that the constraint refuses do not."""
     return scores_of(limit_state, z) == -np.inf
 
 
 def squared_distances(
     z: Float[np.ndarray, "n d"], points: Float[np.ndarray, "m d"]
 ) -> Float[np.ndarray, "n m"]:
-    """Return the squared distance of each point `z` from each of the others."""
+    """Return the squared distances of each point `z` to the other points."""
     return np.sum(points**2, axis=1)[None] - 2 * z @ points.T + np.sum(z * z, axis=1)[:, None]
 
 
@@ -377,8 +379,8 @@ def farthest_first(
     **Arguments:**
     - `first`: the point that is chosen first.
     - `gaps_from`: the distances `[n]` of all points from one.
-    - `maximum`: number of points, at most.
-    - `min_gap`: distance from the chosen ones at which no other point is chosen.
+    - `maximum`: maximum number of points.
+    - `min_gap`: points closer than this to a chosen one are not chosen.
     """
     chosen, gaps = [first], gaps_from(first)
     while len(chosen) < min(maximum, len(gaps)) and gaps.max() > min_gap:

@@ -25,7 +25,7 @@ def connected(
 ) -> Bool[np.ndarray, " n"]:
     """Return for each pair of failing points whether one of two paths between them fails.
 
-    **Raises:** `Ended` where time is over.
+    **Raises:** `Ended` when the time is over.
     """
     joined = np.zeros(len(a), bool)
     for path in (straight, arc):
@@ -45,13 +45,13 @@ def halve(
     end: Float[np.ndarray, "n d"],
     halvings: int,
 ) -> tuple[Float[np.ndarray, "n d"], Float[np.ndarray, "n d"]]:
-    """Follow straight ways as far as they fail, by halving.
+    """Bisect straight lines to find how far they fail.
 
     **Arguments:**
     - `begin`: failures.
-    - `end`: points that are taken not to fail; they are not simulated.
-    **Returns:** the last failure found on each way, and a point just beyond it.
-    **Raises:** `Ended` where time is over.
+    - `end`: points that are assumed not to fail; they are not simulated.
+    **Returns:** the last failure found on each line, and a point just beyond it.
+    **Raises:** `Ended` when the time is over.
     """
     low, high = np.zeros((len(begin), 1)), np.ones((len(begin), 1))
     for _ in range(halvings):
@@ -66,14 +66,14 @@ def straight(
     b: Float[np.ndarray, "n d"],
     fraction: float | Float[np.ndarray, "n 1"],
 ) -> Float[np.ndarray, "n d"]:
-    """Return points of the straight ways."""
+    """Return points on straight lines."""
     return (1 - fraction) * a + fraction * b
 
 
 def arc(
     a: Float[np.ndarray, "n d"], b: Float[np.ndarray, "n d"], fraction: float
 ) -> Float[np.ndarray, "n d"]:
-    """Return points of the arcs: the angle and the distance from the origin change evenly."""
+    """Return points on arcs, along which angle and distance from the origin change linearly."""
     far_a = np.linalg.norm(a, axis=1, keepdims=True)
     far_b = np.linalg.norm(b, axis=1, keepdims=True)
     one, other = a / np.maximum(far_a, 1e-12), b / np.maximum(far_b, 1e-12)

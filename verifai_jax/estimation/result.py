@@ -37,28 +37,29 @@ class Estimate(Drawn, Reported, InNotebook):
     - `name`: name of the problem.
     - `probability`: the probability of a failure, under the prior of the feature space; None if
       none is claimed.
-    - `low`, `high`: the interval, at `confidence`; without an estimate 0 and `upper_bound`.
+    - `low`, `high`: the interval at `confidence`; without an estimate 0 and `upper_bound`.
     - `confidence`: the confidence of the interval and of the bound.
     - `method`: a name of `METHODS`; None without an estimate.
-    - `simulations`: number of all simulations; one with its gradient counts 2.
+    - `simulations`: number of all simulations; one with its gradient counts as 2.
     - `budget`: simulations that were allowed.
-    - `failures`, `no_verdict`: simulations among them that failed, and without a verdict.
-    - `upper_bound`: guaranteed at `confidence` by independent samples of the prior alone, whatever
-      a search may have missed.
-    - `prior_simulations`, `prior_failures`, `prior_no_verdict`: the samples of the prior that the
-      bound rests on; one without a verdict counts as a failure there.
-    - `effective`: independent failures that the weighted samples are worth; NaN where that has no
-      meaning.
-    - `relative_error`: one standard error over the estimate.
+    - `failures`, `no_verdict`: how many simulations failed, and how many had no verdict.
+    - `upper_bound`: upper bound guaranteed at `confidence` by independent samples of the prior
+      alone, whatever a search may have missed.
+    - `prior_simulations`, `prior_failures`, `prior_no_verdict`: the samples of the prior on which
+      the bound rests; one without a verdict counts as a failure there.
+    - `effective`: effective number of independent failures in the weighted samples; NaN for methods
+      where that has no meaning.
+    - `relative_error`: one standard error divided by the estimate.
     - `diagnostics`: further numbers of the method, by name.
     - `notes`: sentences on anything surprising.
-    - `certain`, `rest`: the share of the prior that fails for certain, and the one that is neither
-      proved nor certain to fail, of which samples are drawn; 0 and 1 without a proof.
+    - `certain`, `rest`: the share of the prior that fails for certain, and the share that is
+      neither proved safe nor certain to fail, from which samples are drawn; 0 and 1 without a
+      proof.
     - `p0`: the wanted upper limit of the probability, if one was given.
     - `seed`, `version`, `precision`, `backend`: needed to repeat the estimate.
     - `seconds`: wall-clock time.
-    - `stopped`: what ended it early: `"max_seconds"` or `"interrupted"`; None if nothing did.
-    - `sources`: what the model was made of, as a run records it; empty if that is not recorded.
+    - `stopped`: the reason for an early end: `"max_seconds"` or `"interrupted"`; None without one.
+    - `sources`: the files of the model, as a run records them; empty if not recorded.
     - `drawn`: data of the pictures.
     """
 
@@ -101,17 +102,17 @@ class Estimate(Drawn, Reported, InNotebook):
 
     @property
     def no_verdict_probability(self) -> float:
-        """Share of the prior that has no verdict, by its samples."""
+        """Share of the prior without a verdict, estimated from its samples."""
         return self.rest * self.prior_no_verdict / max(self.prior_simulations, 1)
 
     def simulations_until(self, p0: float, confidence: float | None = None) -> int:
-        """Count further samples of the prior that show a probability below `p0` if none fails.
+        """Return how many more samples without a failure show a probability below `p0`.
 
         **Arguments:**
         - `p0`: failure probability to be shown, between 0 and 1.
-        - `confidence`: the confidence of the bound; that of the estimate when left out.
-        **Returns:** the number of samples in addition to those that `upper_bound` rests on; 0 if
-        these show it already.
+        - `confidence`: the confidence of the bound; by default that of the estimate.
+        **Returns:** the number of samples in addition to those of `upper_bound`; 0 if these
+        suffice.
         **Raises:** `ValueError` unless `0 < p0 < 1`.
         """
         check_fraction("p0", p0)

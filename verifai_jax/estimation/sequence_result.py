@@ -18,10 +18,10 @@ class PartEstimate:
     - `name`: the name of its problem.
     - `probability`: share that fails; NaN if no simulation has a verdict.
     - `low`, `high`: ends of its interval.
-    - `samples`: simulations, or rows of a run, that it rests on.
-    - `without`: of these, how many have no verdict, or begin outside of the part's space.
-    - `effective`: independent samples of the same weight in information; less than `samples` only
-      if rows of a run are weighted.
+    - `samples`: number of simulations, or of rows of a run, on which it rests.
+    - `without`: how many of these have no verdict, or start outside the part's space.
+    - `effective`: effective number of independent samples; smaller than `samples` only if rows of a
+      run are weighted.
     """
 
     name: str
@@ -48,12 +48,12 @@ class SequenceEstimate(InNotebook):
 
     - `parts`: an estimate of each part that was reached.
     - `low`, `high`: ends of the interval of the whole.
-    - `confidence`: with which all intervals hold together.
-    - `counterexamples`: a row for each failure: the `part` that fails, and the features of it and
-      of all parts before it as columns `PART.FEATURE`.
-    - `simulations`: made for it.
+    - `confidence`: the probability that all intervals hold together.
+    - `counterexamples`: a row for each failure: the `part` that fails, and the features of that
+      part and of all earlier ones as columns `PART.FEATURE`.
+    - `simulations`: number of simulations made.
     - `seed`: the seed of the samples; part i has the random keys of seed + i.
-    - `notes`: what the intervals rest on.
+    - `notes`: the assumptions of the intervals.
     """
 
     parts: tuple[PartEstimate, ...]

@@ -41,7 +41,7 @@ class SplittingRun:
 
     - `levels`: robustness at each level, from the prior down; the last is minus infinity.
     - `fractions`: the conditional probability of each level.
-    - `cv2`: squared relative error of each fraction, correlation along chains included.
+    - `cv2`: squared relative error of each fraction, including correlation along chains.
     - `accepted`: share of accepted moves, for each level after the first.
     - `points`: failures `[n, d]` of the last level.
     - `chain_ids`: the chain `[n]` that each failure comes from.
@@ -81,11 +81,11 @@ def run_splitting(
     """Run multilevel splitting once.
 
     **Arguments:**
-    - `per_level`: states of a level: `chains` times the length of a chain.
-    - `chains`: chains of a level; they start at the lowest points of the previous level.
-    - `first`: samples of the prior to begin with, and their score, failing and proper; drawn when
+    - `per_level`: number of states in a level: `chains` times the length of a chain.
+    - `chains`: number of chains in a level; they start at the lowest points of the previous level.
+    - `first`: samples of the prior to start with, and their score, failing and proper; drawn when
       left out.
-    - `reserve`: simulations that are to be left over.
+    - `reserve`: number of simulations that must be left over.
     **Returns:** the run; `stopped` says why it reached no failure.
     """
     run = SplittingRun()
@@ -133,7 +133,7 @@ def explore_failures(
 ) -> tuple[Float[np.ndarray, "n d"], Int[np.ndarray, " n"]]:
     """Walk chains from the failures of the last level that stay among the failures.
 
-    **Returns:** failures `[n, d]`, those of the run included, and the chain `[n]` of each.
+    **Returns:** failures `[n, d]`, including those of the run, and the chain `[n]` of each.
     """
     rows = np.resize(rng.permutation(len(run.points)), chains)
     z, score = run.points[rows], np.full(chains, -np.inf)

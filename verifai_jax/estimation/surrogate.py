@@ -76,9 +76,9 @@ MIN_LOOK = 60
 
 
 def estimate_by_surrogate(limit_state: LimitState, rng: np.random.Generator, plan: Plan) -> Answer:
-    """Estimate with few simulations: half of them learn, the others are the estimate.
+    """Estimate with few simulations: half train the surrogate, half make the estimate.
 
-    With a cheap model fewer learn, since it knows where failures may be.
+    With a cheap model fewer are needed for training, since it shows where failures may be.
     """
     limit_state.rows = []
     surrogate = Surrogate(limit_state.dim, plan.cheap)

@@ -31,19 +31,19 @@ SHORTEST = 0.05
 
 
 def come_in(limit_state: LimitState, z: Float[np.ndarray, "n d"]) -> Float[np.ndarray, "n d"]:
-    """Halve the way to the origin as far as the points still fail."""
+    """Halve the distance to the origin as long as the points still fail."""
     return halve(limit_state, z, np.zeros_like(z), HALVINGS)[0]
 
 
 def approach_origin(
     limit_state: LimitState, z: Float[np.ndarray, "n d"], steps: int = NEAREST_STEPS
 ) -> Float[np.ndarray, "n d"]:
-    """Move failures to the least distant ones near them, by the gradient.
+    """Move failures to nearby ones closest to the origin, using the gradient.
 
-    A step goes towards the point nearest to the origin where the linearised robustness is just
-    below zero (Rackwitz and Fiessler, 1978). Where that does not fail, as on a limit state that
-    bends away, Newton's step leads back to it; where it is no nearer, the next step is half as far,
-    until steps are too short.
+    A step goes towards the point nearest to the origin at which the linearised robustness is just
+    below zero (Rackwitz and Fiessler, 1978). If the simulation there does not fail, because the
+    limit state is curved, a Newton step leads back to it. If the new point is no nearer, the next
+    step is half as long, until steps are too short.
 
     **Returns:** failures `[n, d]`, none farther from the origin than its start.
     """
@@ -74,16 +74,16 @@ def approach_origin(
 def come_in_by_parts(
     limit_state: LimitState, rng: np.random.Generator, z: Float[np.ndarray, "n d"]
 ) -> Float[np.ndarray, "n d"]:
-    """Set parts of the coordinates to zero, the middle of the prior, as far as that still fails."""
+    """Set groups of coordinates to zero, the middle of the prior, while the points still fail."""
     return _replace_by_parts(limit_state, rng, z, np.zeros_like(z), z != 0)[0]
 
 
 def redraw_by_parts(
     limit_state: LimitState, rng: np.random.Generator, z: Float[np.ndarray, "n d"]
 ) -> tuple[Float[np.ndarray, "n d"], Bool[np.ndarray, "n d"]]:
-    """Draw coordinates that are zero from the prior, as far as that still fails.
+    """Redraw coordinates that are zero from the prior, as long as the points still fail.
 
-    **Returns:** the failures `[n, d]`, and the coordinates that decide: those that were not drawn.
+    **Returns:** the failures `[n, d]`, and the deciding coordinates: those that were not redrawn.
     """
     return _replace_by_parts(limit_state, rng, z, rng.standard_normal(z.shape), z == 0)
 

@@ -32,13 +32,13 @@ def walk_among_failures(
     groups: Int[np.ndarray, " n"],
     steps: int,
 ) -> tuple[list[Float[np.ndarray, "n d"]], Float[np.ndarray, "n d"]]:
-    """Walk among the failures.
+    """Walk from failures to other failures nearby.
 
     **Arguments:**
     - `z`: the failure where each chain begins.
-    - `deciding`: the coordinates of each that have to be near what they are for it to fail.
+    - `deciding`: the coordinates of each that must stay close to their values for it to fail.
     - `groups`: the group of each chain, from 0.
-    - `steps`: simulations of a chain.
+    - `steps`: number of simulations of a chain.
     **Returns:** the states of the second half, and the state of each chain nearest to the origin.
     """
     whole = deciding.all(axis=1)

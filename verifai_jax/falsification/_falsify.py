@@ -102,56 +102,59 @@ def falsify(
     - `search`: a name (`verifai_jax.search.names()`), or a search with its options. `"auto"` is
       `portfolio`, or `trace_surrogate`, which saves simulations, if the first two simulations of a
       black box take half a second or longer. Name it for the same table on a machine of any speed.
-    - `budget`: simulations at most; the last batch is cut to fit.
-    - `batch`: simulations a round. Active searches learn once a round: a small batch spends
-      fewer simulations, a large one less time. By default 1024, and for a search that learns at
-      most a twentieth of the budget, so that it can (16 for `bayes`); for one that does not, and
-      that only the budget ends, an eighth of a budget over 8192.
+    - `budget`: maximum number of simulations; the last batch is cut to fit.
+    - `batch`: simulations in a round. A search that learns does so once a round: a small batch
+      spends fewer simulations, a large one less time. The default is 1024, but at most a twentieth
+      of the budget for a search that learns (16 for `bayes`). If a search does not learn and only
+      the budget can end the run, it is an eighth of a budget over 8192.
     - `seed`: the same seed gives the same table, bit for bit, on the same machine.
     - `max_seconds`: wall-clock seconds, compilation included, after which no round begins.
     - `stop_after`: stop after the round in which that many counterexamples are reached.
     - `stop_when`: stop when the failure rate is known well enough: `Within(0.005)`,
       `Decided(0.01)`; only for searches that sample the prior.
-    - `warm_start`: an earlier run or table with the same features, from which a search that learns
-      starts. Its rows are not copied.
-    - `folder`: where rows are kept on disk as they come; must not hold another run.
+    - `warm_start`: an earlier run or table with the same features; a search that learns starts from
+      its rows. They are not copied.
+    - `folder`: where rows are stored on disk as they come; must not hold another run.
     - `precision`: of simulations and verdicts, `"float32"` or `"float64"`.
-    - `backend`: the backend of a system that has several (`"mjx"`, `"native"`); the faster one that
-      the search can use when left out, as measured here. Name it for the same table on every
-      machine.
-    - `confirm`: replay what violates the property in double precision and, where the system has
-      finer steps, at a half and a quarter of its step, and do not claim what no longer does: it
-      stays in the table, as `unconfirmed`. At most 1024 rows are replayed, or one for 128
-      simulations where that is more; the others are `unexamined` (`vj.confirm` replays them).
-      What runs on the host and has no finer steps is simulated once more: 32 rows, or one for 25
-      simulations, and up to 1024 once one came again otherwise.
-    - `diverse`: look for failures of other kinds than those found: `stop_after` then counts
-      failures that are far from each other (`search.Diverse`). True or `"inputs"`: in their
-      inputs; `"behaviour"`: in what happens, that is the predicate that decides, when it does, and
-      the shape of the trace.
-    - `objective`: what the search makes better: `"robustness"`, or `"likelihood"`, how probable a
-      failure is under the features' distributions (`search.Likeliest`, around `cross_entropy` where
-      no search is named). `vj.shrink(run, by="likelihood")` goes on from there.
-    - `first`: features that are simulated before the search proposes any, and told to it where it
-      learns: as in `simulate`. They count in the budget, and the run then has no failure rate.
+    - `backend`: the backend of a system that has several (`"mjx"`, `"native"`). By default both are
+      timed here and the faster one that the search can use is taken, so name it for the same table
+      on every machine.
+    - `confirm`: replay violations in double precision and, if the system has finer steps, at a half
+      and a quarter of its step. Violations that disappear are not claimed: they stay in the table
+      as `unconfirmed`. At most 1024 rows are replayed, or one for every 128 simulations if that is
+      more; the others are `unexamined` (`vj.confirm` replays them). A host system without finer
+      steps simulates violations once more: 32 rows, or one for every 25 simulations, and up to 1024
+      if one of them gave another result.
+    - `diverse`: look for failures of kinds not found yet; `stop_after` then counts failures that
+      are far from each other (`search.Diverse`). True or `"inputs"`: far apart in their inputs.
+      `"behaviour"`: far apart in the deciding predicate, its time and the shape of the trace.
+    - `objective`: what the search optimises: `"robustness"`, or `"likelihood"`, the probability of
+      a failure under the features' distributions (`search.Likeliest`, around `cross_entropy` if no
+      search is named). `vj.shrink(run, by="likelihood")` goes on from there.
+    - `first`: features that are simulated before the search proposes any, in the form that
+      `simulate` takes. A search that learns observes them. They count in the budget, and the run
+      then has no failure rate.
     - `callbacks`: functions called after each round with the number of simulations and plain
       numbers by name, such as `vj.CSVLogger` and `vj.TensorBoardLogger`.
-    - `progress`: show a progress bar; by default on a terminal or in a notebook.
-    - `target`: how the command line names the problem, for the record.
-    - `executor`: whose workers simulate: Dask's `client.get_executor()`, `clusters.RayExecutor()`,
-      a process pool, or anything else with `concurrent.futures`' `submit`. The table is the one of
-      this machine alone, bit for bit, on workers with its kind of processor.
-    - `keep_going`: whether to simulate on if all of the first simulations raise. Otherwise the run
-      ends with an error after 16 that raise the same, or after a first round of many at once.
-    - `engine`: `"xla"`, or `"native"`: rows from the 513th on are simulated by vector code of the
-      machine's own C++ compiler, two to five times as fast where no large network is in the loop,
-      and equal up to rounding; XLA decides what is near to zero, and simulates what cannot be
-      translated. `"auto"` is native for a budget that is worth it, unless the search learns.
-    - `cheap`: a cheap model of the same features, searched first with 20 times the budget. At
-      most a quarter of the budget is spent on what it found. Only `problem` decides what fails.
-    - `proved`: what `verify` found of this problem, or its file. The run is of the rest, and is
-      resumed with it: `proved.rest(problem)`. A search that learns begins where the bounds of the
-      robustness are lowest, with an eighth of the budget at most, unless `first` says otherwise.
+    - `progress`: whether to show a progress bar; by default on a terminal or in a notebook.
+    - `target`: the name of the problem on the command line, for the record.
+    - `executor`: an executor whose workers simulate: Dask's `client.get_executor()`,
+      `clusters.RayExecutor()`, a process pool, or anything else with the `submit` of
+      `concurrent.futures`. On workers with this machine's kind of processor the table is the same,
+      bit for bit.
+    - `keep_going`: whether to go on if the first simulations all raise. Otherwise the run ends with
+      an error after 16 that raise the same, or after a first round of many at once.
+    - `engine`: `"xla"`, or `"native"`: rows from the 513th on are simulated by vector code that the
+      machine's own C++ compiler builds. It is two to five times as fast if no large network is in
+      the loop, and equal up to rounding; XLA decides values near zero, and simulates what cannot be
+      translated. `"auto"` uses native code if the budget is large enough to repay compiling and the
+      search does not learn.
+    - `cheap`: a cheap model of the same features. It is searched first, with 20 times the budget;
+      at most a quarter of the budget is spent on its failures. Only `problem` decides what fails.
+    - `proved`: the result of `verify` for this problem, or its file. The run searches only the part
+      that is not proved, `proved.rest(problem)`, and is resumed with that problem. A search that
+      learns first simulates the points where the bounds of the robustness are lowest, with at most
+      an eighth of the budget, unless `first` is given.
 
     Ctrl-C ends the run and returns what is finished. Likely mistakes of the problem are in `notes`.
 
@@ -159,8 +162,7 @@ def falsify(
     **Raises:** `ValueError` before anything compiles for options out of range, unknown names, a
     problem whose parts do not fit, a constraint that refuses every sample, a search that cannot
     work on the space, a folder that cannot be written or that another process writes; `RunError`
-    with the finished part of the run when the loop breaks down, and when all of the first
-    simulations raise.
+    with the finished part of the run if a round raises, and if all of the first simulations raise.
     """
     started = time.perf_counter()
     check_options(budget, 1 if batch is None else batch, seed, max_seconds, stop_after)
@@ -263,19 +265,19 @@ def simulate(
     executor: "Executor | None" = None,
     engine: str = "xla",
 ) -> Run:
-    """Simulate given features, in their order: no search, a row of the table for each.
+    """Simulate given features in their order, without a search; each is a row of the table.
 
     **Arguments:**
     - `rows`: a DataFrame with the feature columns of a table (from an analysis, another run, a
-      file), a row of one, or features as a person writes them, one or several.
+      file), one row of it, or one or several dictionaries of features.
     - all other arguments: as in `falsify`.
 
-    All are checked before anything is simulated, and simulated with exactly these numbers, in the
-    run's precision; those of a table give its bits again.
+    All rows are checked before the first is simulated, and simulated with exactly these numbers in
+    the run's precision; rows of a table give the same results again, bit for bit.
 
-    **Returns:** the run, with a row of its table for each of these.
-    **Raises:** `ValueError` for features that are missing or outside the space, and for no rows; as
-    `falsify`.
+    **Returns:** the run, with one row in its table for each given one.
+    **Raises:** `ValueError` for features that are missing or outside the space, and if there are no
+    rows; the errors of `falsify`.
     """
     in_precision(precision)
     given = points_of(problem, rows, precision)
@@ -308,27 +310,27 @@ def resume(
     even_if_changed: bool = False,
     keep_going: bool = False,
 ) -> Run:
-    """Go on with a run where it stopped, or where it was cut off, as if it had never stopped.
+    """Continue a run that stopped or was cut off, as if it had never stopped.
 
     **Arguments:**
-    - `run`: a run, or the folder of one; a folder is written on.
-    - `problem`: needed for a folder, which names no code to run.
-    - `search`: needed only if it is none of `verifai_jax.search`.
-    - `budget`: simulations in all, those done included; the run's own when left out.
+    - `run`: a run, or its folder; new rows are added to a folder.
+    - `problem`: needed for a folder, because a record names no code to run.
+    - `search`: needed only if the search is not one of `verifai_jax.search`.
+    - `budget`: simulations in all, including those already done; the run's own when left out.
     - `keep_going`: as in `falsify`.
-    - `even_if_changed`: whether to go on where files of the model are others than those that the
-      run recorded when it began; its rows are then of two models, it has no failure rate, and its
-      notes and its record say so.
+    - `even_if_changed`: whether to go on although files of the model have changed since the run
+      began. Its rows then come from two models: it has no failure rate, and its notes and its
+      record say so.
     - all other arguments: as in `falsify`.
 
     The table is that of an uninterrupted run with this budget and the same `batch` and `engine`,
-    bit for bit: the last round of a search that learns is simulated again where the earlier budget
-    cut it. The defaults of `engine` and of the `batch` of such a search depend on the budget, and
-    notes say where that of `batch` would be another for a run from the start.
+    bit for bit: if the earlier budget cut the last round of a search that learns, that round is
+    simulated again. The defaults of `engine` and of the `batch` of such a search depend on the
+    budget; a note says if a run from the start would have another default `batch`.
 
     **Returns:** the run with the earlier rows and the new ones.
     **Raises:** `ValueError` for a run without its problem or its state, a model that has changed, a
-    budget that is spent, or a folder that another process writes; as `falsify` otherwise.
+    budget that is spent, or a folder that another process writes; the errors of `falsify`.
     """
     ends = Ending(time.perf_counter(), 0, max_seconds, stop_after, stop_when)
     folder = Path(run) if isinstance(run, str | Path) else run.folder

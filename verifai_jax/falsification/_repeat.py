@@ -45,20 +45,19 @@ SIMULATIONS_A_CALL = 512
 class Trials(InNotebook):
     """The histories of one search from many seeds; what `repeat` returns.
 
-    - `name`, `search`: of the problem; the repr of the search.
-    - `seeds`: `[seeds]`.
-    - `batch`: simulations a round.
-    - `rho`: `[seeds, simulations]`, the least formula's robustness, NaN where a simulation has no
-      verdict.
+    - `name`, `search`: the name of the problem; the repr of the search.
+    - `seeds`: `[seeds]`, the seeds.
+    - `batch`: simulations in a round.
+    - `rho`: `[seeds, simulations]`, the least robustness of the formulas; NaN without a verdict.
     - `violated`: `[seeds, simulations]`, which simulations violate the property, as in `falsify`.
     - `failures`: `[seeds, d]`, the first failing point of each seed in the unit cube, NaN without
       one.
-    - `not_claimed`: `[seeds, simulations]`, which of the violating simulations are no failures by
-      closer replays, as in `falsify`; None if these were not asked for. Of a seed they end with
-      the first failure that is claimed, unless it was to go on.
-    - `differentiated`: `[seeds, simulations]`, which were differentiated; None if none or all
-      were.
-    - `sources`: what the model was made of, as a run records it.
+    - `not_claimed`: `[seeds, simulations]`, which violating simulations closer replays reject, as
+      in `falsify`; None without closer replays. Unless all violations were replayed, replays of a
+      seed end with its first claimed failure.
+    - `differentiated`: `[seeds, simulations]`, which simulations were differentiated; None if none
+      or all were.
+    - `sources`: the files of the model, as a run records them.
     """
 
     name: str
@@ -73,7 +72,7 @@ class Trials(InNotebook):
     sources: Mapping[str, Any] = field(default_factory=dict)
 
     def cost(self, derivative: float = 2.0) -> Float[np.ndarray, " seeds"]:
-        """Return `first_failure` with each differentiated simulation counted as so many."""
+        """Return `first_failure`, counting each differentiated simulation as this many."""
         first = self.first_failure
         if self.differentiated is None:
             return first
@@ -82,37 +81,37 @@ class Trials(InNotebook):
 
     @property
     def first_failure(self) -> Float[np.ndarray, " seeds"]:
-        """The number, from 1, of each seed's first failing simulation; infinite without one.
+        """The number, from 1, of each seed's first failing simulation; infinite if none fails.
 
-        Of those that are claimed, where closer replays were asked for.
+        With closer replays only claimed failures count.
         """
         refused = self.not_claimed
         return _first(self.violated if refused is None else self.violated & ~refused)
 
     @property
     def first_violation(self) -> Float[np.ndarray, " seeds"]:
-        """The number of each seed's first violating simulation, as simulated; infinite without."""
+        """The number of each seed's first violation before closer replays; infinite without one."""
         return _first(self.violated)
 
     @property
     def falsified(self) -> int:
-        """Seeds that found a failure."""
+        """Number of seeds that found a failure."""
         return int(np.isfinite(self.first_failure).sum())
 
     @property
     def violating(self) -> int:
-        """Seeds that found a violation as simulated, claimed or not."""
+        """Number of seeds that found a violation, whether or not it is claimed."""
         return int(np.isfinite(self.first_violation).sum())
 
     @property
     def mean_simulations(self) -> float:
-        """Mean simulations to the first failure, of the seeds that found one; NaN if none did."""
+        """Mean simulations to the first failure, over the seeds that found one; NaN if none did."""
         found = self.first_failure[np.isfinite(self.first_failure)]
         return float(found.mean()) if len(found) else float("nan")
 
     @property
     def median_simulations(self) -> float:
-        """Median simulations to the first failure, infinite if half of the seeds found none."""
+        """Median simulations to the first failure; infinite if half of the seeds found none."""
         ordered = np.sort(self.first_failure)
         return float((ordered[(len(ordered) - 1) // 2] + ordered[len(ordered) // 2]) / 2)
 
@@ -145,31 +144,31 @@ def repeat(
     confirm: bool = True,
     progress: bool | None = None,
 ) -> Trials:
-    """Run a search from many seeds at once; each asks for what `falsify` with its seed would.
+    """Run a search from many seeds at once; each seed proposes what it would in `falsify`.
 
     **Arguments:**
     - `budget`: simulations of each seed, rounded up to whole batches.
     - `batch`, `precision`, `backend`: as in `falsify`.
-    - `seeds`: which, or how many from 0 on.
-    - `stop_early`: end once every seed has found a failure. Seeds of a search that plans its
-      rounds (`portfolio`, `gradient`) each end with their own first failure.
-    - `confirm`: count as failures what `falsify` would claim: a violation is replayed more finely,
-      and one that is `refuted` or `fragile` is none. A replay costs ten simulations and more, so of
-      each seed only the first violations are replayed, until one is claimed (all of them without
-      `stop_early`), those of all seeds together. False to count violations as simulated, which
+    - `seeds`: the seeds, or their number, counted from 0.
+    - `stop_early`: end once every seed has found a failure. For a search that plans its rounds
+      (`portfolio`, `gradient`) each seed ends with its own first failure.
+    - `confirm`: count only failures that `falsify` would claim: a violation is replayed more
+      finely, and does not count if it is `refuted` or `fragile`. A replay costs at least ten
+      simulations, so violations of a seed are replayed in order until one is claimed (all of them
+      without `stop_early`), for all seeds together. False counts violations as simulated, and
       compiles nothing but the search.
     - `progress`: whether to show one line of progress; see `core.display.progress` for the default.
 
-    A search that plans its rounds learns that an unclaimed violation is none, as in `falsify`. Any
-    other that learns has its rounds compiled together and learns from them as simulated: after a
-    seed's first unclaimed violation its simulations may be others than those of `falsify`.
+    A search that plans its rounds observes an unclaimed violation as safe, as in `falsify`. Any
+    other search that learns has its rounds compiled together and observes results as simulated:
+    after a seed's first unclaimed violation its simulations may differ from those of `falsify`.
 
-    **Returns:** the robustness and the verdicts of each seed's simulations, as simulated, and which
-    of the violations are not claimed.
-    **Raises:** as `falsify`; `AlwaysRaises` where all of the first simulations raise, so that more
-    of them would say nothing else; `ValueError` for a black box, a constraint (`where=`), a
-    priority, a guide or the search `trace_surrogate`, which are dealt with between rounds: use
-    `falsify` with one seed after the other.
+    **Returns:** the robustness and the verdicts of each seed's simulations, as simulated, and the
+    violations that are not claimed.
+    **Raises:** the errors of `falsify`; `AlwaysRaises` if all of the first simulations raise the
+    same error; `ValueError` for a black box, a constraint (`where=`), a priority, a guide or the
+    search `trace_surrogate`, which need work between rounds: use `falsify` with one seed after the
+    other.
     """
     check_options(budget, 1 if batch is None else batch, 0, None, None)
     search = check_search(problem, search)

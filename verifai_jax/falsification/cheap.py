@@ -27,8 +27,8 @@ LOWEST = 0.02
 def check_same_features(slow: Problem, cheap: Problem) -> None:
     """Check that two problems have the same features.
 
-    **Raises:** `TypeError` for something that is no problem; `ProblemError` that names the first
-    feature in which they differ.
+    **Raises:** `TypeError` for an argument that is not a problem; `ProblemError` that names the
+    first feature in which they differ.
     """
     if not isinstance(cheap, Problem):
         raise TypeError(f"cheap must be a Problem; got {type(cheap).__name__}")
@@ -47,18 +47,18 @@ def check_same_features(slow: Problem, cheap: Problem) -> None:
 
 
 def budget_for(budget: int) -> int:
-    """Return the simulations of a cheap model for a budget of the slow one."""
+    """Return the number of simulations of a cheap model, given the budget of the slow one."""
     return min(TIMES * budget, MAX_CHEAP)
 
 
 def gravest_rows(run: Run, cheap: Problem, budget: int) -> "pd.DataFrame":
-    """Choose rows of a run: its gravest failure, then failures that are far from those before.
+    """Choose rows of a run: its gravest failure, then failures far from those chosen before.
 
-    Where few rows fail, those of the lowest robustness count as failures.
+    If few rows fail, those with the lowest robustness are used as well.
 
     **Arguments:**
-    - `run`, `cheap`: the run of the cheap model, and this.
-    - `budget`: simulations of the slow one, of which these take a quarter at most.
+    - `run`, `cheap`: the run of the cheap model, and that model.
+    - `budget`: simulations of the slow model; at most a quarter of them go to these rows.
     """
     count = max(1, min(budget // 4, MAX_ROWS))
     space = cheap.space

@@ -24,18 +24,18 @@ ROW = "row"
 
 
 def import_tables() -> None:
-    """Import what tables are made of, which takes a fifth of a second."""
+    """Import the libraries that tables use, which takes a fifth of a second."""
     import pandas as pd  # noqa: F401
     import pyarrow as pa  # noqa: F401
 
 
 def length(columns: Columns) -> int:
-    """Return the number of rows."""
+    """Return the number of rows of a batch."""
     return len(columns["rho"])
 
 
 def cut(batch: Batch, begin: int, stop: int) -> Batch:
-    """Return those rows of a batch that have numbers from `begin` to `stop - 1`, as views."""
+    """Return the rows of a batch numbered from `begin` to `stop - 1`, as views."""
     first, columns = batch
     rows = slice(max(begin - first, 0), max(stop - first, 0))
     return max(begin, first), {name: values[rows] for name, values in columns.items()}
@@ -70,11 +70,11 @@ def from_frame(frame: "pd.DataFrame") -> Columns:
 
 
 def wrong_column(columns: Columns, numbers: Sequence[str] = ()) -> str:
-    """Say which column holds what it cannot; empty if all are as they were written.
+    """Name the column that holds values of a wrong type; empty if all columns are right.
 
     **Arguments:**
-    - `columns`: with `status`, `violated` and `rho`.
-    - `numbers`: names of features that are numbers.
+    - `columns`: the columns, among them `status`, `violated` and `rho`.
+    - `numbers`: names of the features that are numbers.
     """
     known = [status.name.lower() for status in Status]
     for each in columns["status"].tolist():
@@ -115,7 +115,7 @@ def _held(values: Shaped[np.ndarray, " n"]) -> str:
 
 
 def to_arrow(columns: Columns) -> "pa.RecordBatch":
-    """Return rows as a batch of Arrow's."""
+    """Return rows as a record batch of Arrow."""
     import pyarrow as pa
 
     return pa.RecordBatch.from_pydict(
@@ -124,7 +124,7 @@ def to_arrow(columns: Columns) -> "pa.RecordBatch":
 
 
 def column_to_arrow(values: Shaped[np.ndarray, " n"]) -> "pa.Array":
-    """Return a column as Arrow's; texts are texts, and null where absent, even if all are."""
+    """Return a column as an Arrow array; text has type string, with nulls, even if all are null."""
     import pandas as pd
     import pyarrow as pa
 
@@ -136,7 +136,7 @@ def column_to_arrow(values: Shaped[np.ndarray, " n"]) -> "pa.Array":
 
 
 def column_checksum(values: Shaped[np.ndarray, " n"], before: int | None = None) -> int:
-    """Return the checksum of a column; of a part of it after one with the checksum `before`."""
+    """Return the checksum of a column, continued from `before`, that of its earlier part."""
     import pandas as pd
 
     if values.dtype == object and len(values) and not isinstance(values[0], str):
@@ -158,13 +158,12 @@ STATUS_NAMES = np.array([status.name.lower() for status in Status], dtype=object
 def rows_of(
     problem: Problem, verdicts: Verdicts, differentiates: bool = False
 ) -> dict[str, np.ndarray]:
-    """Return the columns of the table, as the rows are before they are confirmed.
+    """Return the columns of the table for a round, before any row is confirmed.
 
     **Arguments:**
-    - `problem`: whose features and formulas name columns.
-    - `verdicts`: the verdicts of a round, with features.
-    - `differentiates`: whether clauses are differentiated in some rounds; the rows then say in
-      which.
+    - `problem`: the problem; its features and formulas name columns.
+    - `verdicts`: the verdicts of the round, with features.
+    - `differentiates`: whether some rounds differentiate clauses; a column then marks those rows.
     """
     count = len(verdicts.status)
     assert verdicts.features is not None

@@ -27,15 +27,15 @@ DRAWS: Slot[str, bool] = Slot("randomness of the system")
 
 
 class SeedConfirmer:
-    """Verdicts of closer replays, by the rule that `falsify` has.
+    """Verdicts of closer replays for many seeds, by the rule of `falsify`.
 
-    Violations beyond the first `LIMIT` of a seed that were replayed count as claimed, as there.
+    At most `LIMIT` violations of a seed are replayed; later ones count as claimed, as in `falsify`.
 
     **Arguments:**
-    - `problem`: on a backend that JAX traces.
+    - `problem`: the problem, on a backend that JAX traces.
     - `precision`: the precision of the simulations.
     - `seeds`: the seeds of the runs.
-    - `thorough`: replay all violations, not only each seed's until one is claimed.
+    - `thorough`: replay all violations of a seed, not only those up to the first claimed one.
     """
 
     def __init__(

@@ -14,18 +14,18 @@ from verifai_jax.falsification.columns import Columns
 
 @dataclass
 class Counts:
-    """Counts over a table, from the rows of it that stand out.
+    """Counts over a table, computed from its rows that are not ordinary safe rows.
 
     - `violating`: rows that violate the property as simulated.
     - `claimed`: those among them that closer replays did not refute.
-    - `failing_alone`: violating rows that violate this formula, where there are several.
+    - `failing_alone`: violating rows that violate only this formula, if there are several.
     - `failed`: rows without a verdict, by status, the most frequent first.
     - `verdicts`: violating rows by what closer replays say, the most frequent first.
-    - `repetitions`: how violating rows of a host system came again.
-    - `worst`: number of the row of least robustness among those claimed; None without one.
-    - `nearest`: that among all rows with a verdict.
+    - `repetitions`: how many violating rows of a host system gave the same result again.
+    - `worst`: number of the claimed row with the least robustness; None without one.
+    - `nearest`: number of the row with the least robustness among all rows with a verdict.
     - `lowest`: the least robustness of all rows; NaN where none has one.
-    - `first_message`: number and text of the first row that has one, of those without a verdict.
+    - `first_message`: number and text of the first row without a verdict that has a message.
     - `not_differentiated`: rows whose gradient is not finite.
     """
 
@@ -43,22 +43,22 @@ class Counts:
 
     @property
     def without_verdict(self) -> int:
-        """Rows without a verdict."""
+        """Number of rows without a verdict."""
         return sum(self.failed.values())
 
     @property
     def best(self) -> int | None:
-        """Number of the worst row, or of the nearest where none is claimed."""
+        """Number of the worst row, or of the nearest if none is claimed."""
         return self.nearest if self.worst is None else self.worst
 
 
 @dataclass
 class Tally:
-    """Counts over the rows of a run that is going on.
+    """Counts over the rows of a running run.
 
     - `claimed`: counterexamples that closer replays did not refute.
     - `violating`: simulations that violate the property.
-    - `without_verdict`: simulations that have none.
+    - `without_verdict`: simulations without a verdict.
     - `lowest`: the least robustness.
     """
 
@@ -75,7 +75,7 @@ class Tally:
         self.lowest = float(np.fmin(self.lowest, np.fmin.reduce(verdicts.lowest)))
 
     def numbers(self, simulations: int) -> dict[str, float]:
-        """Return plain numbers of a run with so many simulations, for callbacks."""
+        """Return plain numbers of the run after this many simulations, for callbacks."""
         return {
             "simulations": simulations,
             "violating": self.violating,
@@ -86,7 +86,7 @@ class Tally:
 
 
 def claimed_rows(columns: Columns) -> Bool[np.ndarray, " n"]:
-    """Tell rows that violate the property and are claimed to."""
+    """Mark rows that violate the property and are claimed as counterexamples."""
     claimed = violating_rows(columns)
     if "verdict" in columns:
         indices = np.flatnonzero(claimed)
@@ -95,12 +95,12 @@ def claimed_rows(columns: Columns) -> Bool[np.ndarray, " n"]:
 
 
 def violating_rows(columns: Columns) -> Bool[np.ndarray, " n"]:
-    """Tell rows that ended properly and violate the property as simulated."""
+    """Mark rows that ended properly and violate the property as simulated."""
     return (columns["status"] == "ok") & columns["violated"].astype(bool)
 
 
 def count(parts: Iterable[tuple[Int[np.ndarray, " n"], Columns]]) -> Counts:
-    """Count over parts of a table in their order: numbers of rows, and their columns."""
+    """Count over consecutive parts of a table, each given as row numbers and columns."""
     counts, statuses, verdicts = Counts(), Counter[str](), Counter[str]()
     lowest = {"worst": np.inf, "nearest": np.inf}
     for numbers, columns in parts:

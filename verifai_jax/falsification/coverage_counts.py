@@ -36,7 +36,7 @@ class CoverageCounts:
 
     @property
     def width(self) -> int:
-        """Number of coverage ids of a row at most."""
+        """Maximum number of coverage ids of a row."""
         return 1 + self._feature_width + self._shown
 
     @property
@@ -73,7 +73,7 @@ class CoverageCounts:
         return numbers.astype(np.int32)
 
     def add(self, rows: Int[np.ndarray, "n ids"]) -> Int[np.ndarray, " n"]:
-        """Count the coverage ids of rows; return how many of each row no earlier one had."""
+        """Count the coverage ids of rows; return how many ids of each row are new."""
         fresh = np.zeros(len(rows), np.int32)
         for i, row in enumerate(rows):
             own = np.unique(row[row >= 0])
@@ -86,6 +86,6 @@ class CoverageCounts:
         return {SEEN: self.counts.copy()}
 
     def restore(self, checkpoint: Mapping[str, Any]) -> None:
-        """Go on with the counts of a checkpoint."""
+        """Continue with the counts of a checkpoint."""
         if SEEN in checkpoint:
             self.counts = np.array(checkpoint[SEEN], np.int64)

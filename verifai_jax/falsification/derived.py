@@ -14,12 +14,12 @@ from verifai_jax.problem.problem import Problem
 
 
 def as_simulated(problem: Problem, record: Mapping[str, Any]) -> Problem:
-    """Return the problem that a run recorded, made of the one that was given.
+    """Derive from the given problem the one that the run simulated, as its record says.
 
     **Arguments:**
-    - `problem`: as a person wrote it, or the one of the run itself, which stays as it is.
+    - `problem`: the user's problem, or the run's own, which is returned unchanged.
     - `record`: the record of the run.
-    **Returns:** the given problem where nothing was made of it, or where it cannot be made.
+    **Returns:** the given problem if none was derived from it, or if deriving fails.
     """
     problem = _with_held(problem, record)
     derived = record.get("derived")

@@ -40,9 +40,9 @@ class Batch(NamedTuple):
     """The points of a round.
 
     - `points`: the points of the unit cube, or rows of given features (`given_rows`).
-    - `source`: who gave them.
+    - `source`: who proposed them.
     - `cut`: whether the budget cut the round.
-    - `verdicts`: if workers have simulated them already.
+    - `verdicts`: their verdicts, if workers have simulated them already.
     """
 
     points: Float[Any, "n row"]
@@ -57,15 +57,14 @@ class Batch(NamedTuple):
 
 
 class Learning:
-    """The search of a run with what it knows of the simulations; see the module's docstring.
+    """The search of a run with all that it has learned; see the module's docstring.
 
     **Arguments:**
     - `problem`: the problem of the run.
     - `search`: the search of the run.
     - `key`: the key of the search.
 
-    `surrogate` models the traces for a search that wants it, `coverage_ids` counts what was
-    covered.
+    `surrogate` models the traces if the search wants that; `coverage_ids` counts covered items.
     """
 
     def __init__(self, problem: Problem, search: Search, key: Key[Array, ""]) -> None:
@@ -90,7 +89,7 @@ class Learning:
         self.take(search)
 
     def take(self, search: Search) -> None:
-        """Learn by this search from now on."""
+        """Use this search from now on."""
         self.search = search
         if search.wants.traces is not None:
             from verifai_jax.falsification.surrogates import Surrogate
@@ -99,11 +98,11 @@ class Learning:
 
     @property
     def coverage_id_count(self) -> int:
-        """Number of coverage ids of a row at most; 0 if none are counted."""
+        """Maximum number of coverage ids of a row; 0 if none are counted."""
         return 0 if self.coverage_ids is None else self.coverage_ids.width
 
     def begin(self, batch: int) -> None:
-        """Begin the proposals of the search."""
+        """Start the search."""
         space = self.problem.space
         improve = None if self.surrogate is None else self.surrogate.improve
         self.proposals = Proposals(
@@ -118,18 +117,18 @@ class Learning:
 
     @property
     def distinct(self) -> int | None:
-        """Failures that are far from each other, of a search for diverse ones; else None."""
+        """Failures that are far from each other, for a search for diverse ones; else None."""
         return self.proposals.distinct
 
     @property
     def acceptance(self) -> float | None:
-        """Share of proposed points that the constraint let through; None without one."""
+        """Share of proposed points that satisfy the constraint; None without one."""
         if self.problem.space.where is None or self.proposals is None:
             return None
         return self.proposals.accepted / max(self.proposals.proposed, 1)
 
     def objective(self, verdicts: Verdicts) -> Float[np.ndarray, " n"]:
-        """Return what the search minimises; with a priority it depends on the rows before."""
+        """Return what the search minimises; with a priority it depends on earlier rows."""
         if self._objective is None:
             return verdicts.lowest
         return self._objective(verdicts.rho, verdicts.rho < 0)
@@ -144,8 +143,8 @@ class Learning:
         """Let the search learn from a round.
 
         **Arguments:**
-        - `batch`: its points, of the unit cube.
-        - `objective`: what the search minimises at each of them.
+        - `batch`: the points of the round, in the unit cube.
+        - `objective`: the number at each point that the search minimises.
         - `verdicts`: the verdicts of its simulations.
         - `coverage_ids`: the coverage of its simulations, for a search that wants them.
         """
@@ -235,7 +234,7 @@ class Learning:
         self.proposals.warm_start(points, rho)
 
     def checkpoint(self) -> dict[str, Any]:
-        """Return what it knows as entries of a checkpoint, but for the state of the search."""
+        """Return what was learned as entries of a checkpoint, without the search's state."""
         weighed = self._likelihood or self._objective
         state = {} if weighed is None else weighed.state
         entries: dict[str, Any] = {f"objective.{name}": value for name, value in state.items()}
@@ -244,7 +243,7 @@ class Learning:
         return entries
 
     def restore(self, checkpoint: Mapping[str, Any]) -> None:
-        """Go on from a checkpoint.
+        """Continue from a checkpoint.
 
         **Raises:** `ValueError` for a checkpoint of another search, space or batch size.
         """

@@ -49,11 +49,11 @@ class Likelihood:
     def learned(
         self, points: Float[np.ndarray, "n d"], rho: Float[np.ndarray, " n"], verdicts: Verdicts
     ) -> tuple[Float[np.ndarray, " n"], Verdicts]:
-        """Return the objective, and verdicts whose clauses and gradients are those of it.
+        """Return the objective, and verdicts with its clauses and gradients.
 
         **Arguments:**
         - `points`: the points of a round, in the unit cube.
-        - `rho`: what a search would minimise; positive where a failure is not claimed.
+        - `rho`: the objective of a usual search; positive where a failure is not claimed.
         - `verdicts`: the verdicts of their simulations.
         """
         points = np.asarray(points, np.float64)

@@ -38,9 +38,9 @@ class SeedHistories(NamedTuple):
     - `rho`: the least robustness; NaN where there is no simulation or no verdict.
     - `violated`: whether the simulation violates the property.
     - `differentiated`: whether derivatives were taken.
-    - `failures`: the first failing point of each seed in the unit cube, of those that closer
-      replays were made for the first that is claimed; NaN without one.
-    - `not_claimed`: whether closer replays say that a violating simulation is no failure.
+    - `failures`: the first failing point of each seed in the unit cube; the first claimed one if
+      closer replays were made; NaN without one.
+    - `not_claimed`: whether closer replays reject a violating simulation.
     """
 
     rho: Float[np.ndarray, "seeds simulations"]
@@ -62,10 +62,11 @@ def lockstep(
 ) -> SeedHistories:
     """Run the search from every seed and return the histories.
 
-    A seed that has found a failure makes no further simulation if `stop_early`. With `claims` a
-    failure is what these claim, and the search learns from all other rows, as in `falsify`.
+    With `stop_early` a seed that has found a failure makes no further simulation. With `claims`
+    only claimed violations are failures, and the search observes all others as safe, as in
+    `falsify`.
 
-    **Raises:** `AlwaysRaises` where all of the first simulations raise.
+    **Raises:** `AlwaysRaises` if all of the first simulations raise the same error.
     """
     cube, n = problem.space.cube, len(seeds)
     keys = [run_keys(int(seed)) for seed in seeds]

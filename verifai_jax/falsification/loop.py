@@ -49,15 +49,14 @@ COMPILE, SEARCH, SIMULATE, CONFIRM, REST = "compile", "search", "simulate", "con
 
 
 class Rounds:
-    """The rounds of one run; `compile` first, then `advance` as often as wanted.
+    """The rounds of one run; call `compile` first, then `advance` as often as wanted.
 
     `first` are rows of given features (`given_rows`) that are simulated before the search proposes
-    any; `suggestions` are those that somebody gives on the way, None if nobody is asked.
-    `record_checksum` is that of the run's record, for the checkpoints. `only_budget_ends` is
-    whether only the budget is to end the run. `checks` names the closer replays that were made.
-    `watch` has the seconds of all: to `COMPILE`; to `SEARCH`, which the search took for its
-    proposals and to learn, and whoever suggests points to think of them; to `SIMULATE`, and to put
-    the rows into the table; to `CONFIRM`. The rest is whoever advances the rounds.
+    any; `suggestions` are points that a user's function gives during the run, None without one.
+    `record_checksum` is the checksum of the run's record, for the checkpoints. `only_budget_ends`
+    is true if nothing but the budget can end the run. `checks` names the closer replays that were
+    made. `watch` measures seconds: `COMPILE`; `SEARCH`, for proposals, learning and suggestions;
+    `SIMULATE`, including adding rows to the table; `CONFIRM`. All other time belongs to the caller.
     """
 
     def __init__(
@@ -111,10 +110,10 @@ class Rounds:
         self._raising = Raising()
 
     def compile(self, resumed: bool = False) -> None:
-        """Compile the engine and the search, side by side.
+        """Compile the engine and the search, concurrently.
 
-        - `resumed`: whether the first round is one of any kind; a new run begins with gradients
-          where the first stage of the search wants those of clauses.
+        - `resumed`: whether the first round may be of any kind. A new run begins with gradients if
+          the first stage of the search wants those of clauses.
         """
         cube = self.problem.space.cube
         while_compiling(import_tables, after=0.0)
@@ -137,7 +136,7 @@ class Rounds:
     def advance(self, maximum: int, limit: int | None = None) -> None:
         """Propose, simulate, confirm, learn and store at most `maximum` simulations.
 
-        - `limit`: simulations of the whole run, up to which points may be sent ahead to workers.
+        - `limit`: simulations of the whole run; points up to there may be sent ahead to workers.
         """
         with self.watch.on(SIMULATE):
             batch = self._next_points(maximum, limit)
@@ -286,9 +285,9 @@ class Rounds:
             proposals.wait()
 
     def ask(self, search: "Suggested", checkpoint: Mapping[str, Any] | None = None) -> None:
-        """Ask somebody for suggestions from now on, or go on asking from a checkpoint.
+        """Ask a function for suggestions from now on, or continue asking from a checkpoint.
 
-        **Raises:** `ValueError` if questions are left of a checkpoint and nobody to ask.
+        **Raises:** `ValueError` if a checkpoint has open questions and no function is given.
         """
         from verifai_jax.falsification.suggestions import Suggestions
 
@@ -302,13 +301,13 @@ class Rounds:
         self.save()
 
     def measure(self, maximum: int, timed: bool) -> float:
-        """Simulate the first rows, and return the least seconds that one took.
+        """Simulate the first rows, and return the shortest time of one in seconds.
 
-        They are rows of the run. One by one, a first one that is quick is the only one, unless it
-        raises.
+        These rows belong to the run. They are simulated one by one; if the first is quick and does
+        not raise, it is the only one.
 
-        - `maximum`: of the first round.
-        - `timed`: whether the seconds are wanted, for which they are simulated one by one.
+        - `maximum`: maximum size of the first round.
+        - `timed`: whether the time is wanted, for which rows are simulated one by one.
         """
         if not len(self.first):
             with self._searching():
@@ -320,7 +319,7 @@ class Rounds:
     def take_in_measured(self) -> None:
         """Store the rows that were simulated one by one, without the rest of their round.
 
-        The checkpoint stays before them: a run that goes on simulates their whole round.
+        The checkpoint stays before them: a resumed run simulates their whole round.
         """
         given = len(self.first) > 0
         points = np.asarray(self.first if given else self._pending)[: self._simulations.measured]
@@ -330,12 +329,12 @@ class Rounds:
 
     @property
     def hopeless(self) -> str | None:
-        """The message of all simulations, if more of them would only say it again; else None."""
+        """The message that all simulations raised, which makes more pointless; else None."""
         measured = self._simulations.hopeless
         return self._raising.reason if measured is None else measured
 
     def switch(self, search: Search, note: str, batch: int) -> None:
-        """Go on with another search, for which the rows that are measured are given ones."""
+        """Continue with another search; the rows simulated so far are given rows for it."""
         if not len(self.first) and self._simulations.measured:
             self.first = np.asarray(self._pending)[: self._simulations.measured]
         self._pending = None
@@ -372,17 +371,17 @@ class Rounds:
 
     @property
     def simulated_by(self) -> str:
-        """The engine of the rows, as far as it is decided."""
+        """The engine that simulates the rows, as far as it is decided."""
         return self.evaluate.simulated_by
 
     @property
     def confirms(self) -> bool:
-        """True if only what closer replays confirm is claimed."""
+        """True if only violations that closer replays confirm are claimed."""
         return self._confirmer is not None
 
     @property
     def distinct(self) -> int:
-        """Counterexamples found, of a search for diverse ones those far from each other."""
+        """Counterexamples found; with a search for diverse ones, those far from each other."""
         distinct = self.learning.distinct
         return self.tally.claimed if distinct is None else distinct
 
@@ -401,12 +400,12 @@ class Rounds:
         return proposals is not None and proposals.exhausted and not waiting
 
     def close(self) -> None:
-        """Cancel what workers have been sent ahead and have not begun."""
+        """Cancel work that was sent ahead to workers and has not begun."""
         if self._prefetch is not None:
             self._prefetch.close()
 
     def save(self, seldom: bool = False) -> None:
-        """Write the checkpoint to the folder; if `seldom`, only when the last one is a second old.
+        """Write the checkpoint to the folder; if `seldom`, at most once a second.
 
         **Raises:** `OSError` where it cannot be written.
         """
@@ -422,7 +421,7 @@ class Rounds:
             self._journal.settle(int(self.checkpoint.get("rows", 0)))
 
     def resume(self, checkpoint: Mapping[str, Any]) -> None:
-        """Go on where `checkpoint` was taken; the table must hold its rows already.
+        """Continue from `checkpoint`; the table must hold its rows already.
 
         **Raises:** `ValueError` for a checkpoint of another search, space or batch size.
         """

@@ -31,7 +31,7 @@ EVEN = "even_if_changed=True (--even-if-changed) goes on all the same, and notes
 
 
 def sources_of_row(recorded: Sequence[Mapping[str, Any]], row: int) -> Sources | None:
-    """Return what a row of a run was simulated with; None if it is not recorded."""
+    """Return the files that a row of a run was simulated with; None if they are not recorded."""
     parts = [Sources.from_json(part) for part in recorded]
     return next((part for part in reversed(parts) if part.first <= row), None)
 
@@ -39,12 +39,12 @@ def sources_of_row(recorded: Sequence[Mapping[str, Any]], row: int) -> Sources |
 def model_changes(
     recorded: Sequence[Mapping[str, Any]], now: Sources | None, row: int | None = None
 ) -> tuple[Change, ...]:
-    """Return the files of a result's model that are others now.
+    """Return the files of a result's model that have changed.
 
     **Arguments:**
-    - `recorded`: by the run or the sweep.
-    - `now`: what the model is made of now; without it what lies on the disk counts.
-    - `row`: the row of a run; every model that the run was simulated with if None.
+    - `recorded`: the files recorded by the run or the sweep.
+    - `now`: the present files of the model; without it the files on disk are read.
+    - `row`: the row of a run; if None, every model that the run was simulated with.
     **Returns:** the changes; empty if nothing is recorded.
     """
     parts = [Sources.from_json(part) for part in recorded]
@@ -62,15 +62,15 @@ def continued_with(
     rows: int,
     even_if_changed: bool,
 ) -> tuple[tuple[Mapping[str, Any], ...], str]:
-    """Return the record of the models of a run that goes on, and a note where one is another.
+    """Return the models' record for a continued run, and a note if the model has changed.
 
     **Arguments:**
     - `name`: the name of the run.
-    - `recorded`: by the run.
-    - `problem`: with which it goes on.
-    - `rows`: that it has.
-    - `even_if_changed`: whether another model will do.
-    **Raises:** `ValueError` for another model, unless that will do.
+    - `recorded`: the record of the run.
+    - `problem`: the problem with which the run goes on.
+    - `rows`: number of rows that the run has.
+    - `even_if_changed`: whether a changed model is accepted.
+    **Raises:** `ValueError` for a changed model that is not accepted.
     """
     now = problem.sources(first=rows)
     if not recorded:
@@ -93,13 +93,13 @@ def continued_with(
 
 
 def has_several_models(recorded: Sequence[Mapping[str, Any]]) -> bool:
-    """Return whether the rows of a run are of several models, and so no sample of any of them."""
+    """Return whether rows of a run come from several models, and so sample none of them."""
     parts = [Sources.from_json(part) for part in recorded]
     return any(before.changes(after) for before, after in pairwise(parts))
 
 
 def changed_since(changes: Sequence[Change], row: int | None, what: str = "the run") -> str:
-    """Say that the model has changed; empty if it has not."""
+    """Describe how the model has changed; empty if it has not."""
     if not changes:
         return ""
     when = what if row is None else f"row {row} was simulated"
@@ -109,13 +109,13 @@ def changed_since(changes: Sequence[Change], row: int | None, what: str = "the r
 def finding_of(
     seen: "Replay", stored: Mapping[str, Any], several: bool, near: float | None = None
 ) -> str:
-    """Say that a replay does not give the number of its row; empty if it does.
+    """Describe how a replay differs from its row; empty if it does not.
 
     **Arguments:**
-    - `seen`: the replay, in the precision of the run unless `near` says what may differ.
+    - `seen`: the replay, in the precision of the run unless `near` is given.
     - `stored`: the row of the table.
     - `several`: whether the problem has several formulas.
-    - `near`: share of the signals by which the number may differ; that of rounding when left out.
+    - `near`: share of the signals by which the number may differ; by default that of rounding.
     """
     before = str(stored.get("status", "ok"))
     now = seen.status.name.lower()

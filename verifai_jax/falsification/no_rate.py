@@ -48,7 +48,7 @@ _NO_RATE = "The points between the {rows} samples: nothing is known of them."
 
 
 def why_no_rate(run: Run) -> str:
-    """Say why the rows of a run give no failure rate; empty if they are samples of the prior."""
+    """Explain why a run's rows give no failure rate; empty if they are samples of the prior."""
     if run.prior:
         return ""
     if run.origin == "first":
@@ -58,12 +58,12 @@ def why_no_rate(run: Run) -> str:
 
 
 def remedy(run: Run) -> str:
-    """Say how a run that has no failure rate would have one."""
+    """Say how to run the problem so that the run has a failure rate."""
     return _REMEDY.get(run.origin, _UNIFORM)
 
 
 def what_lies_between(run: Run) -> str:
-    """Say what is not known of the points that a run did not simulate."""
+    """Say what remains unknown about points that a run did not simulate."""
     origin = "prior" if run.prior else run.origin
     text = _BETWEEN[origin]
     if run.prior and run.failure_rate is None:

@@ -40,12 +40,12 @@ class _Round(NamedTuple):
 
 
 class Prefetch:
-    """The rounds that are on their way; see the module's docstring.
+    """The rounds that workers simulate ahead of time; see the module's docstring.
 
     **Arguments:**
     - `proposals`: the proposals of a search that does not learn.
-    - `evaluate`: with an executor, or of a system that this process compiles.
-    - `batch`: rows of a round.
+    - `evaluate`: the evaluator, with an executor or of a system that this process compiles.
+    - `batch`: rows in a round.
     - `limit`: rows of the whole run.
     - `first`: number of the next row.
     - `searching`: a context around each proposal.
@@ -71,13 +71,13 @@ class Prefetch:
 
     @property
     def empty(self) -> bool:
-        """True where no round is on its way."""
+        """True if no round has been sent ahead."""
         return not self._rounds
 
     def next(self) -> tuple[Float[Any, "n d"], Verdicts | None]:
-        """Return the points of the next round and their verdicts; no points where there are none.
+        """Return the points of the next round and their verdicts; no points if there is no round.
 
-        **Raises:** what proposing or evaluating this round raises.
+        **Raises:** the error that proposing or evaluating this round raised.
         """
         self._fill()
         if not self._rounds:
@@ -92,7 +92,7 @@ class Prefetch:
         return each.points, _rows(whole, part)
 
     def close(self) -> None:
-        """Cancel what is queued, and put the proposals back to where the last round taken ended."""
+        """Cancel queued rounds, and reset the proposals to the end of the last round taken."""
         if self._rounds or self._failure is not None:
             for each in self._rounds:
                 each.pending.cancel()

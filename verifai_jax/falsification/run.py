@@ -35,48 +35,48 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class Run(InNotebook):
-    """The result of a falsification: its table, its record, and what follows from them.
+    """The result of a falsification: its table and its record, with methods to evaluate them.
 
     - `name`: the name of the problem.
-    - `formulas`: their texts by name.
-    - `table`, `search`: one row a simulation, and the repr of what proposed them.
+    - `formulas`: the texts of the formulas by name.
+    - `table`, `search`: one row for each simulation; the repr of the search that proposed them.
     - `seed`, `batch`, `budget`: as given to `falsify`.
     - `stopped`: `"budget"`, `"max_seconds"`, `"stop_after"`, `"stop_when"`, `"exhausted"` (a finite
       search came to its end), `"interrupted"`, the error that ended it, or `"running"` for one that
       was cut off.
-    - `compile_seconds`, `confirm_seconds`, `run_seconds`: time of all parts of the run spent
-      compiling, in closer replays, and in everything else.
-    - `search_seconds`: the part of `run_seconds` that proposals and suggestions took, and learning
-      from what came of them.
-    - `simulate_seconds`: the part of `run_seconds` that simulations took, and their rows to be put
-      into the table. What is left is that of callbacks and checkpoints.
+    - `compile_seconds`, `confirm_seconds`, `run_seconds`: time spent compiling, in closer replays,
+      and in everything else, over all parts of the run.
+    - `search_seconds`: the part of `run_seconds` spent on proposals, suggestions and learning.
+    - `simulate_seconds`: the part of `run_seconds` spent on simulations and on adding rows to the
+      table. The rest went to callbacks and checkpoints.
     - `version`: the version of verifai_jax.
     - `prior`: whether the rows are independent samples of the feature space.
-    - `origin`: why the rows are no such samples: `"first"` (given rows came first), `"given"` (all
-      were given), `"sequence"` (of points that spread), `"coverage"`, `"learned"` (by the search).
-    - `folder`: on disk; None for a run in memory.
+    - `origin`: why the rows are not such samples: `"first"` (given rows came first), `"given"` (all
+      were given), `"sequence"` (a low-discrepancy sequence), `"coverage"`, `"learned"` (by the
+      search).
+    - `folder`: the folder on disk; None for a run in memory.
     - `target`: the problem's name on the command line.
-    - `problem`: None for a run that was loaded without it.
-    - `search_data`, `space_data`: search and space as plain data; None for one of the user's own.
+    - `problem`: the problem; None for a run that was loaded without it.
+    - `search_data`, `space_data`: search and space as plain data; None for a user's own class.
     - `acceptance`: share of proposed points that the constraint accepted; None without one.
     - `checkpoint`: the checkpoint that `resume` goes on from.
-    - `precision`: `"float32"` or `"float64"`, of the simulations.
-    - `backend`: the engine that simulated; None for a system that has one only.
+    - `precision`: the precision of the simulations, `"float32"` or `"float64"`.
+    - `backend`: the backend that simulated; None for a system that has only one.
     - `engine`: `"xla"`, `"native"` for rows from the 513th on, or `"host"` for a black box;
       `"auto"` before it is decided.
-    - `notes`: decisions that were made without the user.
-    - `lasting_notes`: those of `notes` that are still true when the run goes on.
+    - `notes`: decisions that were made without asking the user.
+    - `lasting_notes`: the `notes` that stay true when the run is resumed.
     - `confirm`: whether violations were replayed more finely before they were claimed.
     - `checks`: names of the checks that a confirmed row has passed; empty if none was made.
     - `first`: points of the unit cube that were simulated before the search began.
     - `guide`: the term that steered the search, as plain data; None without one.
-    - `sources`: what the model was made of when the run began, and again where it went on with
-      another one: files with their hashes, and versions, as plain data; empty if that is not
-      recorded.
-    - `derived`: what a verb made of the problem, as plain data; None if nothing.
-    - `requirements`: what the requirements of its formulas said, by identifier, as plain data.
-    - `model`: a hash of what was simulated, of a problem with requirements.
-    - `damage`: what of its files could not be read; such a run cannot be resumed.
+    - `sources`: the files of the model with their hashes, and versions, as plain data: recorded
+      when the run began, and again when it was resumed with a changed model; empty if not recorded.
+    - `derived`: how a verb derived its own problem from the user's, as plain data; None if it did
+      not.
+    - `requirements`: the content of the formulas' requirements, by identifier, as plain data.
+    - `model`: a hash of the simulated model, for a problem with requirements.
+    - `damage`: which parts of its files could not be read; such a run cannot be resumed.
     """
 
     _internal = frozenset((
@@ -129,7 +129,7 @@ class Run(InNotebook):
 
     @property
     def simulations(self) -> int:
-        """Simulations in the table."""
+        """Number of simulations in the table."""
         return len(self.table)
 
     @property
@@ -144,7 +144,7 @@ class Run(InNotebook):
 
     @property
     def best(self) -> "pd.Series":
-        """The row with the least robustness among the counterexamples, or among all that ended.
+        """The counterexample with the least robustness; without any, the row with the least one.
 
         **Raises:** `ValueError` when no simulation ended properly.
         """
@@ -160,12 +160,13 @@ class Run(InNotebook):
     def failure_rate(self) -> "Rate | None":
         """Failures per simulation with a 95 % interval.
 
-        It is the rate as simulated, whatever closer replays say of single rows. Clopper-Pearson
-        where the number of simulations was not decided by their outcomes, else one that holds
-        whenever sampling stops. A simulation without a verdict is taken for safe at the lower end
-        of the interval and for failing at the upper end. None unless the rows are independent
-        samples of the feature space and at least one of them has a verdict: an active search may
-        refute, it never certifies. None too where the run went on with another model.
+        The rate counts violations as simulated, whatever closer replays say about single rows. It
+        is a Clopper-Pearson interval if outcomes did not decide the number of simulations,
+        otherwise one that is valid whenever sampling stops. A simulation without a verdict counts
+        as safe at the lower end of the interval and as failing at the upper end. None unless the
+        rows are independent samples of the feature space and at least one has a verdict: a search
+        that learns can find failures, but its rows do not estimate a rate. Also None if the run
+        went on with a changed model.
         """
         return self._rate(self.table.counts.violating, 0)
 
@@ -173,9 +174,9 @@ class Run(InNotebook):
     def confirmed_failure_rate(self) -> "Rate | None":
         """Confirmed failures per simulation with a 95 % interval; as `failure_rate`.
 
-        Refuted rows are taken for safe. Those that closer replays left undecided, or did not reach,
-        are taken for safe at the lower end of the interval and for failing at the upper end. None
-        where no row was decided.
+        Refuted rows count as safe. Rows that closer replays left undecided or did not reach count
+        as safe at the lower end of the interval and as failing at the upper end. None if no row was
+        decided.
         """
         counts = self.verdict_counts
         if not any(counts.get(verdict) for verdict in ("confirmed", "refuted", "fragile")):
@@ -203,10 +204,10 @@ class Run(InNotebook):
 
     @property
     def front(self) -> "pd.DataFrame":
-        """The counterexamples that no other one outdoes: with several formulas, the Pareto set.
+        """The counterexamples that no other one dominates: with several formulas, the Pareto set.
 
-        Compared by how much each formula is broken, in the order of the problem's priority;
-        without one no formula makes up for another. With one formula: the worst row.
+        They are compared by how far each formula is broken, in the order of the problem's priority;
+        without a priority no formula can make up for another. With one formula it is the worst row.
 
         **Raises:** `ValueError` for a run loaded without its problem.
         """
@@ -223,28 +224,28 @@ class Run(InNotebook):
 
     @property
     def has_several_models(self) -> bool:
-        """True where the run went on although its model had changed."""
+        """True if the run went on although its model had changed."""
         return has_several_models(self.sources)
 
     def changes(self, row: int | None = None) -> tuple[Change, ...]:
-        """Return the files of the model that are others by now, with both hashes.
+        """Return the files of the model that have changed since, with both hashes.
 
-        The model of now is that of the run's problem; of a run without it, what lies on the disk.
+        The present model is that of the run's problem; for a run without it, the files on disk.
 
-        - `row`: the row that is asked about; all rows when left out.
+        - `row`: the row in question; all rows when left out.
         """
         now = None if self.problem is None else self.problem.sources()
         return model_changes(self.sources, now, row)
 
     def changed_since(self, row: int | None = None) -> str:
-        """Say in a sentence which files of the model are others by now; empty if none is."""
+        """Say in a sentence which files of the model have changed since; empty if none has."""
         return changed_since(self.changes(row), row)
 
     def compared(self, seen: "Replay") -> "Replay":
-        """Return a replay of a row in the run's precision, with what speaks against taking it so.
+        """Return a replay in the run's precision, with the reasons to doubt it.
 
-        Its `changed` says which files of the model are others by now, and its `finding` that it
-        does not give the number of its row.
+        Its `changed` names the files of the model that have changed, and its `finding` says if the
+        replay does not reproduce the number of its row.
         """
         if seen.row is None:
             return seen
@@ -271,16 +272,16 @@ class Run(InNotebook):
         return f"no file of its model has changed: {why}"
 
     def improbability(self, rows: "pd.DataFrame | None" = None) -> "pd.DataFrame":
-        """Return how improbable the prior makes rows of the table: a failure that is never met.
+        """Return how improbable rows of the table are under the prior.
 
         **Arguments:**
-        - `rows`: the rows of the table, all counterexamples when left out.
-        **Returns:** by the numbers of the rows `log_density`, the natural logarithm of the prior's
-        density (of a constrained space without the share that is accepted), and for each column
-        with a distribution `tail.NAME`, the probability of a value at least as far out. The
-        density is NaN where a feature has none, such as an automaton.
-        **Raises:** `ValueError` for a run of which neither the problem nor the space is known, and
-        for a row outside the space.
+        - `rows`: the rows of the table; all counterexamples when left out.
+        **Returns:** a table indexed by row number. `log_density` is the natural logarithm of the
+        prior's density (in a constrained space not divided by the accepted share), NaN if a feature
+        has no density, such as an automaton. For each column with a distribution `tail.NAME` is the
+        probability of a value at least as far out.
+        **Raises:** `ValueError` if neither the problem nor the space of the run is known, and for a
+        row outside the space.
         """
         import pandas as pd
 
@@ -298,9 +299,9 @@ class Run(InNotebook):
 
     @property
     def space(self) -> FeatureSpace:
-        """The feature space, of the problem or as it was recorded.
+        """The feature space, from the problem or from the record.
 
-        **Raises:** `ValueError` where neither is known.
+        **Raises:** `ValueError` if neither is known.
         """
         if self.problem is not None:
             return self.problem.space
@@ -318,17 +319,17 @@ class Run(InNotebook):
     def replay(
         self, row: "int | np.integer | pd.Series | Mapping[str, Any]", precision: str | None = None
     ) -> "Replay":
-        """Simulate a row of the table again and keep its trace.
+        """Simulate a row of the table again and return it with its trace.
 
         - `row`: a row number, or a row of `table.all` (its index is the row number), or any
           mapping with the feature columns.
         - `precision`: `"float32"` or `"float64"`; that of the run when left out.
 
-        A row that MJX simulated is replayed in native MuJoCo where that gives its number, within
-        rounding; its `engine` says so then.
+        A row that MJX simulated is replayed in native MuJoCo if that gives the same number up to
+        rounding; `engine` of the replay then says so.
 
-        **Returns:** the replay; its `changed` says that the model is another one by now, and its
-        `finding` that it does not give the number of its row, which its text begins with.
+        **Returns:** the replay. Its printed form begins with `changed`, if the model has changed
+        since, and with `finding`, if the replay does not reproduce the number of its row.
         **Raises:** `ValueError` for a run without its problem; `IndexError` for a row that is not
         in the table.
         """
@@ -384,12 +385,12 @@ class Run(InNotebook):
         return replace(seen, engine="native MuJoCo, which gives the number of the row as MJX does")
 
     def save_counterexamples(self, folder: str | Path, **options: Any) -> list[Path]:
-        """Write counterexamples as small files made for version control; returns their paths.
+        """Write counterexamples as small files for version control; returns their paths.
 
         `vj.replay_counterexamples(problem, folder)` simulates them again.
 
         **Arguments:**
-        - `folder`: it is made where there is none.
+        - `folder`: the folder, made if there is none.
         - `options`: the options of `counterexamples.save_counterexamples`: `max_count`, `shrink`,
           `budget`.
         **Raises:** `ValueError` for a run without its problem or without a counterexample.
@@ -399,7 +400,7 @@ class Run(InNotebook):
         )
 
     def summary(self) -> str:
-        """Write what failed, how often, the worst case and how to see it again."""
+        """Write what failed, how often, the worst case and how to replay it."""
         return lazy_import("verifai_jax.falsification.summary", "summarize")(self)
 
     def plot(self, path: str | Path | None = None) -> Any:
@@ -407,7 +408,7 @@ class Run(InNotebook):
         return lazy_import("verifai_jax.reports.plotting.scatter", "plot_features")(self, path)
 
     def report(self, path: str | Path, **options: Any) -> Path:
-        """Write the evidence report on the run: one HTML file, and its claims as JSON next to it.
+        """Write the evidence report of the run: an HTML file, with its claims as JSON next to it.
 
         **Arguments:**
         - `path`: the path of the HTML file.
@@ -420,17 +421,17 @@ class Run(InNotebook):
     def explore(self) -> Any:
         """Return a view of the table for a notebook: scatter, parallel coordinates, traces.
 
-        A row under the pointer shows its values; a clicked one is simulated again. It needs
-        anywidget (extra `widget`); without it this is the picture of `plot`.
+        Hovering over a row shows its values; clicking on it simulates it again. It needs anywidget
+        (extra `widget`); without it the result is the picture of `plot`.
         """
         return lazy_import("verifai_jax.reports", "explore")(self)
 
     def save(self, path: str | Path) -> Path:
         """Write the run to a folder: its record, table and state; returns the folder.
 
-        **Raises:** `FolderInUse` where another process writes there; `ValueError` where it is the
-        run's own folder, and somebody has gone on with the run there; `OSError` for what the file
-        system refuses, such as a full disk: what the folder held before stays.
+        **Raises:** `FolderInUse` if another process writes there; `ValueError` if it is the run's
+        own folder and the run there has been continued meanwhile; `OSError` if the file system
+        refuses, for example because the disk is full: the earlier content of the folder then stays.
         """
         return lazy_import("verifai_jax.falsification.run_folder", "save_run")(self, Path(path))
 

@@ -95,11 +95,11 @@ def _is_own(run: Run, folder: Path) -> bool:
 
 
 def load(path: str | Path, problem: Problem | None = None) -> Run:
-    """Read a run back from its folder, also one that was cut off.
+    """Read a run from its folder, finished or cut off.
 
-    - `problem`: needed to replay rows; a file names no code to run.
+    - `problem`: needed to replay rows, because a record names no code to run.
 
-    Of a run whose checkpoint is damaged the table is there; its `damage` says what is not.
+    If the checkpoint is damaged the run still has its table; `damage` says what is missing.
 
     **Raises:** `FileNotFoundError` for a folder without a run; `ValueError` for a record or a table
     that is damaged, a record of another version, or a problem whose name, formulas or features
@@ -143,7 +143,7 @@ def load(path: str | Path, problem: Problem | None = None) -> Run:
 
 
 def as_made(run: Run) -> Run:
-    """Return a run as the verb that made it does: one of `fuzz` has its coverage."""
+    """Return a run as the class of the verb that made it: `FuzzRun` for `fuzz`."""
     return (
         run
         if run.derived is None
@@ -190,7 +190,7 @@ def _read_state(
 
 
 def check_not_continued(run: Run, folder: Path) -> None:
-    """Refuse to write a run over its own folder where that has become longer, or another run's.
+    """Refuse to overwrite a folder whose run has been continued, or is another run.
 
     **Raises:** `ValueError`.
     """
@@ -211,7 +211,7 @@ def check_not_continued(run: Run, folder: Path) -> None:
 
 
 def write_record(run: Run, folder: Path) -> int:
-    """Write everything about a run but its table to `run.json`; return its checksum."""
+    """Write everything but the table of a run to `run.json`; return its checksum."""
     return deciding_checksum(files.write_record(folder / RECORD, _as_record(run)))
 
 
@@ -223,8 +223,8 @@ def _as_record(run: Run) -> dict[str, Any]:
 def read_record(folder: Path) -> dict[str, Any]:
     """Read the record of a run.
 
-    **Raises:** `FileNotFoundError` where there is none; `DamagedError` for one that is damaged.
-    Both say where the rows are, which are none the worse for it.
+    **Raises:** `FileNotFoundError` if there is none; `DamagedError` for one that is damaged. Both
+    say where the rows are, which are not affected.
     """
     file = folder / RECORD
     if not file.is_file():
@@ -252,17 +252,17 @@ def _check_entries(record: Mapping[str, Any], folder: Path) -> None:
 
 
 def deciding_checksum(record: Mapping[str, Any]) -> int:
-    """Return a checksum of the entries of a record that decide what the rows of its run are."""
+    """Return a checksum of those entries of a record that determine the rows of its run."""
     return files.record_checksum({name: record.get(name) for name in DECIDING})
 
 
 def write_checkpoint(
     checkpoint: Mapping[str, Any], folder: Path, rows_checksum: int, record_checksum: int
 ) -> None:
-    """Write a checkpoint to `folder`, in place of an earlier one, never half.
+    """Replace the checkpoint in `folder` atomically.
 
     **Arguments:**
-    - `checkpoint`: the state of the search, with the number of `rows` that it has seen.
+    - `checkpoint`: the state of the search, with the number of `rows` that it has observed.
     - `folder`: the folder of the run.
     - `rows_checksum`: the checksum of these rows.
     - `record_checksum`: the checksum of the record.

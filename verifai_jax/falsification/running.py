@@ -42,11 +42,11 @@ the prior after rows that were given."""
 
 
 def origin_of(search: Search, first: int) -> Origin:
-    """Return where the rows of a run come from.
+    """Return the origin of a run's rows; see `Run.origin`.
 
     **Arguments:**
     - `search`: the search of the run.
-    - `first`: number of rows that were given before the search proposed any.
+    - `first`: number of rows that were given before the first proposal.
     """
     return "first" if first and search.samples_prior else search.origin
 
@@ -56,7 +56,7 @@ RAISES = "an error of every simulation"
 
 
 class RunError(RuntimeError):
-    """The loop broke down, or nothing can succeed; `run` holds what was finished before."""
+    """An error that ends a run; its `run` holds the finished part."""
 
     def __init__(self, message: str, run: Run) -> None:
         super().__init__(message)
@@ -76,12 +76,12 @@ class Ending(NamedTuple):
 
     @property
     def only_budget(self) -> bool:
-        """True where nothing ends the run before its budget."""
+        """True if only the budget can end the run."""
         return not self.may_be_early and self.max_seconds is None
 
     @property
     def may_be_early(self) -> bool:
-        """True where what simulations give may end the run before its budget."""
+        """True if results of simulations can end the run before its budget."""
         return self.stop_after is not None or self.stop_when is not None
 
     @property
@@ -89,7 +89,7 @@ class Ending(NamedTuple):
         return time.perf_counter() - self.started
 
     def reached(self, rounds: Rounds) -> str | None:
-        """Return the condition that ends the run after this round, if any does."""
+        """Return the condition that ends the run after this round; None if it goes on."""
         if self.stop_after is not None and rounds.distinct >= self.stop_after:
             return "stop_after"
         if self.stop_when is not None and self.stop_when.done(
@@ -107,7 +107,7 @@ class Ending(NamedTuple):
 
 @dataclass
 class Running:
-    """A run that is going on.
+    """A run in progress.
 
     **Fields:**
     - `rounds`: its rounds, not compiled yet.
@@ -115,12 +115,12 @@ class Running:
     - `choice`: the choice of its backend.
     - `seed`: the seed of its search and its simulations.
     - `target`: name of the problem on the command line.
-    - `notes`: on what is likely a mistake.
-    - `lasting`: notes that are still true when the run goes on.
-    - `sources`: what the model is made of, of each part of the run; read now when left out.
+    - `notes`: notes on likely mistakes.
+    - `lasting`: notes that stay true when the run is resumed.
+    - `sources`: the files of the model for each part of the run; read now when left out.
     - `resumed`: whether it goes on from a checkpoint.
     - `warm`: whether the search starts from the rows of an earlier run.
-    - `keep_going`: whether to simulate on if all of the first simulations raise.
+    - `keep_going`: whether to go on if the first simulations all raise.
     """
 
     rounds: Rounds
@@ -140,9 +140,9 @@ class Running:
     def play(
         self, progress: bool | None, prepare: Callable[[], None], callbacks: Sequence[Callback] = ()
     ) -> Run:
-        """Compile, `prepare`, and play rounds until something ends them.
+        """Compile, call `prepare`, and run rounds until a condition ends them.
 
-        **Raises:** `RunError` with what is finished.
+        **Raises:** `RunError` with the finished part.
         """
         rounds, begun = self.rounds, time.time()
         rounds.only_budget_ends = self.ends.only_budget
@@ -267,7 +267,7 @@ class Running:
     def result(self, stopped: str) -> Run:
         """Return the run as it is now.
 
-        - `stopped`: what has ended it.
+        - `stopped`: the condition that ended it.
         """
         rounds, problem, search = self.rounds, self.rounds.problem, self._recorded_search
         spent = dict(rounds.watch.seconds)

@@ -42,7 +42,7 @@ class TableError(DamagedError):
 
 
 def damaged(path: Path, error: Exception) -> TableError:
-    """Return the error for a file that a library cannot read, for whatever reason."""
+    """Return the error for a file that a library cannot read, whatever the reason."""
     return TableError(f"{path} is damaged: {printable(format_error(error), 300)}")
 
 
@@ -59,7 +59,7 @@ class Segment:
 
     @property
     def damage(self) -> str:
-        """Describe how the file differs from what was written; an empty text if it does not."""
+        """Describe how the file differs from what was written; empty if it does not."""
         try:
             own = checksum(self.path.read_bytes())
         except OSError as error:
@@ -101,7 +101,7 @@ class Segment:
             raise damaged(self.path, error) from error
 
     def read_standing_out(self) -> "pd.DataFrame":
-        """Return those of its rows that stand out, from their own file where it is whole."""
+        """Return only the rows that stand out, from their own file if it is whole."""
         folder = self.path.parent.parent / FAILURES
         for others in list_segments(folder):
             if (others.first, others.stop) == (self.first, self.stop) and not others.damage:
@@ -126,7 +126,7 @@ def standing_out(columns: Columns) -> Int[np.ndarray, " k"]:
 
 
 def write_segment(run: Path, first: int, columns: Columns) -> Segment:
-    """Write rows from `first` on into the folder of a run, and those that stand out next to them.
+    """Write rows from `first` on to a run's folder, and the rows that stand out to their own file.
 
     **Raises:** `OSError` where they cannot be written.
     """
@@ -146,7 +146,7 @@ def _write(folder: Path, first: int, stop: int, content: "pa.Buffer") -> Path:
 
 
 def parquet(columns: Columns, rows: Int[np.ndarray, " n"]) -> "pa.Buffer":
-    """Return rows as the content of a Parquet file, which pandas indexes by row number."""
+    """Return rows as the content of a Parquet file, indexed by row number for pandas."""
     import pandas as pd
     import pyarrow as pa
     import pyarrow.parquet as pq
@@ -170,7 +170,7 @@ def parquet(columns: Columns, rows: Int[np.ndarray, " n"]) -> "pa.Buffer":
 
 
 def list_segments(folder: Path) -> list[Segment]:
-    """Return the segments of a folder in the order of their rows, whole or not."""
+    """Return the segments of a folder in the order of their rows, including damaged ones."""
     found = []
     if folder.is_dir():
         for path in folder.iterdir():
@@ -180,7 +180,7 @@ def list_segments(folder: Path) -> list[Segment]:
 
 
 def remove_segments(run: Path, begin: int) -> None:
-    """Remove the segments of a run with rows from `begin` on, the last one first."""
+    """Remove the segments of a run with rows from `begin` on, starting with the last."""
     for name in (SEGMENTS, FAILURES):
         folder = run / name
         for segment in reversed(list_segments(folder)):

@@ -59,7 +59,7 @@ _OPTIONS = (
 
 @dataclass(frozen=True)
 class Shard:
-    """The part `number` of `of` parts of a run, counted from 1.
+    """Part `number` of a run that is divided into `of` parts, counted from 1.
 
     **Raises:** `ValueError` for a part that does not exist.
     """
@@ -76,7 +76,7 @@ class Shard:
 
     @classmethod
     def parse(cls, text: str) -> "Shard":
-        """Read a shard as a person writes it, `3/16`.
+        """Read a shard from its text, such as `3/16`.
 
         **Raises:** `ValueError` for other text.
         """
@@ -86,7 +86,7 @@ class Shard:
         return cls(int(match[1]), int(match[2]))
 
     def rows(self, budget: int, unit: int) -> range:
-        """Return its rows of so many, cut at multiples of `unit`."""
+        """Return the range of its rows out of this many; ranges begin at multiples of `unit`."""
         ends = [budget * i // self.of // unit * unit for i in (self.number - 1, self.number)]
         return range(ends[0], budget if self.number == self.of else ends[1])
 
@@ -110,16 +110,16 @@ def simulate_shard(
     progress: bool | None = None,
     target: str | None = None,
 ) -> int:
-    """Simulate one part of a run into a folder; a part that was begun there is completed.
+    """Simulate one part of a run into a folder, or complete a part that was begun there.
 
     **Arguments:**
     - `shard`: the part.
-    - `folder`: the folder of this part alone.
-    - all other arguments: as in `falsify`, the same for all parts; `confirm` is done when they are
-      merged.
+    - `folder`: a folder for this part only.
+    - all other arguments: as in `falsify`, the same for all parts; rows are confirmed when the
+      parts are merged.
     **Returns:** the number of simulations of this part.
-    **Raises:** `ValueError` for a search that learns, a system with several backends of which none
-    is named, a folder with another part; as `falsify` otherwise.
+    **Raises:** `ValueError` for a search that learns, a system with several backends unless one is
+    named, a folder with another part; the errors of `falsify`.
     """
     check_options(budget, 1 if batch is None else batch, seed, None, None)
     search = check_search(problem, search)
@@ -360,15 +360,15 @@ def merge(
     folder: str | Path | None = None,
     progress: bool | None = None,
 ) -> Run:
-    """Make one run of its parts: the table is the one of one machine, bit for bit.
+    """Merge the parts of a run; the table is that of a run on one machine, bit for bit.
 
     **Arguments:**
     - `folders`: the folders of all parts.
     - `problem`: the problem of the run.
-    - `folder`: the folder of the merged run; in memory when left out.
+    - `folder`: the folder for the merged run; when left out, it is in memory.
     - `progress`: as in `falsify`.
     **Returns:** the run.
-    **Raises:** `ValueError` for parts of different runs, a part that is missing, there twice or not
+    **Raises:** `ValueError` for parts of different runs, a part that is missing, duplicated or not
     finished, and another problem; `FileNotFoundError` for a folder without a part.
     """
     if not folders:

@@ -32,9 +32,9 @@ HARDLY_MOVES = 0.05
 
 
 def notes_before(problem: Problem, search: Search) -> tuple[str, ...]:
-    """Return what is likely a mistake of a problem and a search, before anything compiles.
+    """Return likely mistakes in a problem and a search, before anything compiles.
 
-    Given features are simulated as they are, without a word.
+    Given features are simulated as they are and get no note.
     """
     if search.origin == "given":
         return ()
@@ -50,15 +50,15 @@ def notes_before(problem: Problem, search: Search) -> tuple[str, ...]:
 
 
 def nominal_note(problem: Problem, evaluate: Evaluator, search: Search) -> tuple[str, ...]:
-    """Return a note if the nominal features fail themselves; simulated once for each problem.
+    """Return a note if the nominal features fail; simulated once for each problem.
 
-    Nothing is simulated where the problem does not say what is nominal, and where it may take long:
-    an engine's program has one shape, however few its rows, and one of MuJoCo is compiled for each
-    number of rows.
+    Nothing is simulated if the problem has no nominal features, or if it could take long: an
+    engine's program has one fixed number of rows, and one of MuJoCo is compiled for each number of
+    rows.
 
     **Arguments:**
     - `problem`: the problem of the run.
-    - `evaluate`: the run's own, compiled.
+    - `evaluate`: the compiled evaluator of the run.
     - `search`: the search of the run.
     """
     if problem.nominal is None or problem.system.backends or search.origin == "given":
@@ -108,13 +108,13 @@ def _samples(problem: Problem, rows: int) -> int:
 def notes_after(
     table: ErrorTable, formulas: Mapping[str, str], search: Search, warm: bool = False
 ) -> tuple[str, ...]:
-    """Return what all simulations of a run have in common and is likely a mistake.
+    """Return likely mistakes that all simulations of a run show together.
 
     **Arguments:**
     - `table`: the table of the run.
     - `formulas`: texts by name.
     - `search`: the search of the run.
-    - `warm`: whether the search began where an earlier run had ended.
+    - `warm`: whether the search started from the rows of an earlier run.
     """
     count = len(table) - table.counts.without_verdict
     if count < ENOUGH or search.origin == "given":
@@ -135,12 +135,12 @@ def notes_after(
 
 
 def cut_short_note(search: Search, total: int | None, simulated: int) -> tuple[str, ...]:
-    """Return a note on how much of a finite search, such as a grid, a run has simulated.
+    """Return a note on the simulated share of a finite search, such as a grid.
 
     **Arguments:**
-    - `search`: the search of the run; it has more points to propose.
-    - `total`: points of the whole search; None if it never ends.
-    - `simulated`: points of it that were simulated.
+    - `search`: the search of the run, which has more points to propose.
+    - `total`: number of points of the whole search; None if it never ends.
+    - `simulated`: number of its points that were simulated.
     """
     if total is None or search.origin == "given" or simulated >= total:
         return ()

@@ -37,17 +37,17 @@ follow one by one, up to `ALWAYS`, while all raise."""
 
 
 class Simulations:
-    """Evaluators with and without derivatives of clauses, and the first rows where these are timed.
+    """Evaluators with and without derivatives of clauses, and the first rows if they are timed.
 
     **Arguments:**
-    - `problem`: on the backend that it runs on.
-    - `search`: what it wants decides what is computed in addition to the robustness.
-    - `batch`: simulations of a round at most.
+    - `problem`: the problem, on the backend on which it runs.
+    - `search`: the search; it determines what is computed in addition to the robustness.
+    - `batch`: maximum number of simulations in a round.
     - `seed`: the seed of the run.
     - `precision`, `journal`, `executor`, `target`, `guidance`, `keep_traces`, `given`,
       `engine`, `budget`: as for `Evaluator`.
 
-    `hopeless` is what all of the rows that were timed raised; None if one did not.
+    `hopeless` is the error that all timed rows raised; None if one of them did not.
     """
 
     def __init__(
@@ -99,7 +99,7 @@ class Simulations:
 
     @property
     def differentiates(self) -> bool:
-        """True where some rounds are differentiated."""
+        """True if some rounds are differentiated."""
         return self._differentiate is not None
 
     @property
@@ -116,11 +116,11 @@ class Simulations:
 
     @property
     def measured(self) -> int:
-        """Number of first rows that are simulated already, and wait for their round."""
+        """Number of rows that are already simulated and wait for their round."""
         return 0 if self._measured is None else len(self._measured.status)
 
     def begin_if_recalled(self) -> None:
-        """Begin to compile derivatives where they need not be traced; see `Engine`."""
+        """Start compiling derivatives if they need not be traced; see `Engine`."""
         if self._differentiate is not None:
             self._differentiate.begin_if_recalled()
 
@@ -156,11 +156,12 @@ class Simulations:
         return self.evaluate(points, first=first)
 
     def measure(self, points: Float[np.ndarray, "n d"], timed: bool) -> float:
-        """Simulate the first rows of the run, and return the least seconds of one.
+        """Simulate the first rows of the run, and return the shortest time of one in seconds.
 
-        One by one, a first one that is quick is the only one, unless it raises. Where nobody wants
-        the seconds, what simulates many side by side gets them together. Their round does not
-        simulate them again. Where all of many raise, `hopeless` is what they say, else None.
+        Rows are simulated one by one; if the first is quick and does not raise, it is the only one.
+        If no time is wanted, an engine that simulates many rows together gets them together. Their
+        round does not simulate them again. If all of many raise, `hopeless` is their error, else
+        None.
         """
         from verifai_jax.evaluation.host_engine import HostEngine
 
@@ -184,9 +185,9 @@ class Simulations:
         return seconds
 
     def regroup(self, batch: int, keep_traces: bool) -> None:
-        """Go on with another batch size; with traces, also those of rows that are measured.
+        """Use another batch size; with traces, regroup those of rows already simulated too.
 
-        Rows of a journal have no traces, so it is left.
+        Rows of a journal have no traces, so the journal is not used then.
         """
         self.batch = self.evaluate.batch = batch
         if keep_traces:

@@ -40,30 +40,31 @@ def describe_run(
     precision: str,
     refused: tuple[str, ...],
 ) -> dict[str, Any]:
-    """Return the question after these rows.
+    """Return the question that is asked after these rows.
 
     **Arguments:**
-    - `problem`: the one that is falsified.
+    - `problem`: the problem that is falsified.
     - `frame`: the table so far.
-    - `search`: the one that asks.
+    - `search`: the search that asks.
     - `key`: the key of simulations, for the traces of the worst rows.
     - `precision`: the precision of simulations.
-    - `refused`: what was wrong with earlier suggestions.
+    - `refused`: the reasons why earlier suggestions were refused.
     **Returns:** a dictionary of plain data:
     - `problem`, `description`, `context`: texts.
-    - `formulas`: text by name; all of them are to be kept, and one of them broken is a failure.
-    - `features`: one dictionary each, with `name`, `kind`, `unit` where there is one, and what its
-      domain has (`low`, `high`, `choices`, `knots`, ...); `columns` are its names in the rows.
+    - `formulas`: text by name; the system should keep them all, and breaking one is a failure.
+    - `features`: a dictionary for each, with `name`, `kind`, `unit` if there is one, and the
+      entries of its domain (`low`, `high`, `choices`, `knots`, ...); `columns` are its names in the
+      rows.
     - `constraint`: the constraint of the features, its text or name; None without one.
-    - `nominal`: ordinary features; None without any.
+    - `nominal`: the nominal features; None without any.
     - `wanted`: how many suggestions.
     - `simulations`, `counterexamples`, `least_robustness`: the run so far.
     - `rows`: the last rows of the table, without those that are among the worst: features,
       robustness (`rho`, and `rho.NAME` of each of several formulas), `status`.
-    - `worst`: the rows with the least robustness, the worst first; also `explanation`, a text,
-      `critical` (which predicate decides, at how many seconds, with what robustness and share), and
+    - `worst`: the rows with the least robustness, the worst first. They also have `explanation`, a
+      text; `critical`, the deciding predicate with its time in seconds, robustness and share; and
       `trace`: signals by name, with `times` and `values`, `least` and `greatest`.
-    - `refused`: what was wrong with suggestions that were left out, one text each.
+    - `refused`: the reasons why suggestions were refused, one text each.
     """
     proper = frame.loc[frame["status"] == "ok"]
     worst = proper.nsmallest(search.worst, "rho") if len(proper) else proper
@@ -166,7 +167,7 @@ def _signals(seen: Replay) -> dict[str, Any]:
 
 
 def plain(value: Any) -> Any:
-    """Convert to what JSON has: no NumPy, no JAX, numbers of six digits, None if not finite."""
+    """Convert to JSON types; numbers have six digits, and are None if not finite."""
     if isinstance(value, Mapping):
         return {str(name): plain(each) for name, each in value.items()}
     if isinstance(value, list | tuple):

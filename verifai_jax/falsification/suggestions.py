@@ -31,13 +31,13 @@ of these the last question had."""
 
 
 class SuggestionError(ValueError):
-    """A suggestion that cannot be simulated, or no suggestions at all."""
+    """An error for a suggestion that cannot be simulated, or an answer without suggestions."""
 
 
 class Suggestions:
     """The suggestions of one run; see the module's docstring.
 
-    - `refused`: what was wrong with suggestions that were left out, one text each.
+    - `refused`: the reasons why suggestions were refused, one text each.
     """
 
     def __init__(self, search: Suggested, problem: Problem, precision: str) -> None:
@@ -49,7 +49,7 @@ class Suggestions:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """Say how much was suggested, and what was left out."""
+        """Say how many suggestions there were, and which were left out."""
         if not len(self.asked):
             return ()
         questions = f"{len(self.asked)} question{'s' * (len(self.asked) != 1)}"
@@ -62,7 +62,7 @@ class Suggestions:
         return self.search.times - len(self.asked)
 
     def check_source(self) -> None:
-        """Refuse to go on without the function where there are questions left.
+        """Refuse to continue without the function if questions are left.
 
         **Raises:** `ValueError`.
         """
@@ -70,13 +70,13 @@ class Suggestions:
             self.search.suggest({})
 
     def due(self, rows: int) -> bool:
-        """Return whether the next question is asked when there are so many rows."""
+        """Return whether the next question is asked at this number of rows."""
         if self.left() <= 0:
             return False
         return not len(self.asked) or rows >= int(self.asked[-1, 0]) + self.search.every
 
     def waiting(self, rows: int) -> Float[np.ndarray, "n row"]:
-        """Return the suggested rows that are not among the first `rows` rows yet."""
+        """Return the suggested rows that are not among the first `rows` rows."""
         if not len(self.asked):
             return self.points[:0]
         begin, count = self.asked[-1]
@@ -86,11 +86,11 @@ class Suggestions:
     def next_points(
         self, table: ErrorTable, key: Key[Array, ""], keep: Callable[[], None]
     ) -> Float[np.ndarray, "n row"]:
-        """Return the suggested rows that come next, after a question where it is time for one.
+        """Return the next suggested rows; asks a question first if one is due.
 
         - `table`: the rows of the run so far.
         - `key`: the key of the run's simulations.
-        - `keep`: writes a checkpoint, so that nobody is asked twice for the same suggestions.
+        - `keep`: writes a checkpoint, so that no question is asked twice.
         """
         rows = len(table)
         waiting = self.waiting(rows)
@@ -108,8 +108,8 @@ class Suggestions:
     def ask(self, question: dict[str, Any], rows: int) -> None:
         """Ask, and keep the suggestions that can be simulated.
 
-        **Raises:** `SuggestionError` for anything that is not a list of suggestions, and with
-        `strict` for one that cannot be simulated; what the function itself raises.
+        **Raises:** `SuggestionError` for an answer that is not a list of suggestions, and with
+        `strict` for a suggestion that cannot be simulated; the errors of the function itself.
         """
         number = len(self.asked) + 1
         points, wrong = [], []
@@ -132,13 +132,13 @@ class Suggestions:
         self.refused = (*self.refused, *wrong)
 
     def checkpoint(self) -> dict[str, np.ndarray]:
-        """Return what was suggested, as entries of a checkpoint."""
+        """Return the suggestions as entries of a checkpoint."""
         refused = np.array(self.refused, dtype=np.str_)
         last = np.array(len(self.last_refused))
         return {POINTS: self.points, ASKED: self.asked, REFUSED: refused, LAST_REFUSED: last}
 
     def restore(self, checkpoint: Mapping[str, Any]) -> None:
-        """Go on with the suggestions of a checkpoint."""
+        """Continue with the suggestions of a checkpoint."""
         if ASKED in checkpoint:
             self.points = np.asarray(checkpoint[POINTS], np.float64)
             self.asked = np.asarray(checkpoint[ASKED], np.int64)
@@ -151,12 +151,12 @@ def row_of(problem: Problem, suggestion: object, precision: str) -> Float[np.nda
     """Return the row that simulates a suggestion exactly; see `given_rows`.
 
     **Arguments:**
-    - `problem`: the one that is falsified.
-    - `suggestion`: features by name, as a person writes them, or by the columns of the table;
-      columns that are none of features are ignored.
+    - `problem`: the problem that is falsified.
+    - `suggestion`: features by name, as a user writes them, or by the columns of the table; columns
+      that belong to no feature are ignored.
     - `precision`: the precision of the run.
-    **Raises:** `TypeError` for anything that is not a mapping; `ValueError` that names the feature
-    for one that is missing, unknown or outside its domain, and for features that break the
+    **Raises:** `TypeError` for a suggestion that is not a mapping; `ValueError` that names a
+    feature that is missing, unknown or outside its domain, or for features that break the
     constraint.
     """
     if not isinstance(suggestion, Mapping):

@@ -19,9 +19,9 @@ SHOWN = 0.005
 
 
 def summarize(run: Run) -> str:
-    """Write the summary of a run, every number of it from its table.
+    """Write the summary of a run; every number comes from its table.
 
-    Of a table whose rows have changed no number is written.
+    If rows of the table have changed on disk, no number is written.
     """
     if run.table.changed:
         lines = [f"{run.name}: its rows have changed since they were written, so they say nothing"]
@@ -83,9 +83,9 @@ def summarize(run: Run) -> str:
 
 
 def first_message(run: Run) -> tuple[int, str] | None:
-    """Return number and text of the first row that has one, of those without a verdict.
+    """Return number and text of the first row without a verdict that has a message.
 
-    Rows of a traced system have none; what it knows of its first error stands for them.
+    Rows of a traced system have no messages; the system's record of its first error is used.
     """
     counts = run.table.counts
     if counts.first_message is not None or run.problem is None or "error" not in counts.failed:

@@ -65,8 +65,8 @@ class Surrogate:
     """The rows of a run with their traces, and proposals from a model of them.
 
     **Arguments:**
-    - `problem`: the problem of the run; its monitored signals are modelled.
-    - `options`: the options of the model and the descents on it.
+    - `problem`: the problem of the run, whose monitored signals are modelled.
+    - `options`: the options of the model and of the descents on it.
     - `key`: the key of its random numbers.
     """
 
@@ -83,7 +83,7 @@ class Surrogate:
         self._programs = problem.programs.get(DESCENTS, options, lambda: Descents(problem, options))
 
     def learn(self, u: Float[Any, "n d"], verdicts: Verdicts) -> None:
-        """Keep the rows that have a verdict and a trace like that of the others."""
+        """Keep the rows that have a verdict and a trace of the same form as the others."""
         proper = verdicts.proper & np.isfinite(verdicts.lowest)
         given = [
             (i, trace)
@@ -110,7 +110,7 @@ class Surrogate:
         self._forget()
 
     def improve(self, points: Float[Any, "batch d"]) -> Float[Any, "batch d"]:
-        """Replace the model's share of the points that the search proposes."""
+        """Replace the model's share of the proposed points."""
         before, after = (
             round(self.options.share * number * len(points))
             for number in (self.round, self.round + 1)
@@ -124,7 +124,7 @@ class Surrogate:
         return np.concatenate([proposed, np.asarray(points)[len(proposed) :]])
 
     def checkpoint(self) -> dict[str, np.ndarray]:
-        """Return what decides the next proposals; the arrays are never written to."""
+        """Return the state that determines the next proposals; its arrays are never modified."""
         form = self.form
         signals = () if form is None else form.signals
         return {
@@ -141,7 +141,7 @@ class Surrogate:
         }
 
     def restore(self, checkpoint: Mapping[str, Any]) -> None:
-        """Continue from a checkpoint; from one without a surrogate, with none of its rows."""
+        """Continue from a checkpoint; one without a surrogate gives an empty model."""
         if "surrogate.u" not in checkpoint:
             return
         self.u, self.traces, self.rho = (
@@ -242,7 +242,7 @@ class Surrogate:
 
 
 class Descents:
-    """Programs of a problem: the fit, and descents on simulators drawn from the model."""
+    """The compiled programs of a problem: the fit, and descents on simulators drawn from it."""
 
     def __init__(self, problem: Problem, options: TraceOptions) -> None:
         self.end: End = problem.end
@@ -329,14 +329,14 @@ DESCENTS: Slot[TraceOptions, Descents] = Slot("descents on a model of the traces
 
 
 def spread_factor(rho: Float[np.ndarray, " n"], number: int, dim: int) -> float:
-    """Return the factor on the model's standard deviations: it grows while no row is progress.
+    """Return the factor on the model's standard deviations, which grows while no row improves.
 
-    A model that is too sure of itself proposes the neighbours of one hollow again and again; drawn
-    more widely, its simulators have their minima elsewhere. After a failure there is no need.
+    An overconfident model proposes points near one local minimum again and again; with a wider
+    spread its simulators have minima elsewhere. After a failure this is not needed.
 
     **Arguments:**
     - `rho`: robustness of the rows, in the order in which they were simulated.
-    - `number`: the number of the round.
+    - `number`: number of the round.
     - `dim`: the dimension of the cube.
     """
     lowest = np.minimum.accumulate(rho)
@@ -376,7 +376,7 @@ def _embed(u: Float[Any, "n d"], cube: Cube) -> Float[Array, "n x"]:
 
 
 def padded_rows(rows: int, capacity: int) -> int:
-    """Return the number of rows of the program for so many; each is compiled once."""
+    """Return the padded number of rows of the program for this many; each size compiles once."""
     size = MIN_ROWS
     while size < rows:
         size *= 4

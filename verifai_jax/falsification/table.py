@@ -71,10 +71,9 @@ class ErrorTable(TableView):
     - `folder`: where to keep the rows; in memory only when left out.
 
     **Attributes:**
-    - `missing`: ranges of rows that are missing, as their files are damaged or gone.
-    - `damage`: what is damaged and what is missing; empty if nothing is.
-    - `changed`: whether rows are others than those that were written, so that no number of the
-      table can be relied on.
+    - `missing`: ranges of rows that are missing because their files are damaged or gone.
+    - `damage`: which files are damaged and which rows are missing; empty if none.
+    - `changed`: whether rows differ from those written, so that no number of the table is reliable.
 
     **Raises:** `ValueError` for a feature with a reserved name.
     """
@@ -105,9 +104,9 @@ class ErrorTable(TableView):
         return self._folder / (SEGMENTS if self._segments else FINISHED)
 
     def append(self, columns: Columns) -> None:
-        """Add a batch: a mapping of column name to `[n]` values, with `rho` and `status`.
+        """Append a batch: a mapping of column name to `[n]` values, with `rho` and `status`.
 
-        **Raises:** `OSError` where it cannot be written; it is then in memory all the same.
+        **Raises:** `OSError` if it cannot be written; the rows are then still in memory.
         """
         first, batch = self._next, {name: np.asarray(each) for name, each in columns.items()}
         self._hold(first, batch)
@@ -128,9 +127,9 @@ class ErrorTable(TableView):
             self._tail.put(tail_entry(begin, to_arrow(rest)))
 
     def close(self) -> None:
-        """Turn what the tail holds into Parquet.
+        """Convert the rows of the tail to Parquet.
 
-        **Raises:** `OSError` where it cannot be written; the tail then stays as it is.
+        **Raises:** `OSError` if it cannot be written; the tail then stays as it is.
         """
         if self._tail is None:
             return
@@ -146,16 +145,16 @@ class ErrorTable(TableView):
     def load(
         cls, folder: Path, features: tuple[str, ...], numbers: Sequence[str] = ()
     ) -> "ErrorTable":
-        """Read a table back, finished or cut off; its segments are read when they are wanted.
+        """Read a table, finished or cut off; its segments are read when needed.
 
-        What is damaged is left out: `missing` and `damage` say what.
+        Damaged parts are left out: `missing` and `damage` describe them.
 
         **Arguments:**
         - `folder`: the folder of the table.
         - `features`: names of the feature columns.
-        - `numbers`: those among them that are numbers, where that is known.
-        **Raises:** `FileNotFoundError` where there is none; `TableError` for a `table.parquet` that
-        is damaged, or a column that is missing or holds what it cannot.
+        - `numbers`: the features that are numbers, if known.
+        **Raises:** `FileNotFoundError` if there is none; `TableError` for a `table.parquet` that is
+        damaged, or a column that is missing or holds values of a wrong type.
         """
         if not cls.exists(folder):
             raise FileNotFoundError(
@@ -186,9 +185,9 @@ class ErrorTable(TableView):
     def resumed(self, rows: int, folder: Path | None = None) -> "ErrorTable":
         """Return a table with the first `rows` rows of this one, to which more can be appended.
 
-        With a `folder` it is kept there, in place of what the folder held.
+        With a `folder` the table is stored there and replaces the folder's content.
 
-        **Raises:** `TableError` where rows are missing.
+        **Raises:** `TableError` if rows are missing.
         """
         if self.missing:
             raise TableError(f"rows cannot be added to a table that misses some: {self.damage}")
@@ -214,9 +213,9 @@ class ErrorTable(TableView):
         return table
 
     def save(self, folder: Path) -> "ErrorTable":
-        """Write the rows to `folder`, in place of a table there; return the table of the folder.
+        """Write the rows to `folder`, replacing a table there; return the new table.
 
-        **Raises:** `OSError` where they cannot be written; `TableError` where rows are missing.
+        **Raises:** `OSError` if they cannot be written; `TableError` if rows are missing.
         """
         table = self.resumed(self._next, folder)
         table.close()

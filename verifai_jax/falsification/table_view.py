@@ -39,9 +39,9 @@ FEW = 64
 
 
 class TableView(InNotebook):
-    """Rows by number, those of closed segments first, then batches in memory.
+    """Rows by number: those of closed segments first, then batches in memory.
 
-    **Attributes:** as of `ErrorTable`.
+    **Attributes:** those of `ErrorTable`.
     """
 
     def __init__(self, features: Sequence[str]) -> None:
@@ -63,9 +63,9 @@ class TableView(InNotebook):
 
     @property
     def all(self) -> "pd.DataFrame":
-        """Every simulation asked for, once, indexed by row number.
+        """All simulations, each once, indexed by row number.
 
-        Where rows are missing or have changed since they were written, a `UserWarning` says so.
+        If rows are missing or have changed since they were written, a `UserWarning` says so.
         """
         if self.damage:
             warnings.warn(f"the error table is damaged: {self.damage}", stacklevel=2)
@@ -114,9 +114,9 @@ class TableView(InNotebook):
     def entry(
         self, row: "int | np.integer | pd.Series | Mapping[str, object]"
     ) -> "tuple[int | None, pd.Series | Mapping[str, object]]":
-        """Return the number, if it is known, and the values of a row by its number or itself.
+        """Return the number, if known, and the values of a row given by number or as a row.
 
-        **Raises:** `TypeError` for anything else; `IndexError` for a number that the table does not
+        **Raises:** `TypeError` for another type; `IndexError` for a number that the table does not
         have.
         """
         if isinstance(row, int | np.integer) and not isinstance(row, bool):
@@ -131,32 +131,32 @@ class TableView(InNotebook):
 
     @property
     def counts(self) -> Counts:
-        """Counts over all rows, from those that stand out: they are counted once."""
+        """Counts over all rows, computed once from the rows that stand out."""
         if self._counts is None:
             self._counts = count(self._standing_out())
         return self._counts
 
     @property
     def counterexamples(self) -> "pd.DataFrame":
-        """Rows that ended properly and violate the property, also when looked at closely.
+        """Rows that ended properly and violate the property, unless closer replays reject them.
 
-        That is without those whose column `verdict` says `fragile` or `refuted`.
+        Rows whose `verdict` is `fragile` or `refuted` are left out.
         """
         return self._select(claimed_rows)
 
     @property
     def unconfirmed(self) -> "pd.DataFrame":
-        """Rows that violate the property as simulated, and not surely when looked at closely."""
+        """Rows that violate the property as simulated, but were not confirmed by closer replays."""
         return self._select(lambda columns: violating_rows(columns) & ~claimed_rows(columns))
 
     @property
     def violating(self) -> "pd.DataFrame":
-        """Rows that violate the property as simulated, whatever a closer look said."""
+        """Rows that violate the property as simulated, whatever closer replays say."""
         return self._select(violating_rows)
 
     @property
     def failed(self) -> "pd.DataFrame":
-        """Rows without a verdict: the simulation raised, timed out or went non-finite."""
+        """Rows without a verdict: the simulation raised, timed out or became non-finite."""
         return self._select(lambda columns: columns["status"] != "ok")
 
     @property
@@ -167,9 +167,9 @@ class TableView(InNotebook):
         return self._concatenate([*safe])
 
     def digest(self, rows: int) -> int:
-        """Return a checksum of the first `rows` rows: names of closed segments, and other rows.
+        """Return a checksum of the first `rows` rows, from names of closed segments and other rows.
 
-        It does not depend on the batches in which the rows came.
+        It does not depend on how the rows were divided into batches.
         """
         closed = [s for s in self._segments if s.stop <= rows and len(s) == segments.SEGMENT_ROWS]
         begin = closed[-1].stop if closed else 0
@@ -186,7 +186,7 @@ class TableView(InNotebook):
         )
 
     def distrust(self, sentence: str) -> None:
-        """Note that rows have changed since they were written."""
+        """Record that rows have changed since they were written."""
         self.changed = True
         self._note(sentence)
 

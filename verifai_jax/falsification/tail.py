@@ -21,7 +21,7 @@ _STREAM = "arrow"
 
 
 def tail_entry(first: int, batch: "pa.RecordBatch") -> dict[str, Arrays]:
-    """Return a batch of which the first row has this number, as an entry of the tail."""
+    """Return a batch as an entry of the tail; `first` is the number of its first row."""
     import pyarrow as pa
 
     sink = pa.BufferOutputStream()
@@ -31,9 +31,9 @@ def tail_entry(first: int, batch: "pa.RecordBatch") -> dict[str, Arrays]:
 
 
 def read_tail(folder: Path) -> "list[tuple[int, pa.RecordBatch]]":
-    """Return the batches of a tail that are whole, each with the number of its first row.
+    """Return the undamaged batches of a tail, each with the number of its first row.
 
-    **Raises:** `DamagedError` for anything that is not a file.
+    **Raises:** `DamagedError` if the path is not a file.
     """
     import pyarrow as pa
 

@@ -28,7 +28,7 @@ class TraceForm:
     - `signals`: names and components (0 for a plain signal), in order.
     - `dt`: sampling period in seconds.
     - `length`: number of samples.
-    - `stride`: samples from one that the monitor sees of a model's trace to the next.
+    - `stride`: step between the samples of a model's trace that the monitor sees.
     """
 
     signals: tuple[tuple[str, int], ...]
@@ -44,11 +44,11 @@ class TraceForm:
         length: int,
         formulas: Iterable[Formula],
     ) -> "TraceForm":
-        """Return the form with the longest stride that the formulas leave.
+        """Return the form with the largest stride that the formulas allow.
 
-        A model's trace has no more detail than its modelled samples. Monitored at every sample of
-        a simulator, tens of thousands where there are a few hundred, it is the same at many times
-        the cost. Windows keep their bounds, and the last sample is seen.
+        A model's trace has no more detail than its modelled samples. Monitoring it at every sample
+        of a simulator, tens of thousands instead of a few hundred, gives the same result at many
+        times the cost. Windows keep their bounds, and the last sample is always included.
         """
         divided = math.gcd(length - 1, *(_bounds(formulas, dt)))
         strides = range(1, max(length - 1, 1) // SAMPLES + 1)
@@ -61,14 +61,14 @@ class TraceForm:
         return np.linspace(0, self.length - 1, min(self.length, SAMPLES))
 
     def fits(self, trace: Trace) -> bool:
-        """Return whether a trace has these signals and this clock, whatever its length is."""
+        """Return whether a trace has these signals and this clock; its length may differ."""
         names = [name for name, _ in self.signals]
         same = all(name in trace.signals for name in names)
         same = same and signals_of(trace, names) == self.signals
         return same and bool(np.isclose(trace.dt or 0.0, self.dt))
 
     def flat(self, trace: Trace) -> Float[np.ndarray, " values"]:
-        """Return the modelled samples of a trace, signal after signal."""
+        """Return the modelled samples of a trace as one vector, signal by signal."""
         own, parts = np.arange(self.length), []
         for name, _ in self.signals:
             signal = np.asarray(trace.signals[name])
@@ -81,13 +81,13 @@ class TraceForm:
         return np.concatenate(parts).astype(np.float32)
 
     def held(self, row: Float[np.ndarray, " values"]) -> Float[np.ndarray, "signals time"]:
-        """Return modelled samples at every sample, those between on straight lines."""
+        """Interpolate modelled samples linearly to every sample."""
         own = np.arange(self.length)
         columns = row.reshape(-1, len(self.positions))
         return np.stack([np.interp(own, self.positions, column) for column in columns])
 
     def trace(self, flat: Float[Array, " values"]) -> Trace:
-        """Return the trace of modelled samples, every so many of its own; traced by JAX."""
+        """Return the trace of modelled samples at the form's stride; traced by JAX."""
         positions, own = self.positions, np.arange(0, self.length, self.stride)
         left = own * (len(positions) - 1) // max(self.length - 1, 1)
         left = np.minimum(left, max(len(positions) - 2, 0))
@@ -105,7 +105,7 @@ class TraceForm:
 
 
 def signals_of(trace: Trace, names: list[str]) -> tuple[tuple[str, int], ...]:
-    """Return these signals of a trace, each with its components, 0 for a plain one."""
+    """Return the components of these signals of a trace; a plain signal has component 0."""
     shapes = [(name, np.shape(trace.signals[name])) for name in names]
     return tuple((name, int(np.prod(s[1:])) if len(s) > 1 else 0) for name, s in shapes)
 

@@ -36,17 +36,18 @@ that rounds of 32 768 take, as less is confirmed; larger rounds were not tried."
 def usual_batch(
     search: Search, budget: int, stop_after: int | None = None, whole: bool = False
 ) -> int:
-    """Return the default batch: twenty rounds or more for a search that learns.
+    """Return the default batch: at least twenty rounds for a search that learns.
 
-    A power of two, so that shapes are few; small for one that stops at few counterexamples, which
-    is likely to end in its first. Where it does not learn it has at most a thousand rounds.
+    It is a power of two, so that there are few shapes, and small for a run that stops at few
+    counterexamples, which is likely to end in its first round. A search that does not learn has at
+    most a thousand rounds.
 
     **Arguments:**
-    - `search`: that of the run.
-    - `budget`: simulations of the run.
-    - `stop_after`: counterexamples at which it ends, if it does.
-    - `whole`: whether the budget alone ends the run; a search that does not learn then has eight
-      rounds, where these are not too large.
+    - `search`: the search of the run.
+    - `budget`: number of simulations of the run.
+    - `stop_after`: number of counterexamples at which it ends; None if it does not.
+    - `whole`: whether only the budget can end the run; a search that does not learn then has eight
+      rounds, unless these would be too large.
     """
     if not search.learns and stop_after is not None:
         few = 1 << (min(search.wants.max_batch, 16 * stop_after).bit_length() - 1)
@@ -72,12 +73,12 @@ def batch_size(
     whole: bool = False,
     small: int | None = None,
 ) -> int:
-    """Return the simulations of a round.
+    """Return the number of simulations in a round.
 
     **Arguments:**
-    - `asked`: what the user wants; the default when left out.
-    - `search`, `budget`, `stop_after`, `whole`: as of `usual_batch`.
-    - `small`: the usual size where many small rounds are wanted.
+    - `asked`: the user's choice; the default when left out.
+    - `search`, `budget`, `stop_after`, `whole`: as in `usual_batch`.
+    - `small`: the default if many small rounds are wanted.
     """
     usual = usual_batch(search, budget, stop_after, whole)
     usual = usual if small is None else min(usual, small)
@@ -85,10 +86,10 @@ def batch_size(
 
 
 def as_wanted(engine: object, portable: bool = False) -> Wanted:
-    """Return an engine that was asked for, or that was recorded: a host system has no other.
+    """Return the engine that was asked for or recorded; a host system has only one.
 
-    - `portable`: whether `"auto"` is XLA: if few simulations may end the run, or if rounding may
-      decide which points a search that learns proposes next.
+    - `portable`: whether `"auto"` means XLA: if few simulations may end the run, or if rounding may
+      change the next proposals of a search that learns.
 
     **Raises:** `UnknownNameError`.
     """
@@ -100,10 +101,10 @@ def as_wanted(engine: object, portable: bool = False) -> Wanted:
 
 
 def check_search(problem: object, search: object) -> Search:
-    """Return the search, by its name or itself, if it can work on this problem.
+    """Return the search, given by name or as an object, if it can work on this problem.
 
-    **Raises:** `TypeError` for anything that is not a problem or a search; `ValueError` for one
-    that cannot.
+    **Raises:** `TypeError` for anything that is not a problem or a search; `ValueError` for a
+    search that cannot work on it.
     """
     if not isinstance(problem, Problem):
         raise TypeError(f"falsify needs a Problem; got {type(problem).__name__}")
@@ -127,7 +128,7 @@ def _why_not_traced(system: System) -> str:
 
 
 def check_gradient(problem: Problem, search: Search) -> None:
-    """Refuse a search that needs gradients of a system that has none.
+    """Refuse a search that needs gradients if the system has none.
 
     **Raises:** `ValueError`.
     """
@@ -146,7 +147,7 @@ def check_gradient(problem: Problem, search: Search) -> None:
 
 
 def check_guide(problem: Problem, search: Search) -> None:
-    """Refuse a guide that has no effect: of a search that does not learn.
+    """Refuse a guide for a search that does not learn, where it has no effect.
 
     **Raises:** `ValueError`.
     """
@@ -160,9 +161,9 @@ def check_guide(problem: Problem, search: Search) -> None:
 
 
 def with_objective(search: Search, objective: str, diverse: bool) -> Search:
-    """Return the search with an objective by its name.
+    """Return the search with the objective of this name.
 
-    **Raises:** `UnknownNameError`; `ValueError` for a search or an option that has another one.
+    **Raises:** `UnknownNameError`; `ValueError` for a search or an option with another objective.
     """
     if objective not in OBJECTIVES:
         raise unknown_name("objective", objective, OBJECTIVES)
@@ -177,7 +178,7 @@ def with_objective(search: Search, objective: str, diverse: bool) -> Search:
 
 
 def check_objective(problem: Problem, search: Search) -> None:
-    """Refuse a search for likely failures where something else orders them, or nothing can.
+    """Refuse a search for likely failures if it conflicts with another order or has no density.
 
     **Raises:** `ValueError`.
     """
@@ -195,7 +196,7 @@ def check_objective(problem: Problem, search: Search) -> None:
 
 
 def check_same_guide(run: Run, problem: Problem) -> None:
-    """Refuse to go on with a run under another guide than it had.
+    """Refuse to resume a run under another guide.
 
     **Raises:** `ValueError`.
     """
@@ -214,9 +215,9 @@ def _guide_text(guide: Mapping[str, Any] | None) -> str:
 def adapt_search(
     problem: Problem, search: Search, executor: "Executor | None" = None
 ) -> tuple[Search, tuple[str, ...]]:
-    """Return the search, or its fallback where the problem lacks what it wants, and a note on that.
+    """Return the search, or its fallback if the problem lacks what it needs, and a note on that.
 
-    **Raises:** `ValueError` for a search that needs gradients, and a system with a step that has no
+    **Raises:** `ValueError` for a search that needs gradients if a step of the system has no
     derivative.
     """
     lacking = without_derivative(problem) if search.needs_derivatives else None
@@ -277,10 +278,11 @@ FEW_DIMENSIONS = 20
 
 
 def can_be_slow(problem: Problem, executor: "Executor | None") -> bool:
-    """Return whether the seconds of a simulation decide on the default search.
+    """Return whether the time of a simulation decides which search is the default.
 
-    Where JAX traces the system a simulation is quick, one that simulates many rows in a call takes
-    as long for one as for all, and at an executor it is not the simulation alone that takes time.
+    It does not for a system that JAX traces, which is quick; for one that simulates many rows in a
+    call, where one takes as long as all; and with an executor, where the simulation is not the only
+    cost.
     """
     if problem.system.backends or problem.system.can_simulate_batch:
         return False
@@ -288,9 +290,9 @@ def can_be_slow(problem: Problem, executor: "Executor | None") -> bool:
 
 
 def slow_search(problem: Problem, seconds: float) -> tuple[Search, str] | None:
-    """Return the default search where a simulation takes so long, and a note that says why.
+    """Return the default search for simulations that take this long, and a note with the reason.
 
-    None if it takes not long enough for another search than the portfolio.
+    None if they are quick enough for the portfolio.
     """
     if seconds < SLOW:
         return None
@@ -304,7 +306,7 @@ def slow_search(problem: Problem, seconds: float) -> tuple[Search, str] | None:
 
 
 def check_rule(search: Search, rule: "StoppingRule | None") -> None:
-    """Refuse a rule that is none, or that the samples of this search say nothing to.
+    """Refuse a stopping rule that is invalid, or that does not fit the samples of this search.
 
     **Raises:** `TypeError`, `ValueError`.
     """
@@ -322,7 +324,7 @@ def check_rule(search: Search, rule: "StoppingRule | None") -> None:
 def points_of(problem: Problem, rows: Rows, precision: str) -> Float[np.ndarray, "n row"]:
     """Return given features as rows that an engine simulates with exactly these numbers.
 
-    **Raises:** as `given_features`.
+    **Raises:** the errors of `given_features`.
     """
     return given_rows(problem.space, given_features(problem.space, rows, precision))
 
@@ -335,7 +337,8 @@ def check_first(
 ) -> Float[np.ndarray, "n row"]:
     """Return the rows that are simulated before the search begins; empty if none are given.
 
-    **Raises:** as `points_of`; `ValueError` together with a rule that needs independent samples.
+    **Raises:** the errors of `points_of`; `ValueError` together with a rule that needs independent
+    samples.
     """
     if first is None:
         return rows_of_first([], problem)
@@ -356,7 +359,7 @@ def rows_of_first(first: Sequence[Sequence[float]], problem: Problem) -> np.ndar
 
 
 def space_as_data(problem: Problem) -> dict[str, Any] | None:
-    """Return the feature space as plain data; None if it has no such form."""
+    """Return the feature space as plain data; None if that is impossible."""
     try:
         return problem.space.to_json()
     except ValueError:
@@ -366,7 +369,7 @@ def space_as_data(problem: Problem) -> dict[str, Any] | None:
 def recorded_search(run: Run) -> Search:
     """Return the search that is recorded with a run.
 
-    **Raises:** `ValueError` where the record describes none.
+    **Raises:** `ValueError` if the record describes none.
     """
     try:
         return searches.from_json(run.search_data or {})
@@ -378,7 +381,7 @@ def recorded_search(run: Run) -> Search:
 
 
 def check_same_space(run: Run, problem: Problem) -> None:
-    """Refuse to go on with a run in another space than it was in.
+    """Refuse to resume a run in another space.
 
     **Raises:** `ValueError` that names the first difference.
     """
@@ -400,7 +403,7 @@ def check_same_space(run: Run, problem: Problem) -> None:
 
 
 def earlier_rows(warm_start: object, problem: Problem) -> "pd.DataFrame | None":
-    """Return the rows of an earlier table, as a DataFrame with the columns that are needed."""
+    """Return the rows of an earlier table as a DataFrame with the columns needed here."""
     if warm_start is None:
         return None
     table = warm_start.table if isinstance(warm_start, Run) else warm_start
@@ -419,9 +422,10 @@ def earlier_rows(warm_start: object, problem: Problem) -> "pd.DataFrame | None":
 
 @contextmanager
 def new_folder(folder: str | Path | None) -> Iterator[Path | None]:
-    """Make the folder for a new run, and be the only one who writes to it.
+    """Make the folder for a new run, and lock it for this process.
 
-    **Raises:** `ValueError` for one that is not empty, cannot be made, or is another one's.
+    **Raises:** `ValueError` for a folder that is not empty, cannot be made, or is locked by another
+    process.
     """
     if folder is None:
         yield None

@@ -34,13 +34,13 @@ def acceptance_rate(
 ) -> float:
     """Estimate the share of the prior's samples that a constraint accepts.
 
-    A constraint that Python decides is asked for a second, or until it has accepted one sample.
+    A constraint that Python evaluates is called for a second, or until it has accepted one sample.
 
     **Arguments:**
-    - `where`: the constraint as a function of one point of the unit cube.
+    - `where`: the constraint as a function of a point of the unit cube.
     - `accepts`: the same for many points, compiled.
     **Raises:** `ValueError` for a constraint that raises, does not return one truth value, or
-    accepts none of the samples.
+    accepts no sample.
     """
     try:
         form = jax.ShapeDtypeStruct((dim,), jnp.float32)

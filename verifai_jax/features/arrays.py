@@ -20,14 +20,14 @@ from verifai_jax.features.facts import Facts, integer_facts
 class Array(Domain):
     """`length` independent values of one domain: `Array(Box(0, 1), length=3)`.
 
-    A value is stacked along a leading axis: an array `[length]` of a `Box`, a dictionary of such
-    arrays of a `Struct`. With `length=(1, 3)` the number varies too, see `VariableArray`.
+    A value is stacked along a leading axis: an array `[length]` for a `Box`, a dictionary of such
+    arrays for a `Struct`. With `length=(1, 3)` the number varies too; see `VariableArray`.
 
     **Arguments:**
     - `domain`: the domain of each value.
     - `length`: their number, or a pair with the smallest and the greatest number.
-    **Raises:** `ValueError` for a length that is not a positive integer, or a pair that is not
-    `0 <= shortest <= longest` with `longest >= 1`; `TypeError` for something that is not a domain.
+    **Raises:** `ValueError` for a length that is not a positive integer, or a pair that is not `0
+    <= shortest <= longest` with `longest >= 1`; `TypeError` for a `domain` that is not a domain.
     """
 
     arguments = ("domain", "length")
@@ -145,7 +145,7 @@ class Items:
       simulation has the same shapes. Entries after the length hold the middle of the item's domain.
     - `length`: the number of valid items.
 
-    `features["cars"]["x"]` are the `x` of all entries; multiply by `mask`, or use `jnp.where`.
+    `features["cars"]["x"]` is the `x` of all entries; multiply it by `mask`, or use `jnp.where`.
     """
 
     values: PyTree

@@ -27,37 +27,37 @@ from verifai_jax.features.written_events import (
 
 @dataclass(frozen=True, init=False, repr=False)
 class Automaton(Domain):
-    """Sequences of timed events that an automaton allows, as a domain without a refused point.
+    """Sequences of timed events that an automaton allows; every point of the cube is one.
 
         Automaton(start="cruise", max_events=6, events={
             ("cruise", "cut_in"): dict(to="crowded", wait=Box(0.5, 4), gap=Box(5, 20)),
             ("crowded", "brake"): dict(to="cruise", wait=Box(0.2, 2), rate=Box(2, 8), weight=2.0),
         })
 
-    A value is an `Events`. The prior: the number of events is uniform over `min_events` to
-    `max_events`, and a sequence ends early in a state that no event can leave; each event is drawn
-    among those that are enabled after the ones before it, in proportion to their weights; waiting
-    times and parameters come from their domains. Each of these is one unit coordinate by its
-    inverse cumulative distribution, so every point of the cube is a legal sequence.
+    A value is an `Events`. Under the prior the number of events is uniform from `min_events` to
+    `max_events`, and a sequence ends early in a state that no event can leave. Each event is drawn
+    from those enabled by its predecessors, in proportion to their weights; waiting times and
+    parameters come from their domains. Each of these is one unit coordinate, mapped by its inverse
+    cumulative distribution.
 
     **Arguments:**
     - `start`: the state before the first event.
-    - `events`: `(state, name)` -> what happens: a dictionary with
+    - `events`: `(state, name)` -> a description of the event: a dictionary with
 
       - `to`: the state afterwards; the same one when left out,
-      - `wait`: domain of the seconds since the event before, or since the start,
-      - `weight`: relative probability among the events that are enabled, 1 when left out,
+      - `wait`: domain of the seconds since the previous event, or since the start,
+      - `weight`: relative probability among the enabled events, 1 when left out,
       - `after`: names of events that must have happened before,
-      - `at_most`: how often events of this name may happen,
-      - `guard`: a function of the `Past` that must be true, asked when the automaton is made,
+      - `at_most`: maximum number of events of this name,
+      - `guard`: a function of the `Past` that must return True; called when the automaton is built,
       - and parameters by name, each a domain.
-    - `max_events`: events at most.
-    - `min_events`: events at least, unless no event is possible any longer.
+    - `max_events`: maximum number of events.
+    - `min_events`: minimum number of events, unless no event is possible any more.
 
-    **Raises:** `ValueError` for events that are none, options that are unknown or out of range,
-    states that no event leads to, a `to` that is nearly the name of another state, a `min_events`
-    that no sequence reaches, guards that tell too many pasts apart; `TypeError` for a parameter
-    that is not a domain.
+    **Raises:** `ValueError` for invalid events, options that are unknown or out of range, states
+    that no event leads to, a `to` that nearly matches the name of another state, a `min_events`
+    that no sequence reaches, and guards that distinguish too many pasts; `TypeError` for a
+    parameter that is not a domain.
     """
 
     start: str
@@ -158,7 +158,7 @@ class Automaton(Domain):
 
     @cached_property
     def graph(self) -> Graph:
-        """The states and pasts that can be reached, and what can follow what."""
+        """The reachable states and pasts, and their possible successors."""
         return unfold(self.start, self.transitions, self.max_events)
 
     @cached_property

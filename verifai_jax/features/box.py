@@ -73,16 +73,16 @@ class Box(_Between):
     """Real numbers from `low` to `high`, uniform; vectors if the ends are sequences.
 
     `Box(-1, 1)`, `Box([0, 0], [10, 5])`, `Box(0, 1, closed="left")`. A value is a real number, or
-    an array with shape `[entries]`. It is never outside the interval, in single precision neither:
-    the greatest value of `Box(0, 61.2)` is then 61.199997, since 61.2 itself would be rounded up.
+    an array with shape `[entries]`. It never lies outside the interval, even in single precision:
+    the greatest value of `Box(0, 61.2)` is 61.199997 then, since 61.2 itself would be rounded up.
 
     **Arguments:**
     - `low`, `high`: the ends, two finite numbers or two sequences of one length; `low < high`.
-    - `closed`: which ends may be values: `"both"`, `"left"` (the range is half-open, without
-      `high`), `"right"` or `"neither"`. Next to an end that is left out come the nearest numbers
-      of the precision.
-    **Raises:** `ValueError` for ends that are reversed, equal (use `Constant`), not finite,
-    farther apart or nearer than float32 can hold, or of different lengths; for an unknown `closed`.
+    - `closed`: the ends that may be values: `"both"`, `"left"` (half-open, without `high`),
+      `"right"` or `"neither"`. An end that is left out is replaced by the nearest number of the
+      precision.
+    **Raises:** `ValueError` for ends that are reversed, equal (use `Constant`), not finite, too far
+    apart or too close for float32, or of different lengths; for an unknown `closed`.
     """
 
     arguments = ("low", "high")
@@ -115,7 +115,7 @@ class Box(_Between):
     def from_intervals(cls, *intervals: Sequence[float]) -> "Box":
         """Translate VerifAI's notation: an interval for each entry, its ends in any order.
 
-        **Raises:** `ValueError` for an interval that is not a pair of numbers, and as the `Box`.
+        **Raises:** `ValueError` for an interval that is not a pair of numbers; the errors of `Box`.
         """
         ends = _in_order(intervals)
         if len(ends) == 1:
@@ -159,7 +159,7 @@ class Box(_Between):
         return on_device(self.rounded(real_numbers(value)))
 
     def rounded(self, value: Reals) -> Reals:
-        """Return real numbers, those that their precision has rounded over an end at that end."""
+        """Return real numbers; those that rounding has moved past an end are set to that end."""
         return round_inwards(value, self.low, self.high, self.closed)  # pyright: ignore[reportArgumentType]
 
     def contains(self, numbers: Float[np.ndarray, "*n"]) -> Bool[np.ndarray, "*n"]:
@@ -226,7 +226,7 @@ class DiscreteBox(_Between):
 
     **Arguments:**
     - `low`, `high`: the ends, two integers or two sequences of one length; `low <= high`.
-    **Raises:** `ValueError` for ends that are no integers, reversed, of different lengths, beyond
+    **Raises:** `ValueError` for ends that are not integers, reversed, of different lengths, beyond
     32 bits, or with more than 2^20 values between them.
     """
 
@@ -259,7 +259,7 @@ class DiscreteBox(_Between):
 
         The ends are rounded inwards.
 
-        **Raises:** `ValueError` for an interval that is not a pair of numbers, and as the
+        **Raises:** `ValueError` for an interval that is not a pair of numbers; the errors of
         `DiscreteBox`.
         """
         ends = [(math.ceil(low), math.floor(high)) for low, high in _in_order(intervals)]

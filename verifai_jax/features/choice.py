@@ -43,16 +43,16 @@ MAX_CHOICES = 12
 class Categorical(Domain):
     """One of several choices without an order: `Categorical("ppo", "sac", weights=[0.9, 0.1])`.
 
-    Where all choices are numbers the value is the number; otherwise JAX cannot hold it and the
-    value is its index in `choices`, an `int32`. The table always shows the choice itself. A person
-    writes the choice; an integer that is not a choice is an index, but only if no choice reads as a
-    number.
+    If all choices are numbers the value is the number; otherwise JAX cannot hold it and the value
+    is its index in `choices`, an `int32`. The table always shows the choice itself. A user writes
+    the choice. An integer that is not a choice is taken as an index, unless some choice could be
+    read as a number.
 
     **Arguments:**
     - `choices`: numbers, texts or other objects, one by one.
     - `weights`: their probabilities; equally likely when left out.
     **Raises:** `ValueError` for no choices, the same choice twice, or weights that are not one
-    positive number a choice with the sum one.
+    positive number for each choice with sum one.
     """
 
     choices: tuple[object, ...]
@@ -322,8 +322,8 @@ class Constant(Domain):
     in a `Categorical` with one choice.
 
     **Arguments:**
-    - `value`: the only one, such as `9.8`, `[0, 1]`, `"dry"`.
-    **Raises:** `ValueError` for a number that is not finite, or a value of another kind.
+    - `value`: the value, such as `9.8`, `[0, 1]`, `"dry"`.
+    **Raises:** `ValueError` for a number that is not finite, or a value of another type.
     """
 
     arguments = ("value",)

@@ -24,7 +24,7 @@ class Struct(Domain):
 
     **Arguments:**
     - `fields`: name -> `Domain`, in the order in which coordinates and columns come.
-    **Raises:** `ValueError` for no fields, or a name that is empty or no text; `TypeError` for a
+    **Raises:** `ValueError` for no fields, or a name that is empty or not a text; `TypeError` for a
     field that is not a domain.
     """
 

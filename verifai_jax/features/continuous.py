@@ -73,22 +73,22 @@ class Continuous(Domain):
 
     @property
     def closed(self) -> str:
-        """The ends of the support that are values themselves, as in `Box`."""
+        """The ends of the support that are values, as in `Box`."""
         return "both"
 
     def log_density(self, value: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
         """Return the natural logarithm of the probability density, in double precision.
 
         **Arguments:**
-        - `value`: numbers of double precision; minus infinity comes for those beyond the support.
-        **Raises:** `NotImplementedError` for a distribution that does not say it.
+        - `value`: numbers in double precision; the result is minus infinity outside the support.
+        **Raises:** `NotImplementedError` for a distribution that does not define it.
         """
         raise NotImplementedError(f"{self!r} has no density")
 
     def tail(self, value: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
         """Return the probability of a value at least as far out, on either side.
 
-        It is twice the probability of the smaller of both sides of the value.
+        It is twice the smaller of the probabilities on the two sides of the value.
         """
         with in_precision("float64"):
             u = np.asarray(jax.vmap(self.probability)(jnp.ravel(jnp.asarray(value))), np.float64)
@@ -118,7 +118,7 @@ class Continuous(Domain):
         return on_device(self.rounded(real_numbers(value)))
 
     def rounded(self, value: Reals) -> Reals:
-        """Return real numbers, those that their precision has rounded over an end at that end."""
+        """Return real numbers; those that rounding has moved past an end are set to that end."""
         return round_inwards(value, *self.support, self.closed)
 
     @property
@@ -206,7 +206,7 @@ def _bounds_text(low: float, high: float, closed: str) -> str:
 
 
 def check_numbers(domain: Domain, *names: str) -> None:
-    """Make finite numbers of these arguments of a distribution, or refuse them."""
+    """Convert these arguments of a distribution to finite numbers, or refuse them."""
     kind = type(domain).__name__
     for name in names:
         given = as_number(getattr(domain, name), f"{name} of a {kind}")
@@ -246,25 +246,25 @@ def check_positive(domain: Domain, *names: str) -> None:
 
 
 def check_logs(domain: Domain, middle: float, greatest: float) -> None:
-    """Refuse positive values beyond float32, by the logarithms of the median and a greatest one."""
+    """Refuse positive values beyond float32, given logarithms of the median and the maximum."""
     if not (math.log(MIN_REAL) <= middle and greatest < math.log(MAX_REAL)):
         raise ValueError(f"its values must fit into float32; got {domain!r}")
 
 
 def scipy_special() -> Any:
-    """Return SciPy's special functions, which take as long to import as a small run."""
+    """Return SciPy's special functions; importing them takes as long as a small run."""
     from scipy import special
 
     return special
 
 
 def sides(u: Float[Array, ""]) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    """Return the probabilities on both sides of a value, neither of them zero."""
+    """Return the probabilities on both sides of a value, both kept above zero."""
     return at_least(u, OUTERMOST), at_least(1 - u, OUTERMOST)
 
 
 def hazard(u: Float[Array, ""]) -> Float[Array, ""]:
-    """Return the value of an exponential distribution of mean one at a coordinate."""
+    """Map a coordinate to the value of an exponential distribution with mean one."""
     left, right = sides(u)
     lower = u < 0.5
     # Each logarithm only where it is wanted: where it is not, its derivative may be infinite.
@@ -273,12 +273,12 @@ def hazard(u: Float[Array, ""]) -> Float[Array, ""]:
 
 
 def normal_score(u: Float[Array, ""]) -> Float[Array, ""]:
-    """Return the value of a standard normal distribution at a coordinate: from -5.54 to 5.54."""
+    """Map a coordinate to the value of a standard normal distribution, from -5.54 to 5.54."""
     left = u < 0.5
     z = ndtri(at_least(jnp.where(left, u, 1 - u), OUTERMOST))
     return jnp.where(left, z, -z)
 
 
 def at_least(x: Float[Array, ""], bound: float) -> Float[Array, ""]:
-    """Return `x`, or `bound` where it is below, with the derivative of `x`."""
+    """Return `x`, or `bound` if that is larger, with the derivative of `x`."""
     return replace_where(x, x < bound, bound)

@@ -18,21 +18,21 @@ from verifai_jax.features.english import quantile_words
 
 @dataclass(frozen=True, repr=False)
 class Distribution(Continuous):
-    """A distribution of your own, by two JAX functions of one number that are each other's inverse.
+    """A distribution of your own, given by two JAX functions of one number that are inverses.
 
         Distribution(lambda u: 3 * jnp.sqrt(u), lambda x: (x / 3) ** 2, name="triangle")
 
-    Simulated are `inverse_cdf` of 0 and 1 only where both are finite and values near them are
-    probable (a finite and positive slope). Elsewhere the coordinates 0 and 1 stand for 2^-26 and
-    1 - 2^-24, the outermost probabilities that float32 tells from these: what would be infinite,
-    or a limit that no value has, is never simulated.
+    The coordinates 0 and 1 give `inverse_cdf` of 0 and 1 only if these are finite and values near
+    them are probable (a finite positive slope). Otherwise they stand for 2^-26 and 1 - 2^-24, the
+    outermost probabilities that float32 distinguishes from 0 and 1: an infinite value, or a limit
+    that no value reaches, is never simulated.
 
     **Arguments:**
     - `inverse_cdf`: probability -> value, increasing.
     - `cdf`: value -> probability.
-    - `name`: for people and JSON.
+    - `name`: the name in messages and JSON.
     **Raises:** `ValueError` for functions that raise, return no number, do not increase, are not
-    finite inside, or are not each other's inverse.
+    finite inside, or are not inverses of each other.
     """
 
     inverse_cdf: Callable[[Array], Array]
@@ -125,7 +125,7 @@ class Distribution(Continuous):
 
     @property
     def source(self) -> str:
-        """The text of `inverse_cdf` as it is written, in one line; its name without a source."""
+        """The source of `inverse_cdf` in one line; its name if there is no source."""
         try:
             return " ".join(inspect.getsource(self.inverse_cdf).split())
         except (OSError, TypeError):

@@ -29,17 +29,17 @@ class NoDensityError(ValueError):
 
 
 def log_density(space: FeatureSpace, rows: Mapping[str, Any]) -> Float[np.ndarray, " n"]:
-    """Return the natural logarithm of the density that the prior has at rows of a table.
+    """Return the natural logarithm of the prior's density at rows of a table.
 
-    It is the sum over the features, which are independent but for the constraint: a density of real
-    numbers, a probability of choices, integers and lengths. Features that are held count for
-    nothing, and the share that the constraint accepts, by which it would be divided, is left out.
+    It is the sum over the features, which are independent except for the constraint: a density of
+    real numbers, a probability of choices, integers and lengths. Fixed features do not count. The
+    sum is not divided by the share that the constraint accepts.
 
     **Arguments:**
     - `space`: the space of the features.
-    - `rows`: columns `[n]` by name; columns of no feature are ignored.
+    - `rows`: columns `[n]` by name; columns that belong to no feature are ignored.
     **Raises:** `ValueError` for a row outside the space, and for a domain without a density, such
-    as an automaton or one of the user's own.
+    as an automaton or a user's own.
     """
     features = check_columns(space, rows, held=False)
     whole = np.zeros(len(rows[space.columns[0]]) if space.columns else 0)
@@ -49,13 +49,13 @@ def log_density(space: FeatureSpace, rows: Mapping[str, Any]) -> Float[np.ndarra
 
 
 def tails(space: FeatureSpace, rows: Mapping[str, Any]) -> dict[str, np.ndarray]:
-    """Return how improbable a value as far out is, for each column of a distribution.
+    """Return the probability of a value at least as far out, for each column of a distribution.
 
     It is twice the probability of the smaller side: 0.046 at two standard deviations of a `Normal`.
-    Boxes, integers and choices, whose values are as probable as their weights say, have none.
+    Columns of boxes, integers and choices, which have no tails, are left out.
 
     **Arguments:**
-    - `space`, `rows`: as of `log_density`.
+    - `space`, `rows`: as in `log_density`.
     **Returns:** probabilities `[n]` by the names of columns; NaN for an absent item.
     **Raises:** `ValueError` for a row outside the space.
     """

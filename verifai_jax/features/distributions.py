@@ -32,8 +32,8 @@ outermost probability of a coordinate, 2^-26, it is still a normal number of flo
 class Normal(continuous.Continuous):
     """A normal distribution: `Normal(mean, std)`.
 
-    A float32 coordinate reaches 5.5 standard deviations to either side, beyond which lies a
-    probability of 3e-8; the coordinates 0 and 1 stand for these outermost values.
+    A float32 coordinate reaches 5.5 standard deviations to either side; the probability beyond is
+    3e-8. The coordinates 0 and 1 stand for these outermost values.
 
     **Arguments:**
     - `mean`: the mean of the distribution.
@@ -79,15 +79,16 @@ class TruncatedNormal(continuous.Bounded):
     """A normal distribution given that the value lies in `[low, high]`.
 
     **Arguments:**
-    - `mean`, `std`: of the distribution before it is cut off.
+    - `mean`, `std`: those of the distribution before truncation.
     - `low`, `high`: the ends; `low < high`.
 
-    The coordinates 0 and 1 are `low` and `high` exactly. Where an end is more than 5 standard
+    The coordinates 0 and 1 are exactly `low` and `high`. If an end is more than 5 standard
     deviations away, values near it are too improbable for a float32 coordinate.
 
     **Raises:** `ValueError` for parameters that are not finite, a standard deviation that is not
-    positive, ends that are reversed or equal, ends so near that it is uniform between them, or so
-    far in one tail (11 standard deviations) that float32 cannot hold the probabilities.
+    positive, ends that are reversed or equal, ends so close that the distribution is uniform
+    between them, or so far out in one tail (11 standard deviations) that float32 cannot hold the
+    probabilities.
     """
 
     arguments = ("mean", "std", "low", "high")

@@ -52,12 +52,12 @@ class Row(Protocol):
 
 
 class Tuning(NamedTuple):
-    """One number or one choice, as tools have it that tune hyper-parameters.
+    """One number or choice, in the terms of tools that tune hyper-parameters.
 
-    - `scale`: `"linear"`, `"log"` or `"integer"` for what is uniform between the ends on that
-      scale, `"choice"`, or `"other"` for what such tools do not have.
+    - `scale`: `"linear"`, `"log"` or `"integer"` for values uniform between the ends on that scale,
+      `"choice"`, or `"other"` for anything that such tools lack.
     - `low`, `high`: the ends as they were written, not rounded to float32.
-    - `choices`: the options of a choice.
+    - `choices`: the possible choices.
     """
 
     scale: Literal["linear", "log", "integer", "choice", "other"]
@@ -71,7 +71,7 @@ class Domain(ForUsers, abc.ABC):
 
     Laws: `from_unit(to_unit(value))` is `value` (up to rounding in a `Box`);
     `to_unit(from_unit(u))` is `u` in a continuous coordinate and the middle of its cell in a
-    discrete one. Both are pure JAX: they can be jitted, differentiated and vmapped.
+    discrete one. Both are pure JAX, so they can be jitted, differentiated and vmapped.
     """
 
     _internal = frozenset((
@@ -108,7 +108,7 @@ class Domain(ForUsers, abc.ABC):
 
     @abc.abstractmethod
     def coerce(self, value: PyTree) -> PyTree:
-        """Convert what a person may write (a number, a list, a choice) to what `from_unit` gives.
+        """Convert a value as a user writes it (number, list, choice) to the form of `from_unit`.
 
         Leading axes are kept. Nothing is checked; see `check`.
         """
@@ -118,9 +118,9 @@ class Domain(ForUsers, abc.ABC):
         """Check that a concrete value lies in the domain.
 
         **Arguments:**
-        - `value`: as `from_unit` gives it, or as a person writes it.
+        - `value`: a value as returned by `from_unit`, or as a user writes it.
         - `name`: the name of the feature, for the message.
-        **Raises:** `ValueError` for a value outside the domain, or of another kind.
+        **Raises:** `ValueError` for a value outside the domain, or of another type.
         """
 
     @abc.abstractmethod
@@ -133,9 +133,9 @@ class Domain(ForUsers, abc.ABC):
 
     @abc.abstractmethod
     def from_columns(self, row: Row, name: str) -> PyTree:
-        """Return the value that a table row holds, exactly.
+        """Return the exact value stored in a table row.
 
-        **Raises:** `ValueError` for an entry that is not a value of this kind.
+        **Raises:** `ValueError` for an entry that is not a value of this domain's type.
         """
 
     @property
@@ -145,17 +145,17 @@ class Domain(ForUsers, abc.ABC):
 
     @property
     def weights(self) -> tuple[tuple[float, ...] | None, ...]:
-        """Probabilities of the cells of each unit coordinate, their widths; None if equal."""
+        """Probabilities (widths) of the cells of each unit coordinate; None if they are equal."""
         return (None,) * self.size
 
     @property
     def ordered(self) -> tuple[bool, ...]:
-        """Order of each unit coordinate: True if its values have one; choices have none."""
+        """For each unit coordinate, True if its values have an order; choices have none."""
         return (True,) * self.size
 
     @property
     def lengths(self) -> tuple[int, ...]:
-        """Indices of the unit coordinates that are lengths of arrays, on which others depend."""
+        """Indices of the unit coordinates that are array lengths; others depend on them."""
         return ()
 
     @property
@@ -165,49 +165,49 @@ class Domain(ForUsers, abc.ABC):
 
     @property
     def sequences(self) -> tuple[tuple[int, int, int, int], ...]:
-        """Arrays whose items can be put in and taken out; see `Cube`."""
+        """Arrays whose items can be inserted and removed; see `Cube`."""
         return ()
 
     @property
     def nominal(self) -> PyTree:
-        """A value that is ordinary whatever the system is, such as no events; None without one."""
+        """A value that is nominal for any system, such as no events; None if there is none."""
         return None
 
     @property
     def items(self) -> int:
-        """Number of items at most that `without` can take away."""
+        """Maximum number of items that `without` can remove."""
         return 0
 
     def without(
         self, u: Float[Array, " size"], drop: Bool[Array, " items"]
     ) -> Float[Array, " size"]:
-        """Return the coordinates of the value without some of its items; those after them move up.
+        """Return the coordinates of the value without some items; later items move up.
 
-        Items that cannot be without those that go, go too.
+        Items that depend on removed ones are removed too.
         """
         return u
 
     def settled(self, u: Float[Array, " size"]) -> Float[Array, " size"]:
-        """Return coordinates of the same value, those without a meaning in it at one point."""
+        """Return coordinates of the same value in which unused ones have a fixed value."""
         return u
 
     def used(self, u: Float[Array, " size"]) -> Bool[Array, " size"]:
-        """Return which coordinates mean something: all but those of absent items."""
+        """Return which coordinates are used: all but those of absent items."""
         return jnp.ones(self.size, bool)
 
     @property
     def coverage_id_count(self) -> int:
-        """Number of things that values can cover, such as transitions of an automaton."""
+        """Number of items that values can cover, such as transitions of an automaton."""
         return 0
 
     def coverage_ids(self, value: PyTree) -> Int[Array, " ids"]:
-        """Return the numbers of what a value covers, below `coverage_id_count`; -1 for nothing."""
+        """Return the ids of the items that a value covers, below `coverage_id_count`, or -1."""
         return jnp.zeros(0, jnp.int32)
 
     # Other rooms ask for these. Each has a default, which a domain overrides where it differs.
 
     def words(self) -> str:
-        """Return in English what values there are, and how probable they are."""
+        """Describe the possible values and their probabilities in English."""
         return one_line(repr(self))
 
     def parts(self, name: str) -> "tuple[tuple[str, Domain], ...]":
@@ -224,7 +224,7 @@ class Domain(ForUsers, abc.ABC):
         return ()
 
     def facts(self, name: str) -> Facts:
-        """Return what is known of the table columns of a feature before any row; see `facts`."""
+        """Return the facts about a feature's table columns known before any row; see `facts`."""
         found: Facts = {}
         parts = self.parts(name)
         for part_name, part in parts:
@@ -233,12 +233,12 @@ class Domain(ForUsers, abc.ABC):
 
     @property
     def held_at(self) -> PyTree:
-        """The value at which the feature is held; None for one that varies."""
+        """The value at which the feature is fixed; None for one that varies."""
         return None
 
     @property
     def numeric(self) -> bool:
-        """True if a system sees the value itself, and not the index of a choice."""
+        """True if a system receives the value itself, not the index of a choice."""
         return True
 
     @property
@@ -248,18 +248,18 @@ class Domain(ForUsers, abc.ABC):
 
     @property
     def tailed(self) -> tuple[bool, ...]:
-        """For each unit coordinate, True if its values thin out towards an end."""
+        """For each unit coordinate, True if its distribution has a tail towards an end."""
         inner = tuple(tailed for _, part in self.parts("") for tailed in part.tailed)
         return (False,) * (self.size - len(inner)) + inner
 
     @property
     def monotone(self) -> bool:
-        """True if each number of a value rises with one coordinate alone, or is constant."""
+        """True if each number of a value increases with one coordinate only, or is constant."""
         return False
 
     @property
     def tuning(self) -> "Tuning | None":
-        """The domain as tools that tune hyper-parameters have it; None for one that they lack."""
+        """The domain in the terms of hyper-parameter tuners; None if they lack it."""
         return None
 
     @property
@@ -268,8 +268,7 @@ class Domain(ForUsers, abc.ABC):
         return None
 
     def spans(self, duration: float) -> list[tuple[float, float]] | None:
-        """Return the begin and the end of the time in which each control point acts, in seconds, or
-        None.
+        """Return the start and end of each control point's time of effect in seconds, or None.
 
         **Arguments:**
         - `duration`: the duration of the simulation in seconds.
@@ -277,9 +276,9 @@ class Domain(ForUsers, abc.ABC):
         return None
 
     def check_reachable(self, value: PyTree, name: str) -> None:
-        """Check that a coordinate of the unit cube reaches a value nearly.
+        """Check that a coordinate of the unit cube maps close to a value.
 
-        **Raises:** `ValueError` for a value so far in a tail that none does.
+        **Raises:** `ValueError` for a value so far out in a tail that none does.
         """
 
     def coordinates(self, name: str) -> tuple[str, ...]:
@@ -287,17 +286,16 @@ class Domain(ForUsers, abc.ABC):
         return self.columns(name)
 
     def labels(self, name: str, duration: float | None = None) -> tuple[str, ...]:
-        """Return the names of the unit coordinates for people: control points by their time.
+        """Return readable names of the unit coordinates; control points are named by their time.
 
         **Arguments:**
         - `name`: the name of the feature.
-        - `duration`: the duration of a simulation in seconds, for signals that have none of their
-          own.
+        - `duration`: the duration of a simulation in seconds, for signals without their own.
         """
         return self.coordinates(name)
 
     def refined(self, factor: int) -> "Domain":
-        """Return the same domain with finer signals, where it has any; see `Signal.refined`."""
+        """Return the same domain with finer signals, if it has signals; see `Signal.refined`."""
         return self
 
     def refine(self, value: PyTree, factor: int) -> PyTree:
@@ -306,9 +304,9 @@ class Domain(ForUsers, abc.ABC):
 
 
 def cell(u: Float[Array, "*shape"], count: int) -> Int[Array, "*shape"]:
-    """Return the index of the cell that holds `u`, of `count` equally wide ones.
+    """Return the index of the cell that contains `u`, of `count` equally wide cells.
 
-    1.0 is in the last one.
+    1.0 belongs to the last one.
     """
     return jnp.clip((u * count).astype(jnp.int32), 0, count - 1)
 
@@ -324,7 +322,7 @@ def as_real(value: Any) -> Float[Array, "*shape"]:
 
 
 def real_numbers(value: Any) -> Any:
-    """Convert as `as_real`, to an array of NumPy where the value is not of JAX."""
+    """Convert like `as_real`, but to a NumPy array if the value is not a JAX array."""
     value = without_objects(value)
     plain = float | int | np.ndarray | np.number
     several = isinstance(value, list | tuple) and all(isinstance(each, plain) for each in value)
@@ -344,7 +342,7 @@ def real_numbers(value: Any) -> Any:
 
 
 def without_objects(value: Value) -> Value | np.ndarray:
-    """Convert numbers that JAX has not, such as `Decimal`, to those of NumPy; others stay."""
+    """Convert numbers that JAX does not support, such as `Decimal`, to NumPy; others stay."""
     other = Decimal | Fraction | np.longdouble
     several = isinstance(value, list | tuple) and any(isinstance(each, other) for each in value)
     objects = isinstance(value, np.ndarray) and value.dtype in (object, np.longdouble)
@@ -354,7 +352,7 @@ def without_objects(value: Value) -> Value | np.ndarray:
 
 
 def on_device(numbers: Array | np.ndarray) -> Array:
-    """Return numbers as an array of JAX; those of NumPy must not change any more."""
+    """Return numbers as a JAX array; a NumPy array passed here must not change afterwards."""
     # Not `jnp.asarray`, which compiles a program for each shape.
     return numbers if isinstance(numbers, jax.Array) else jax.device_put(numbers)
 
@@ -416,7 +414,7 @@ def dotted(name: str, field: str) -> str:
 
 
 def nearest(number: float, low: float, high: float) -> str:
-    """Return the end of a message that names the value nearest to a number; empty without one."""
+    """Return the end of a message with the value nearest to a number; empty if there is none."""
     text = f"; the nearest value is {short(np.clip(number, low, high).item())}"
     return text if math.isfinite(number) else ""
 
@@ -427,7 +425,7 @@ def format_choices(choices: Sequence[object]) -> str:
 
 
 def short(value: object) -> str:
-    """Format a number, or a tuple of them, as a person would write it."""
+    """Format a number, or a tuple of numbers, as a user would write it."""
     if isinstance(value, tuple):
         return "[" + ", ".join(map(short, value)) + "]"
     if isinstance(value, float) and value == int(value if math.isfinite(value) else 0):

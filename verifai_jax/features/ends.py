@@ -28,7 +28,7 @@ Reals = TypeVar("Reals", jax.Array, np.ndarray)
 
 
 def check_closed(closed: object) -> None:
-    """Refuse what does not say which ends belong to an interval.
+    """Refuse a value that does not say which ends belong to an interval.
 
     **Raises:** `UnknownNameError` for a word that is not in `CLOSED`.
     """
@@ -39,9 +39,9 @@ def check_closed(closed: object) -> None:
 def ends_within(
     low: End, high: End, dtype: DTypeLike, closed: str = "both"
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the least and the greatest number of a precision within intervals.
+    """Return the least and the greatest number of a precision inside intervals.
 
-    They are zero or normal numbers: XLA takes a subnormal one for zero.
+    They are zero or normal numbers, because XLA treats subnormal numbers as zero.
 
     **Arguments:**
     - `low`, `high`: the ends.
@@ -54,9 +54,9 @@ def ends_within(
 def clip_to_ends(
     x: Float[Array, "*shape"], first: np.ndarray | Array, last: np.ndarray | Array
 ) -> Float[Array, "*shape"]:
-    """Return numbers moved to the ends that they are beyond, with the derivative of `x` there.
+    """Return numbers clipped to the ends, but with the derivative of `x`.
 
-    A search that stands at an end can so leave it.
+    So a search that stands at an end can leave it.
     """
     return replace_where(replace_where(x, x < first, first), x > last, last)
 
@@ -71,9 +71,10 @@ def replace_where(
 def is_inside(
     numbers: Float[np.ndarray, "*shape"], low: End, high: End, closed: str = "both"
 ) -> Bool[np.ndarray, "*shape"]:
-    """Return which numbers of double precision lie in intervals, up to rounding.
+    """Return which numbers of double precision lie inside intervals, up to rounding.
 
-    One that is an end in single precision is that end, if this belongs to the interval.
+    A number that rounds to an end in single precision counts as that end, if the end belongs to the
+    interval.
     """
     first, last, under, over, _ = _ends(low, high, np.dtype(np.float64), closed)
     single = _single(numbers, np)
@@ -83,10 +84,9 @@ def is_inside(
 
 
 def round_inwards(value: Reals, low: End, high: End, closed: str = "both") -> Reals:
-    """Return numbers with those on an end that rounding moved outwards moved to the last number
-    inside.
+    """Return numbers in which those rounded just past an end become the last number inside.
 
-    Others stay as they are, those that are farther outside too.
+    Other numbers are unchanged, including those farther outside.
 
     **Arguments:**
     - `value`: numbers in single or double precision.

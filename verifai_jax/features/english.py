@@ -15,7 +15,7 @@ from verifai_jax.core.messages.text import one_line
 
 
 def number(value: Any) -> str:
-    """Write a value of a feature: six digits of a number, anything else in one line."""
+    """Format a value of a feature: a number with six digits, anything else in one line."""
     if value is None or value != value:
         return "absent"
     if isinstance(value, bool | np.bool_) or not isinstance(value, int | float | np.number):
@@ -26,14 +26,14 @@ def number(value: Any) -> str:
 
 
 def numbers(value: float | Sequence[float] | np.ndarray) -> str:
-    """Write a number, or the numbers of a vector in brackets."""
+    """Format a number, or a vector in brackets."""
     if np.ndim(value) == 0:
         return number(value)
     return f"[{', '.join(number(each) for each in np.asarray(value).ravel().tolist())}]"
 
 
 def quantile_words(domain: Any) -> str:
-    """Write a distribution by its quantiles, the outermost that are simulated among them."""
+    """Describe a distribution by its quantiles, including the outermost that are simulated."""
     u = jnp.array([0.0, 0.01, 0.25, 0.5, 0.75, 0.99, 1.0], jnp.float32)
     lowest, low, first, median, third, high, highest = np.asarray(
         jax.vmap(domain.from_unit)(u[:, None])

@@ -22,8 +22,8 @@ from verifai_jax.features.transitions import Graph, Transition
 class EventTables:
     """Tables of an automaton's events.
 
-    - `transitions`: what may happen, in the order written.
-    - `graph`: the states and pasts that can be reached.
+    - `transitions`: the possible transitions, in the order written.
+    - `graph`: the reachable states and pasts.
     """
 
     transitions: tuple[Transition, ...]
@@ -45,7 +45,7 @@ class EventTables:
 
     @cached_property
     def widths(self) -> tuple[int, ...]:
-        """Coordinates of an event: one for its kind, those of its wait and of each parameter."""
+        """Numbers of coordinates of an event: 1 for its kind, those of its wait and parameters."""
         waits = max(each.wait.size for each in self.transitions)
         others = [max(domain.size for domain in group) for group in self.domains.values()]
         return (1, waits, *others)
@@ -56,7 +56,7 @@ class EventTables:
 
     @cached_property
     def by_kind(self) -> Int[np.ndarray, "nodes kinds"]:
-        """The transition that each kind of event is at each node; -1 where it is not enabled."""
+        """The transition for each kind of event at each node; -1 if it is not enabled."""
         table = np.full((len(self.graph.states), len(self.names)), ABSENT, np.int32)
         for node, number in np.argwhere(self.graph.enabled):
             table[node, self.kind_of[number]] = number
@@ -70,7 +70,7 @@ class EventTables:
 
     @cached_property
     def waits(self) -> dict[Domain, tuple[int, ...]]:
-        """The different domains of waiting times, each with the transitions that have it."""
+        """The different domains of waiting times, each with the transitions that use it."""
         found: dict[Domain, tuple[int, ...]] = {}
         for number, each in enumerate(self.transitions):
             found[each.wait] = (*found.get(each.wait, ()), number)
@@ -78,7 +78,7 @@ class EventTables:
 
     @cached_property
     def users(self) -> dict[str, dict[Domain, tuple[int, ...]]]:
-        """For each parameter its domains, each with the transitions that have it."""
+        """For each parameter its domains, each with the transitions that use it."""
         found: dict[str, dict[Domain, tuple[int, ...]]] = {name: {} for name in self.domains}
         for number, each in enumerate(self.transitions):
             for name, domain in each.parameters:
@@ -87,7 +87,7 @@ class EventTables:
 
     @cached_property
     def uses(self) -> Bool[np.ndarray, "transitions width"]:
-        """The coordinates of an event that matter, for each transition."""
+        """The coordinates of an event that are used, for each transition."""
         table = np.zeros((len(self.transitions), sum(self.widths)), bool)
         starts = np.concatenate([[0], np.cumsum(self.widths)])
         for number, each in enumerate(self.transitions):
@@ -108,7 +108,7 @@ class EventTables:
         return table
 
     def followed(self, kinds: Int[np.ndarray, "n events"]) -> Int[np.ndarray, "n events"]:
-        """Return the transition of each event, from the kinds of many sequences."""
+        """Return the transition of each event, given the kinds in many sequences."""
         taken, node = np.full(kinds.shape, ABSENT), np.zeros(len(kinds), int)
         for i in range(kinds.shape[1]):
             there = kinds[:, i] >= 0

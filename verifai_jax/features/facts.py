@@ -20,7 +20,8 @@ Facts: TypeAlias = dict[str, dict[str, Any]]
 def drawn_facts(domain: Any, name: str) -> Facts:
     """Return bounds from the ends of the coordinates, or those that the domain names.
 
-    The range of a distribution without ends, such as a normal one, leaves out their thousandths.
+    For a distribution without ends, such as a normal one, the range leaves out a thousandth of each
+    tail.
     """
     if domain.size == 0:
         return {}
@@ -46,13 +47,13 @@ def drawn_facts(domain: Any, name: str) -> Facts:
 
 
 def integer_facts(low: int, high: int) -> dict[str, Any]:
-    """Return what is known of a column of integers that are equally probable."""
+    """Return the facts about a column of equally probable integers."""
     ends = (low, high)
     return {"ordered": True, "bounds": ends, "range": ends, "integer": True, "uniform": True}
 
 
 def joined_facts(one: dict[str, Any] | None, other: dict[str, Any]) -> dict[str, Any]:
-    """Return what is known of a column that has one of two domains, or is empty."""
+    """Return the facts about a column that has one of two domains, or may be empty."""
     if not other["ordered"]:
         return {"ordered": False}
     if one is None or one == other:

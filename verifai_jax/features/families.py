@@ -67,7 +67,7 @@ class LogNormal(Positive):
     Coordinates reach 5.54 standard deviations of the logarithm to either side.
 
     **Arguments:**
-    - `mean`, `std`: of the logarithm; the median is `exp(mean)`.
+    - `mean`, `std`: those of the logarithm; the median is `exp(mean)`.
     **Raises:** `ValueError` for parameters that are not finite, a standard deviation that is not
     positive, or values that do not fit into float32.
     """
@@ -108,7 +108,7 @@ class LogNormal(Positive):
 class Weibull(Positive):
     """Positive numbers such as times to a failure, or wind speeds: `Weibull(shape, scale)`.
 
-    The probability of more than `x` is `exp(-(x / scale) ** shape)`.
+    The probability of a value above `x` is `exp(-(x / scale) ** shape)`.
 
     **Arguments:**
     - `shape`: positive; below 1 the density is infinite at zero.
@@ -176,8 +176,8 @@ class Exponential(Positive):
 class Triangular(Bounded):
     """Numbers between two ends with one most likely value: `Triangular(low, mode, high)`.
 
-    The coordinates 0 and 1 stand for a probability of 2^-26, since the density is zero at the ends,
-    but for one that is the mode.
+    The density is zero at the ends, so the coordinates 0 and 1 stand for a tail probability of
+    2^-26, except at an end that is the mode.
 
     **Arguments:**
     - `low`, `mode`, `high`: `low <= mode <= high` and `low < high`.

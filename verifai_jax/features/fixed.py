@@ -14,11 +14,11 @@ from verifai_jax.features.english import number
 
 @dataclass(frozen=True, init=False, repr=False)
 class Fixed(Domain):
-    """A domain at one of its values: it keeps its table columns and has no coordinates.
+    """A domain fixed at one of its values: it keeps its table columns and has no coordinates.
 
     **Arguments:**
     - `domain`: the domain of the feature.
-    - `value`: in the domain, as a person writes it.
+    - `value`: a value of the domain, as a user writes it.
     - `name`: the name of the feature, for messages.
     **Raises:** `ValueError` for a value outside the domain.
     """
@@ -33,7 +33,7 @@ class Fixed(Domain):
 
     @property
     def value(self) -> PyTree:
-        """The value, as a system sees it."""
+        """The value, as a system receives it."""
         return self.domain.from_columns(dict(self.row), "")
 
     @property

@@ -35,17 +35,17 @@ TABLE_COLUMNS = ("row", "rho", "violated", "status", "verdict", "suggested", "me
 
 
 def given_features(space: FeatureSpace, rows: Rows, precision: str = "float32") -> dict[str, Any]:
-    """Check features in any form, and convert them to those that a system sees.
+    """Check features in any form, and convert them to the form that a system receives.
 
-    Everything is checked as it was written, in double precision, before it is converted.
+    Everything is checked as given, in double precision, before it is converted.
 
     **Arguments:**
     - `rows`: a DataFrame with the columns of a table, a row of one, or dictionaries (one or
-      several) that hold features by name or by the columns of a table.
-    - `precision`: `"float32"` or `"float64"`, of their real numbers.
+      several) of features by name or by the columns of a table.
+    - `precision`: the precision of their real numbers, `"float32"` or `"float64"`.
     **Returns:** the features, stacked along a leading axis `[n, ...]`.
-    **Raises:** `ValueError` that names the first row and feature which is missing, unknown, outside
-    its domain or refused by the constraint; `TypeError` for rows of another form.
+    **Raises:** `ValueError` that names the first row and feature that is missing, unknown, outside
+    its domain or refused by the constraint; `TypeError` for rows of another type.
     """
     if _is_frame(rows):
         frame: Any = rows
@@ -74,8 +74,8 @@ def given_rows(space: FeatureSpace, features: Mapping[str, Any]) -> Float[np.nda
     """Return rows that an engine simulates with exactly these features.
 
     **Arguments:**
-    - `features`: `[n, ...]`, as `given_features` gives them.
-    **Returns:** the points of the unit cube nearest to the features, and after each the real
+    - `features`: `[n, ...]`, as returned by `given_features`.
+    **Returns:** the points of the unit cube nearest to the features, each followed by the real
     numbers among its features; see `FeatureSpace.unflatten_given`.
     """
     leaves = [np.asarray(leaf) for leaf in jax.tree.leaves(features)]
@@ -94,9 +94,9 @@ def check_columns(
     """Check rows of a table `[n]`, and return their features in double precision.
 
     **Arguments:**
-    - `columns`: by name; others than those of features are ignored.
-    - `held`: whether features that the space holds at one value are checked too.
-    **Raises:** as `given_features`.
+    - `columns`: columns by name; those that belong to no feature are ignored.
+    - `held`: whether to check features that the space fixes, too.
+    **Raises:** the errors of `given_features`.
     """
     for name in space.columns:
         if name not in columns:

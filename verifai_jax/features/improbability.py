@@ -40,7 +40,7 @@ STEEP = 1e-13
 
 
 class Improbability:
-    """The departures of points from the likeliest one, coordinate by coordinate.
+    """The departures of points from the likeliest point, for each coordinate.
 
     **Arguments:**
     - `space`: the space of the features.
@@ -61,12 +61,12 @@ class Improbability:
 
     @cached_property
     def scale(self) -> Float[np.ndarray, " d"]:
-        """A departure of each continuous coordinate that is neither small nor large."""
+        """A typical departure of each continuous coordinate, neither small nor large."""
         return np.min(self.slope(np.full((1, self.space.dim), 0.5)), axis=0).clip(0, 1)
 
     @cached_property
     def likeliest(self) -> Float[np.ndarray, " d"]:
-        """The point of the greatest density; the middle of boxes, and the shortest arrays."""
+        """The point with the greatest density; the middle of boxes, and the shortest arrays."""
         u = self.point_at(np.zeros((1, self.space.dim)))[0]
         for index, losses in zip(self.space.cube.discrete, self.losses, strict=True):
             edges = np.append(0.0, np.cumsum(np.exp(-losses / 2)))
@@ -75,7 +75,7 @@ class Improbability:
         return u
 
     def departure(self, points: Points) -> Points:
-        """Return the signed departure; of discrete coordinates, how far away the point is."""
+        """Return the signed departures; for discrete coordinates, the distance."""
         u, found = np.asarray(points, np.float64), np.zeros(np.shape(points))
         for domain, own in self.groups:
             if domain is None:
@@ -87,7 +87,7 @@ class Improbability:
         return found
 
     def point_at(self, departures: Points) -> Points:
-        """Return the points with these departures; discrete coordinates are in the middle."""
+        """Return the points with these departures; discrete coordinates are at the middle."""
         from scipy.special import ndtr
 
         u = np.full(np.shape(departures), 0.5)
@@ -99,7 +99,7 @@ class Improbability:
         return u
 
     def slope(self, points: Points) -> Points:
-        """Return the derivative of the departures by the coordinates; 1 of discrete ones."""
+        """Return the derivative of the departures by the coordinates; 1 for discrete ones."""
         u, found = np.asarray(points, np.float64), np.ones(np.shape(points))
         for domain, own in self.groups:
             if domain is None:
@@ -111,9 +111,9 @@ class Improbability:
         return found
 
     def square(self, points: Points) -> Points:
-        """Return the squares of all departures, twice the losses of log-density.
+        """Return the squares of all departures, which are twice the loss of log density.
 
-        Those of boxes are `SLIGHT`, and so are those of items that do not exist zero.
+        For boxes they are `SLIGHT`, for items that do not exist zero.
         """
         found, cube = self.departure(points) ** 2, self.space.cube
         for domain, own in self.groups:

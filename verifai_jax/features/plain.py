@@ -27,9 +27,9 @@ SIGNAL_OPTIONS = ("times", "width")
 
 
 def to_plain(domain: Domain) -> dict[str, Any]:
-    """Describe a domain by dictionaries, lists, texts and numbers.
+    """Convert a domain to dictionaries, lists, texts and numbers.
 
-    **Raises:** `ValueError` for a domain of the user's own, or choices that are no plain data.
+    **Raises:** `ValueError` for a user's own domain, or choices that are not plain data.
     """
     match domain:
         case Struct():
@@ -71,10 +71,10 @@ def from_plain(
     """Build the domain that `to_plain` described.
 
     **Arguments:**
-    - `data`: as `to_plain` gives it.
-    - `distributions`: those with functions, by name.
-    **Raises:** `ValueError` for an unknown kind, a distribution that is not given, missing parts,
-    or what the domain itself refuses.
+    - `data`: data returned by `to_plain`.
+    - `distributions`: the distributions that have functions, by name.
+    **Raises:** `ValueError` for an unknown kind, a distribution that is not given, missing parts;
+    the errors of the domain.
     """
     try:
         return _build(data, distributions or {})

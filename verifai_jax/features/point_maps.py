@@ -28,11 +28,11 @@ from verifai_jax.features.signal import Signal
 
 
 class PointMaps:
-    """Points `[dim]` of the unit cube to features by name, and back; programs are compiled once.
+    """Maps from points `[dim]` of the unit cube to features by name, and back; compiled once.
 
     **Arguments:**
     - `root`: the domains by name, as one domain.
-    - `where`: the constraint between features, or None.
+    - `where`: the constraint between features; None without one.
     """
 
     def __init__(self, root: Struct, where: Callable[[Any], Bool[Array, ""]] | None) -> None:
@@ -65,12 +65,12 @@ class PointMaps:
 
     @cached_property
     def ordered(self) -> tuple[bool, ...]:
-        """Order of each coordinate: True if its values have one."""
+        """For each coordinate, True if its values have an order."""
         return self.root.ordered
 
     @cached_property
     def lengths(self) -> tuple[int, ...]:
-        """Indices of the coordinates that are lengths of arrays, on which others depend."""
+        """Indices of the coordinates that are lengths of arrays; others depend on them."""
         return self.root.lengths
 
     @cached_property
@@ -84,11 +84,11 @@ class PointMaps:
         return self.root.coordinates("")
 
     def labels(self, duration: float | None = None) -> dict[str, str]:
-        """Return the names of the coordinates for people: `{"wind[3]": "wind at 1.5 s", ...}`.
+        """Return readable names of the coordinates: `{"wind[3]": "wind at 1.5 s", ...}`.
 
         **Arguments:**
-        - `duration`: the duration of a simulation in seconds, for signals that have none of their
-          own; without it their control points keep their numbers.
+        - `duration`: the duration of a simulation in seconds, for signals without their own; when
+          left out, control points keep their numbers.
         """
         return dict(zip(self.coordinates, self.root.labels("", duration), strict=True))
 
@@ -108,7 +108,7 @@ class PointMaps:
         return jax.eval_shape(self.unflatten, self.point_form)
 
     def feature_form_in(self, precision: str) -> dict[str, Any]:
-        """Return the form of the features in `"float32"` or `"float64"`, whatever JAX is set to."""
+        """Return the form of the features in `"float32"` or `"float64"`, whatever JAX's setting."""
         with in_precision(precision):
             return jax.eval_shape(self.unflatten, jax.ShapeDtypeStruct((self.dim,), precision))
 
@@ -124,7 +124,7 @@ class PointMaps:
 
         **Arguments:**
         - `u`: the point, `[dim]` with entries in `[0, 1]`.
-        **Returns:** the features by name, as a system sees them.
+        **Returns:** the features by name, as a system receives them.
         **Raises:** `ValueError` for a point of another shape.
         """
         u = as_real(u)
@@ -136,46 +136,46 @@ class PointMaps:
         return self.root.from_unit(u)
 
     def flatten(self, features: Mapping[str, Any]) -> Float[Array, " dim"]:
-        """Convert features to the point `[dim]` of the unit cube; discrete ones to cell centres.
+        """Convert features to the point `[dim]` of the unit cube; discrete ones to cell middles.
 
-        Pure JAX on the values that `unflatten` gives; takes plain Python values too. Nothing is
+        Pure JAX for values returned by `unflatten`; also takes plain Python values. Nothing is
         checked.
 
         **Arguments:**
-        - `features`: by name; constant, fixed ones and events may be left out.
+        - `features`: features by name; constant and fixed ones and events may be left out.
         **Returns:** the point, `[dim]`.
         """
         return self.root.to_unit(self.root.coerce(self.completed(features)))
 
     @cached_property
     def features_at(self) -> Callable[[Numbers], dict[str, Any]]:
-        """Points `[n, dim]` to features `[n, ...]`: `unflatten`, compiled once for each `n`."""
+        """Convert points `[n, dim]` to features `[n, ...]`: `unflatten`, compiled for each `n`."""
         return jax.jit(jax.vmap(self.unflatten))
 
     @cached_property
     def point_of(self) -> Callable[[Mapping[str, Any]], Float[Array, " dim"]]:
-        """Features of one simulation to a point `[dim]`: `flatten`, compiled."""
+        """Convert features of one simulation to a point `[dim]`: `flatten`, compiled."""
         return jax.jit(self.flatten)
 
     @cached_property
     def points_at(self) -> Callable[[Mapping[str, Any]], Float[Array, "n dim"]]:
-        """Features `[n, ...]` to points `[n, dim]`: `flatten`, compiled once for each `n`."""
+        """Convert features `[n, ...]` to points `[n, dim]`: `flatten`, compiled for each `n`."""
         return jax.jit(jax.vmap(self.flatten))
 
     @cached_property
     def width(self) -> int:
-        """Number of real numbers among the features of one simulation."""
+        """Number of real numbers in the features of one simulation."""
         leaves = jax.tree.leaves(self.feature_form)
         return sum(math.prod(leaf.shape) for leaf in leaves if _is_real(leaf))
 
     def unflatten_given(
         self, u: Float[Array, " dim"], values: Float[Array, " width"]
     ) -> dict[str, Any]:
-        """Return features with given real numbers, others as `unflatten` gives them. Pure JAX.
+        """Return features with given real numbers, and the rest from `unflatten`. Pure JAX.
 
         **Arguments:**
         - `u`: the point of the unit cube nearest to the features.
-        - `values`: their real numbers, one after another; where one is NaN, that of the point.
+        - `values`: their real numbers in order; NaN stands for the number of the point.
         """
         leaves, form = jax.tree.flatten(self.unflatten(u))
         start = 0
@@ -210,27 +210,27 @@ class PointMaps:
 
     @property
     def items(self) -> int:
-        """Number of items at most that `without_items` can take away, such as events."""
+        """Maximum number of items, such as events, that `without_items` can remove."""
         return self.root.items
 
     @cached_property
     def without_items(self) -> Callable[[Numbers, Numbers], Float[Array, "n dim"]]:
-        """Take those items away from points `[n, dim]` that `[n, items]` selects; compiled."""
+        """Remove the items selected by `[n, items]` from points `[n, dim]`; compiled."""
         return jax.jit(jax.vmap(self.root.without))
 
     @cached_property
     def settle(self) -> Callable[[Numbers], Float[Array, "n dim"]]:
-        """Move unused coordinates of points `[n, dim]` to one value; compiled."""
+        """Set unused coordinates of points `[n, dim]` to a fixed value; compiled."""
         return jax.jit(jax.vmap(self.root.settled))
 
     @cached_property
     def used(self) -> Callable[[Numbers], Bool[Array, "n dim"]]:
-        """Say which coordinates of points `[n, dim]` mean something; compiled."""
+        """Return which coordinates of points `[n, dim]` are used; compiled."""
         return jax.jit(jax.vmap(self.root.used))
 
     @cached_property
     def coverage_ids_at(self) -> Callable[[Numbers], Int[Array, "n ids"]]:
-        """Return what points `[n, dim]` cover, such as transitions of an automaton; compiled."""
+        """Return the items that points `[n, dim]` cover, such as transitions; compiled."""
         return jax.jit(jax.vmap(lambda u: self.root.coverage_ids(self.unflatten(u))))
 
     @property
@@ -239,7 +239,7 @@ class PointMaps:
         return None if self.where is None else self.accepts_points
 
     def completed(self, features: Mapping[str, Any]) -> Mapping[str, Any]:
-        """Return features with the constant, fixed ones and events that were left out."""
+        """Return features with the constant and fixed ones and events added that were left out."""
         if not isinstance(features, Mapping):
             return features
         held = ((name, domain.held_at) for name, domain in self.root.fields)
@@ -259,13 +259,13 @@ ROUNDING = 2.0**-23
 def features_of_rows(
     domains: Mapping[str, Domain], rows: Mapping[str, Numbers], precision: str
 ) -> dict[str, PyTree]:
-    """Return the features `[n, ...]` that rows of a table hold, in this precision.
+    """Return the features `[n, ...]` in rows of a table, in this precision.
 
     **Arguments:**
     - `domains`: the domains of the features, by name.
-    - `rows`: columns `[n]` by name; others than those of features are ignored.
-    - `precision`: `"float32"` or `"float64"`, of real numbers.
-    **Raises:** as `space.from_row`.
+    - `rows`: columns `[n]` by name; those that belong to no feature are ignored.
+    - `precision`: the precision of real numbers, `"float32"` or `"float64"`.
+    **Raises:** the errors of `space.from_row`.
     """
     names = [column for name, domain in domains.items() for column in domain.columns(name)]
     for name in names:
@@ -315,7 +315,7 @@ def _batch(domain: Domain, columns: Mapping[str, np.ndarray], name: str, precisi
 
 
 def nudged(domains: Mapping[str, Domain], features: Mapping[str, PyTree]) -> dict[str, PyTree]:
-    """Return the same features `[n, ...]`, their real numbers one rounding of float32 away.
+    """Return the features `[n, ...]` with real numbers moved by one rounding of float32.
 
     They stay in their domains; choices, constants and fixed features do not move.
     """

@@ -25,7 +25,7 @@ Corners = Float[np.ndarray, "n dim"]
 class FeatureRanges:
     """The ranges of a space's features.
 
-    - `edges`: where the cells of each coordinate begin and end; None for a continuous one.
+    - `edges`: the ends of the cells of each coordinate; None for a continuous one.
 
     **Arguments:**
     - `space`: the feature space.
@@ -67,7 +67,7 @@ class FeatureRanges:
         return found
 
     def ends(self, low: Corners, high: Corners) -> tuple[Corners, Corners]:
-        """Return the points of the cube that have the least and the greatest features of boxes."""
+        """Return the points of the cube with the minimum and the maximum of box features."""
         low, high = low.copy(), high.copy()
         for j, edges in enumerate(self.edges):
             if edges is not None:
@@ -105,7 +105,7 @@ class FeatureRanges:
         return found
 
     def shares(self, points: Corners) -> Corners:
-        """Return where the features of points lie between their least and greatest, from 0 to 1."""
+        """Return the positions of features between their minimum and maximum, from 0 to 1."""
         shares = points.astype(float).copy()
         leaves = self._features(points)
         ends = self._features(np.array([[0.0] * self.dim, [1.0] * self.dim]))

@@ -21,18 +21,18 @@ Inputs = Mapping[str, tuple[float, float]] | Sequence
 class Reactive(Domain):
     """An adversary that sees signals during the run: `Reactive({"gap": (0, 60)}, bounds=(-3, 3))`.
 
-    A value is a `Reaction`, which a system calls with the signals of the moment:
-    `features["brake"](gap=gap, v=v)`. Its parameters are the coordinates, so that a search finds
-    how to react, where a `Signal` can only say when.
+    A value is a `Reaction`, which a system calls with the present signals:
+    `features["brake"](gap=gap, v=v)`. Its parameters are the coordinates. So a search finds how to
+    react to signals, whereas a `Signal` depends on time only.
 
     **Arguments:**
-    - `inputs`: signal -> `(low, high)`, the range that it usually has, which is scaled to -1 to 1;
-      or names of signals that are of that size anyway.
-    - `hidden`: hidden units of a network with hyperbolic tangents; 0 for an affine function.
+    - `inputs`: signal -> `(low, high)`, its usual range, which is scaled to -1 to 1; or names of
+      signals that have this size already.
+    - `hidden`: number of hidden tanh units of a network; 0 for an affine function.
     - `bounds`: the bounds of the output.
     - `scale`: weights and biases are uniform from `-scale` to `scale`.
-    **Raises:** `ValueError` for no inputs, ranges or bounds that are none, a negative number of
-    hidden units, or a scale that is not positive.
+    **Raises:** `ValueError` for no inputs, invalid ranges or bounds, a negative number of hidden
+    units, or a scale that is not positive.
     """
 
     arguments = ("inputs", "hidden", "bounds", "scale")
@@ -82,7 +82,7 @@ class Reactive(Domain):
         return self._box.to_unit(jnp.asarray(value.parameters))
 
     def coerce(self, value: PyTree) -> Reaction:
-        """Convert a `Reaction`, or a list of its parameters, layer after layer."""
+        """Convert a `Reaction`, or a list of its parameters, layer by layer."""
         parameters = value.parameters if isinstance(value, Reaction) else value
         return self._reaction(self._box.coerce(parameters))
 

@@ -38,7 +38,7 @@ Course = tuple[str, float | None, tuple[float, ...] | None, float | None]
 
 @dataclass(frozen=True)
 class Signal(Domain):
-    """A function of time by control points: `Signal(Box(-1, 1), knots=16, hold="linear")`.
+    """A function of time with control points: `Signal(Box(-1, 1), knots=16, hold="linear")`.
 
         Signal(Box(0, 61), times=[0, 5, 20, 30], hold="pchip")   # where the control points are
         Signal(Box(0, 3), times=[2, 8], hold="pulse", width=0.5)  # two gusts of half a second
@@ -46,19 +46,19 @@ class Signal(Domain):
     A value is a `Waveform`, which a system calls with a time in seconds: `features["wind"](time)`.
 
     **Arguments:**
-    - `domain`: the domain of each control point: a `Box`, of numbers or vectors, or a distribution.
-    - `knots`: number of control points, at equal distances; with `times` it is theirs.
-    - `hold`: `"linear"` joins them by lines, the first at time 0 and the last at the end;
-      `"pchip"` by a cubic that is monotone between them and never beyond them;
-      `"constant"` holds each for an equal part of the time;
-      `"pulse"` holds each for `width` seconds from its time on, and is 0 otherwise.
-    - `duration`: in seconds; that of the simulation when left out (`ode` knows it).
-    - `times`: the times of the control points in seconds, increasing. The first and the last value
+    - `domain`: the domain of each control point: a `Box` of numbers or vectors, or a distribution.
+    - `knots`: number of control points at equal distances; left out if `times` is given.
+    - `hold`: how they are interpolated. `"linear"` joins them by lines, the first at time 0 and the
+      last at the end; `"pchip"` by a cubic that is monotone between them and never exceeds them;
+      `"constant"` holds each for an equal part of the time; `"pulse"` holds each for `width`
+      seconds from its time on, and is 0 otherwise.
+    - `duration`: duration in seconds; that of the simulation when left out (`ode` knows it).
+    - `times`: the increasing times of the control points in seconds. The first and the last value
       hold before and after them.
-    - `width`: the width of a pulse in seconds; half the shortest distance of two when left out.
+    - `width`: the width of a pulse in seconds; by default half the shortest distance of two pulses.
     **Raises:** `ValueError` for a domain that is not continuous, an unknown `hold`, too few knots
     (1 for constant and pulse, 2 for linear and pchip), a duration or width that is not positive,
-    and times that do not increase, lie after the duration or are not as many as the knots.
+    and times that do not increase, exceed the duration, or differ from the knots in number.
     """
 
     arguments = ("domain", "knots", "hold", "duration")
@@ -192,13 +192,13 @@ class Signal(Domain):
         return self.waveform(on_device(np.stack([np.asarray(knot) for knot in knots])))
 
     def refined(self, factor: int) -> "Signal":
-        """Return the signal with more control points, among which are all of the coarse one's.
+        """Return the signal with more control points, among them those of the coarse signal.
 
-        `(knots - 1) * factor + 1` where linear, `knots * factor` where constant: `Waveform.refined`
-        gives the same function on them, so that a search can go from coarse to fine. Given times
-        are refined between the first and the last.
+        There are `(knots - 1) * factor + 1` if linear, `knots * factor` if constant.
+        `Waveform.refined` gives the same function on them, so that a search can go from coarse to
+        fine. Given times are refined between the first and the last.
 
-        **Raises:** `ValueError` for a factor that is not a positive integer, and for a cubic and
+        **Raises:** `ValueError` for a factor that is not a positive integer, and for cubics and
         pulses, which more control points cannot represent.
         """
         if isinstance(factor, bool) or not isinstance(factor, int) or factor < 1:

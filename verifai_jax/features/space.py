@@ -33,10 +33,10 @@ if TYPE_CHECKING:
 
 
 class FeatureSpace(PointMaps, ForUsers):
-    """Named domains over `dim` unit coordinates; uniform coordinates are the prior on features.
+    """Named domains over `dim` unit coordinates; the prior is uniform in these coordinates.
 
     A simulation has three forms: a *point* of the unit cube, its *features* by name as a system
-    sees them, and a *row* of a table. These convert one form into another:
+    receives them, and a *row* of a table. These methods convert between them:
 
     - point `[dim]` to features: `unflatten`; points `[n, dim]`: `features_at`, compiled.
     - features to point `[dim]`: `flatten`, and compiled `point_of`; features `[n, ...]` to points
@@ -44,15 +44,16 @@ class FeatureSpace(PointMaps, ForUsers):
     - features `[n, ...]` to columns `[n]` of a table: `rows`.
     - row to features: `from_row`; columns `[n]` to features `[n, ...]`: `features_of`.
     - a table to points `[n, dim]`: `points`.
-    - what a person writes to features: `coerce`, which checks it, and `convert`, which JAX may
+    - features as a user writes them: `coerce`, which checks them, and `convert`, which JAX may
       trace.
 
     **Arguments:**
     - `domains`: name -> `Domain`, in the order in which coordinates and columns come.
     - `where`: a constraint between features, a JAX function from features to one truth value. The
-      prior is then that of the domains given that it holds, and only such points are simulated.
-    **Raises:** `ValueError` for no features, bad names, or names that give one column twice;
-    `TypeError` for a value that is not a domain, or a `where` that is not a function.
+      prior is then that of the domains given that it holds, and only points that satisfy it are
+      simulated.
+    **Raises:** `ValueError` for no features, invalid names, or names that give the same column
+    twice; `TypeError` for a value that is not a domain, or a `where` that is not a function.
     """
 
     _internal = frozenset((
@@ -77,9 +78,9 @@ class FeatureSpace(PointMaps, ForUsers):
             known.add(column)
 
     def points(self, rows: "pd.DataFrame") -> Float[np.ndarray, "n dim"]:
-        """Convert a table to the points `[n, dim]` of the unit cube that its rows came from.
+        """Convert a table to the points `[n, dim]` of the unit cube that gave its rows.
 
-        **Raises:** `KeyError` for a missing column; `ValueError` for an entry of the wrong kind.
+        **Raises:** `KeyError` for a missing column; `ValueError` for an entry of the wrong type.
         """
         records = rows.loc[:, list(self.columns)].to_dict("records")
         features = [self.from_row(row) for row in records]
@@ -92,38 +93,38 @@ class FeatureSpace(PointMaps, ForUsers):
         """Convert columns `[n]` of a table to features `[n, ...]`: `from_row` of each row, stacked.
 
         **Arguments:**
-        - `rows`: columns `[n]` by name; others than those of features are ignored.
-        - `precision`: `"float32"` or `"float64"`, of their real numbers.
-        **Raises:** as `from_row`.
+        - `rows`: columns `[n]` by name; those that belong to no feature are ignored.
+        - `precision`: the precision of their real numbers, `"float32"` or `"float64"`.
+        **Raises:** the errors of `from_row`.
         """
         return features_of_rows(self.domains, rows, precision)
 
     def nudged(self, features: Mapping[str, Any]) -> dict[str, Any]:
-        """Return features `[n, ...]` whose real numbers are one rounding of float32 away."""
+        """Return features `[n, ...]` with real numbers moved by one rounding of float32."""
         return nudged(self.domains, features)
 
     def coerce(self, features: Mapping[str, Any]) -> dict[str, Any]:
-        """Check features that a person wrote and convert them to those that a system sees.
+        """Check features as a user writes them, and convert them to those that a system receives.
 
         **Arguments:**
-        - `features`: numbers, lists, choices, dictionaries by name; constant, fixed ones and events
-          may be left out.
-        **Returns:** the features as `unflatten` gives them.
-        **Raises:** as `check`.
+        - `features`: numbers, lists, choices, dictionaries by name; constant and fixed ones and
+          events may be left out.
+        **Returns:** the features in the form of `unflatten`.
+        **Raises:** the errors of `check`.
         """
         self.check(features)
         return self.root.coerce(self.completed(features))
 
     def convert(self, features: Mapping[str, Any]) -> dict[str, Any]:
-        """Convert features that a person wrote to those that a system sees; pure JAX.
+        """Convert features as a user writes them to those that a system receives; pure JAX.
 
-        Their names and shapes are checked, and their values are not: JAX may trace them.
+        Names and shapes are checked; values are not, so that JAX may trace them.
 
         **Arguments:**
         - `features`: as in `coerce`.
-        **Returns:** the features as `unflatten` gives them.
-        **Raises:** `ValueError` that names the first feature which is unknown, is missing or has
-        another shape.
+        **Returns:** the features in the form of `unflatten`.
+        **Raises:** `ValueError` that names the first feature that is unknown, missing or of another
+        shape.
         """
         complete = self.completed(features)
         check_names("feature", complete, self.domains)
@@ -142,9 +143,9 @@ class FeatureSpace(PointMaps, ForUsers):
         return converted
 
     def check(self, features: Mapping[str, Any]) -> None:
-        """Check concrete features; constant, fixed ones and events may be left out.
+        """Check concrete features; constant and fixed ones and events may be left out.
 
-        **Raises:** `ValueError` that names the first feature which is missing, unknown or outside
+        **Raises:** `ValueError` that names the first feature that is missing, unknown or outside
         its domain, and for features that break the constraint.
         """
         complete = self.completed(features)
@@ -154,20 +155,20 @@ class FeatureSpace(PointMaps, ForUsers):
 
     @property
     def breaks_constraint(self) -> str:
-        """End of a message on features that the constraint refuses."""
+        """The end of a message on features that the constraint refuses."""
         assert self.where is not None
         return f"breaks the constraint of this space, {_source(self.where)}"
 
     def check_where(self, seed: int | Key[Array, ""] = 0) -> float:
-        """Measure the share of the prior that the constraint accepts; 1 without one.
+        """Measure the share of the prior that the constraint accepts; 1 if there is none.
 
-        One that Python decides, through a callback, is asked for a second rather than thousands of
-        times.
+        A constraint that Python evaluates, through a callback, is called for a second instead of
+        thousands of times.
 
         **Arguments:**
         - `seed`: the seed of the samples.
         **Raises:** `ValueError` for a constraint that raises, does not return one truth value, or
-        accepts none of 65 536 samples, or of those that Python can decide in a minute.
+        accepts none of 65 536 samples (or of those that Python can check in a minute).
         """
         where = self.where
         if where is None:
@@ -177,13 +178,14 @@ class FeatureSpace(PointMaps, ForUsers):
         )
 
     def sample(self, key: Key[Array, ""], count: int) -> dict[str, Any]:
-        """Draw features from the prior; for people.
+        """Draw features from the prior, for use outside a run.
 
         **Arguments:**
         - `key`: a random key of JAX.
         - `count`: number of samples.
         **Returns:** the features by name, stacked along a leading axis `[count, ...]`.
-        **Raises:** as `check_where`; `ValueError` for a count that is not a positive integer.
+        **Raises:** the errors of `check_where`; `ValueError` for a count that is not a positive
+        integer.
         """
         self.check_where()
         if isinstance(count, bool) or not isinstance(count, int | np.integer) or count < 1:
@@ -200,18 +202,18 @@ class FeatureSpace(PointMaps, ForUsers):
     def distance(
         self, one: Mapping[str, Any] | Row, other: Mapping[str, Any] | Row
     ) -> Float[Array, ""]:
-        """Return the distance between two points of the space: Euclidean over unit coordinates.
+        """Return the distance of two points of the space: Euclidean over unit coordinates.
 
-        That is by probability in continuous coordinates, by difference of ranks (from 0 to 1)
+        Distances are by probability in continuous coordinates, by difference of ranks (from 0 to 1)
         in integers and lengths, and 0 or 1 between choices; an absent item counts as one in the
-        middle of its domain. A metric; pure JAX on the values that `unflatten` gives.
+        middle of its domain. This is a metric, in pure JAX for values returned by `unflatten`.
 
         **Arguments:**
-        - `one`, `other`: features as `unflatten` gives them, or as a person writes them (numbers,
-          lists, choices, dictionaries by name; constant, fixed ones and events may be left out), or
-          rows of a table.
-        **Raises:** `ValueError` that names the first feature which is missing, unknown or outside
-        its domain, for values that a person wrote.
+        - `one`, `other`: features as returned by `unflatten`, or as a user writes them (numbers,
+          lists, choices, dictionaries by name; constant and fixed ones and events may be left out),
+          or rows of a table.
+        **Raises:** `ValueError` that names the first feature that is missing, unknown or outside
+        its domain, for values as a user writes them.
         """
         levels, ordered = np.array(self.levels, int), np.array(self.ordered, bool)
         scale = np.where(levels > 1, levels / np.maximum(levels - 1, 1), 1.0)
@@ -222,10 +224,10 @@ class FeatureSpace(PointMaps, ForUsers):
         return jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1.0)), 0.0)
 
     def fixed(self, **values: Any) -> "FeatureSpace":
-        """Return the space with these features held at a value; they keep their table columns.
+        """Return the space with these features fixed at a value; they keep their table columns.
 
         **Arguments:**
-        - `values`: by name, as a person writes them.
+        - `values`: values by name, as a user writes them.
         **Raises:** `ValueError` for an unknown feature, or a value outside its domain.
         """
         check_names("feature", values, self.domains)
@@ -236,12 +238,13 @@ class FeatureSpace(PointMaps, ForUsers):
         return FeatureSpace(domains, self.where)
 
     def only(self, *features: str, nominal: Mapping[str, Any] | None = None) -> "FeatureSpace":
-        """Return the space with these features varied alone, the others held at `nominal`.
+        """Return the space in which only these features vary, the others fixed at `nominal`.
 
         **Arguments:**
-        - `features`: names of those that vary.
-        - `nominal`: values of the others, by name, as a person writes them.
-        **Raises:** `ValueError` for no or an unknown feature, or one without a nominal value.
+        - `features`: names of the features that vary.
+        - `nominal`: values of the others, by name, as a user writes them.
+        **Raises:** `ValueError` for no or an unknown feature, or a fixed one without a nominal
+        value.
         """
         if not features:
             raise ValueError("name at least one feature that varies")
@@ -262,12 +265,12 @@ class FeatureSpace(PointMaps, ForUsers):
         return self.fixed(**{name: nominal[name] for name in others})
 
     def refined(self, factor: int) -> "tuple[FeatureSpace, Callable[[dict], dict]]":
-        """Return the space with finer signals, and a map of features to it.
+        """Return the space with finer signals, and a map from features to the new features.
 
-        See `Signal.refined`; the finer features are the same functions of time.
+        The finer features are the same functions of time; see `Signal.refined`.
 
         **Arguments:**
-        - `factor`: control points of the finer signals for one of the coarse ones.
+        - `factor`: number of control points of the finer signals for each of the coarse ones.
         **Raises:** `ValueError` for a factor that is not a positive integer.
         """
         positive = isinstance(factor, int | np.integer) and not isinstance(factor, bool)
@@ -277,9 +280,9 @@ class FeatureSpace(PointMaps, ForUsers):
         return finer, lambda features: self.root.refine(features, factor)
 
     def to_json(self) -> dict[str, Any]:
-        """Describe the space as plain data; of a constraint only that there is one, and its name.
+        """Describe the space as plain data; a constraint is only described by its name.
 
-        **Raises:** `ValueError` for domains of the user's own.
+        **Raises:** `ValueError` for a user's own domains.
         """
         where = None if self.where is None else _source(self.where)
         return {"features": to_plain(self.root)["fields"], "where": where}
@@ -291,13 +294,13 @@ class FeatureSpace(PointMaps, ForUsers):
         where: Callable[[Any], Bool[Array, ""]] | None = None,
         distributions: Mapping[str, Distribution] | None = None,
     ) -> "FeatureSpace":
-        """Build the space that `to_json` described; code is given, never read.
+        """Build the space that `to_json` described; code is passed as arguments, never read.
 
         **Arguments:**
-        - `data`: as `to_json` gives it.
+        - `data`: data returned by `to_json`.
         - `where`: the constraint, if the space has one.
-        - `distributions`: those with functions of their own, by name.
-        **Raises:** `ValueError` for data that describes no space, or code that is missing.
+        - `distributions`: distributions with their own functions, by name.
+        **Raises:** `ValueError` for data that describes no space, or missing code.
         """
         if not isinstance(data, Mapping) or "features" not in data:
             raise ValueError(f"this describes no feature space: {data!r}")
@@ -315,11 +318,11 @@ class FeatureSpace(PointMaps, ForUsers):
         return self.root.to_columns(features, "")
 
     def from_row(self, row: Row) -> dict[str, Any]:
-        """Convert a row of a table (of pandas, or a mapping) to its features, exactly.
+        """Convert a row of a table (a pandas row, or a mapping) to its features, exactly.
 
-        Other columns are ignored; a value outside its domain is taken as it is.
+        Other columns are ignored; a value outside its domain is accepted.
 
-        **Raises:** `ValueError` for a missing column, or an entry of the wrong kind.
+        **Raises:** `ValueError` for a missing column, or an entry of the wrong type.
         """
         known = [str(column) for column in row.keys()]  # noqa: SIM118 - pandas iterates values
         present = set(known)
@@ -329,7 +332,7 @@ class FeatureSpace(PointMaps, ForUsers):
         return self.root.from_columns(row, "")
 
     def describe(self) -> str:
-        """Describe the space, one line a feature: its name, its domain and its unit coordinates."""
+        """Describe the space, one line for each feature: name, domain and unit coordinates."""
         rows = self._summary()
         widths = [max(len(row[i]) for row in rows) for i in range(3)]
         return "\n".join(

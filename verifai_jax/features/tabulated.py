@@ -156,7 +156,7 @@ class Beta(continuous.Bounded):
 
     **Arguments:**
     - `a`, `b`: at least 0.05 each; the mean is `low + (high - low) * a / (a + b)`.
-    - `low`, `high`: the ends, which are no values themselves.
+    - `low`, `high`: the ends, which are not values themselves.
     **Raises:** `ValueError` for parameters that are not finite, `a` or `b` below 0.05, or ends that
     are reversed or equal.
     """
@@ -246,15 +246,14 @@ class Beta(continuous.Bounded):
 class Empirical(continuous.Continuous):
     """Numbers as they were measured: `Empirical(data)`.
 
-    The quantiles are those of the sorted data, with straight lines between neighbours; a number
-    that comes several times has the middle of its ranks. The coordinates 0 and 1 are the least and
-    the greatest number, and no value lies beyond them: values rarer than those in the data do not
-    occur.
+    The quantiles are those of the sorted data, interpolated linearly; a number that occurs several
+    times gets the middle of its ranks. The coordinates 0 and 1 are the least and the greatest
+    number. No value lies beyond them: values rarer than those in the data do not occur.
 
     **Arguments:**
     - `data`: finite numbers, at least two different ones.
-    **Raises:** `ValueError` for fewer, for more than 65 536 different ones, or for what is no
-    finite number.
+    **Raises:** `ValueError` for fewer numbers, more than 65 536 different ones, or a number that is
+    not finite.
     """
 
     arguments = ("values", "ranks", "count")
@@ -283,9 +282,9 @@ class Empirical(continuous.Continuous):
 
     @classmethod
     def from_ranks(cls, values: Iterable[float], ranks: Iterable[float], count: int) -> "Empirical":
-        """Make it of different numbers in order with their cumulative probabilities, from 0 to 1.
+        """Build it from increasing numbers with their cumulative probabilities, from 0 to 1.
 
-        **Raises:** `ValueError` for other ones.
+        **Raises:** `ValueError` for numbers that are not increasing, or other probabilities.
         """
         made = cls.__new__(cls)
         made._set([*map(float, values)], [*map(float, ranks)], int(count))

@@ -29,10 +29,10 @@ MIN_SHARE = 2.0**-20
 
 @dataclass(frozen=True)
 class Past:
-    """The events before the one that a guard decides about.
+    """The events before the one that a guard decides on.
 
-    - `counts`: how often each event has happened, by name; those that have not are missing.
-    - `last`: name of the latest one; None at the start.
+    - `counts`: how often each event has happened, by name; events that have not are missing.
+    - `last`: name of the latest event; None at the start.
     """
 
     counts: tuple[tuple[str, int], ...] = ()
@@ -58,12 +58,12 @@ class Transition:
 
     - `source` and `to`: the states before and after it.
     - `name`: the name of the event.
-    - `wait`: domain of the seconds since the event before.
+    - `wait`: domain of the seconds since the previous event.
     - `parameters`: domains by name.
-    - `weight`: relative probability among the transitions that are enabled.
+    - `weight`: relative probability among the enabled transitions.
     - `after`: names of events that must have happened before.
-    - `at_most`: times that an event of this name may happen; any number if None.
-    - `guard`: function of the `Past` that must be true; none if None.
+    - `at_most`: maximum number of events of this name; any number if None.
+    - `guard`: a function of the `Past` that must return True; None for no guard.
     """
 
     source: str
@@ -78,11 +78,11 @@ class Transition:
 
     @property
     def guarded(self) -> bool:
-        """True where the past decides whether it is enabled."""
+        """True if the past decides whether it is enabled."""
         return bool(self.after) or self.at_most is not None or self.guard is not None
 
     def enabled(self, past: Past) -> bool:
-        """Return whether it may happen after this past, in its state."""
+        """Return whether the transition is enabled after this past, in its state."""
         if any(not past.count(name) for name in self.after):
             return False
         if self.at_most is not None and past.count(self.name) >= self.at_most:
@@ -91,21 +91,21 @@ class Transition:
 
     @property
     def label(self) -> str:
-        """The transition as a person writes it, such as `cruise -cut_in-> crowded`."""
+        """The transition as text, such as `cruise -cut_in-> crowded`."""
         return f"{self.source} -{self.name}-> {self.to}"
 
 
 @dataclass(frozen=True, eq=False)
 class Graph:
-    """The nodes that can be reached, node 0 first, and the transitions from each.
+    """The reachable nodes, node 0 first, and the transitions from each.
 
     - `states`: the state of each node.
     - `edges`: cumulative probabilities of the transitions from each node; those that are not
       enabled have an interval of width zero.
-    - `following`: the node after each transition; 0 where it is not enabled.
-    - `enabled`: whether it is.
-    - `last`: the last transition that is enabled at each node; -1 where none is.
-    - `reachable_states`, `transitions`: names and numbers of those that a sequence can contain.
+    - `following`: the node after each transition; 0 if it is not enabled.
+    - `enabled`: whether each transition is enabled.
+    - `last`: the last enabled transition at each node; -1 if there is none.
+    - `reachable_states`, `transitions`: names and numbers of those that occur in some sequence.
     - `pairs`: pairs of transitions that can follow each other directly.
     """
 
@@ -119,7 +119,7 @@ class Graph:
     pairs: tuple[tuple[int, int], ...]
 
     def longest(self, limit: int) -> int:
-        """Return the events of the longest sequence, of at most `limit`."""
+        """Return the number of events in the longest sequence, at most `limit`."""
         nodes = {0}
         for length in range(limit):
             nodes = {
@@ -133,7 +133,7 @@ class Graph:
 
 
 def check_states(start: str, transitions: tuple[Transition, ...]) -> None:
-    """Refuse states that are misspelt, or that no sequence of events can lead to.
+    """Refuse states that are misspelt, or that no sequence of events reaches.
 
     **Raises:** `UnknownNameError`, `ValueError`.
     """
@@ -168,7 +168,7 @@ def _is_numbered(one: str, other: str) -> bool:
 def unfold(start: str, transitions: tuple[Transition, ...], limit: int) -> Graph:
     """Return the graph of all sequences of at most `limit` events.
 
-    **Raises:** `ValueError` for guards that tell too many pasts apart, weights too unequal, or a
+    **Raises:** `ValueError` for guards that distinguish too many pasts, too unequal weights, or a
     start that no event can leave.
     """
     guarded = any(each.guarded for each in transitions)

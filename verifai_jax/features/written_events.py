@@ -29,10 +29,10 @@ from verifai_jax.features.transitions import Past, Transition
 
 @dataclass(frozen=True, eq=False)
 class WrittenEvents:
-    """The written forms of an automaton's sequences.
+    """The written forms of an automaton's sequences: lists of events and table columns.
 
     - `tables`: the automaton's tables.
-    - `min_events`, `max_events`: number of events of a sequence.
+    - `min_events`, `max_events`: minimum and maximum number of events in a sequence.
     """
 
     tables: EventTables
@@ -94,7 +94,7 @@ class WrittenEvents:
     def check(self, value: object, name: str) -> None:
         """Refuse anything that is not a sequence of the automaton.
 
-        **Raises:** `ValueError`, which names the event and what it can be.
+        **Raises:** `ValueError` that names the event and the alternatives.
         """
         tables = self.tables
         if isinstance(value, Events):
@@ -174,7 +174,7 @@ class WrittenEvents:
         return found
 
     def to_columns(self, values: Events, name: str) -> dict[str, np.ndarray]:
-        """Return values, one of each row, as columns of a table."""
+        """Return values, one for each row, as columns of a table."""
         tables = self.tables
         kinds, waits = np.asarray(values.kinds), np.asarray(values.waits)
         taken = tables.followed(kinds)
@@ -223,7 +223,7 @@ class WrittenEvents:
 
 
 def where_there(there: Any, one: Any, other: Any) -> Any:
-    """Choose one where an event is there, else the other; a parameter may have further axes."""
+    """Select one value where an event exists, else the other; parameters may have further axes."""
     axes = max(jnp.ndim(one), jnp.ndim(other)) - jnp.ndim(there)
     return jnp.where(jnp.reshape(there, jnp.shape(there) + (1,) * axes), one, other)
 
@@ -267,7 +267,7 @@ def read_event(entry: object, event: object) -> Transition:
     **Arguments:**
     - `entry`: its key, `(state, name)`.
     - `event`: its dictionary; see `Automaton`.
-    **Raises:** `ValueError` or `TypeError`, which name the event and what is wrong with it.
+    **Raises:** `ValueError` or `TypeError` that names the event and the problem.
     """
     if not (
         isinstance(entry, tuple) and len(entry) == 2 and all(isinstance(x, str) for x in entry)
@@ -318,7 +318,7 @@ def read_event(entry: object, event: object) -> Transition:
 
 
 def describe_event(each: Transition) -> str:
-    """Return the entry of `events` that describes a transition, as Python writes it."""
+    """Return the entry of `events` that describes a transition, as Python source."""
     parts = [f"'to': {each.to!r}", f"'wait': {each.wait!r}"]
     if each.weight != 1:
         parts.append(f"'weight': {each.weight:zg}")

@@ -30,10 +30,10 @@ from verifai_jax.mtl.walk import Walk
 
 @dataclass(frozen=True)
 class Node:
-    """A sub-formula at the instant at which its parent asked for it.
+    """A sub-formula at the instant at which its parent evaluates it.
 
-    `decides` says whether it lies on the path to the responsible predicate. `series` is its
-    robustness at every sample.
+    `decides` says whether it lies on the path to the deciding predicate. `series` is its robustness
+    at every sample.
     """
 
     formula: Formula
@@ -44,15 +44,15 @@ class Node:
     series: Float[np.ndarray, " time"] = field(repr=False)
 
     def path(self) -> tuple["Node", ...]:
-        """Return the nodes from here down to the responsible leaf."""
+        """Return the nodes from this one down to the deciding leaf."""
         below = next((child for child in self.children if child.decides), None)
         return (self,) if below is None else (self, *below.path())
 
     def flat(self) -> list[tuple[int, "Node"]]:
-        """Return itself and all nodes below with their depths, parents first.
+        """Return this node and all nodes below with their depths, parents first.
 
-        A node that occurs several times (as both sides of `<->` do) is followed by what is below it
-        at its first occurrence only.
+        For a node that occurs several times (such as both sides of `<->`), the nodes below follow
+        only its first occurrence.
         """
         rows: list[tuple[int, Node]] = []
         listed: set[int] = set()
@@ -68,9 +68,10 @@ class Node:
 
 @dataclass(frozen=True)
 class Instant:
-    """A predicate at an instant that matters, with its share of the robustness.
+    """A predicate at an instant with influence, and its share of the robustness.
 
-    The shares are those of the smooth robustness's gradient: all predicates and instants add to 1.
+    Shares are computed from the gradient of the smooth robustness; those of all predicates and
+    instants sum to 1.
     """
 
     predicate: Formula
@@ -92,7 +93,7 @@ class Explanation(InNotebook):
 
     @property
     def path(self) -> tuple[Node, ...]:
-        """Return the nodes from here down to the responsible leaf."""
+        """Return the nodes from the formula down to the deciding leaf."""
         return self.tree.path()
 
     @property
@@ -102,7 +103,7 @@ class Explanation(InNotebook):
 
     @property
     def time(self) -> float:
-        """When, in seconds."""
+        """The deciding time in seconds."""
         return self.path[-1].time
 
     def __str__(self) -> str:
@@ -135,7 +136,7 @@ class Explanation(InNotebook):
 
 
 def heading(f: Formula) -> str:
-    """Return the operator alone, as in `always[0,4]`; a leaf in full."""
+    """Return the operator alone, such as `always[0,4]`; a leaf in full."""
     if not f.operands():
         return str(f)
     word, _, interval = surface(f)
@@ -148,12 +149,12 @@ def explain(
     """Find the predicate, instant and path that decide a formula on one trace.
 
     **Arguments:**
-    - `formula`, `trace`, `end`: as for `robustness`; the trace is concrete, not under `jit`.
-    - `k`: how many critical instants to report at most: the peaks, over time, of each predicate's
+    - `formula`, `trace`, `end`: as in `robustness`; the trace must be concrete, not under `jit`.
+    - `k`: maximum number of critical instants to report: the peaks, over time, of each predicate's
       influence.
     - `tau`: temperature at which influence is measured; a tenth of the predicates' spread when
       left out.
-    **Raises:** as `robustness`, and `ValueError` for a NaN among the samples that matter.
+    **Raises:** the errors of `robustness`, and `ValueError` for a NaN among the relevant samples.
     """
     check_trace(trace)
     trace = trace.trim()

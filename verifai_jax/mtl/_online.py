@@ -36,7 +36,7 @@ from verifai_jax.mtl.tree import missing_case
 
 
 class State(NamedTuple):
-    """A pytree: how many samples came, the last one's predicates, and what the operators keep."""
+    """A pytree: the number of samples so far, the last predicates, and the operators' memory."""
 
     count: Array
     last: tuple[Array, ...]
@@ -64,7 +64,7 @@ class Online:
     def step(self, state: State, sample: Mapping[str, Any]) -> State:
         """Return the state after one more sample: numbers (or vectors `[k]`) by signal name.
 
-        **Raises:** `UnknownNameError` for a signal that the sample lacks.
+        **Raises:** `UnknownNameError` for a signal that the sample does not contain.
         """
         for name in self.formula.signals():
             if name not in sample:
@@ -73,35 +73,35 @@ class Online:
         return _step(self, state, own)
 
     def interval(self, state: State) -> tuple[Float[Array, ""], Float[Array, ""]]:
-        """Return the lowest and the greatest robustness at time 0 that further samples allow."""
+        """Return the minimum and maximum robustness at time 0 that further samples allow."""
         return _end_with(self, state, -math.inf), _end_with(self, state, math.inf)
 
     def finish(self, state: State, count: int | None = None) -> Float[Array, ""]:
-        """Return the robustness at time 0 if the trace ends here and is held: the offline value.
+        """Return the robustness at time 0 if the trace ends here and is held, as computed offline.
 
         NaN before the first sample.
 
         **Arguments:**
-        - `count`: number of samples that came, where it is known while JAX traces; a program then
-          does nothing for windows that are past.
+        - `count`: number of samples so far, if it is known while JAX traces; the program then skips
+          windows that have passed.
         """
         return _end_with(self, state, None, count)
 
     @property
     def memory(self) -> int:
-        """Number of numbers that the state holds."""
+        """Number of floats in the state."""
         return sum(leaf.size for leaf in jax.tree.leaves(jax.eval_shape(self.init)))
 
 
 def online(formula: Formula | str, dt: float, semantics: Semantics = hard) -> Online:
-    """Make a monitor of `formula` for samples `dt` seconds apart.
+    """Make an online monitor of `formula` for samples `dt` seconds apart.
 
     **Arguments:**
-    - `semantics`: `hard`, or `boolean`, by which all values are above zero where the formula holds
-      and below where it does not, also where its robustness is exactly zero.
+    - `semantics`: `hard`, or `boolean`: values are above zero if the formula holds and below if
+      not, even if its robustness is exactly zero.
     **Raises:** `IntervalError` for an interval that is not a multiple of `dt`; `ValueError` for
-    smooth semantics, and for an unbounded future operator within another temporal operator, which
-    no bounded memory can follow.
+    smooth semantics, and for an unbounded future operator inside another temporal operator, which
+    would need unbounded memory.
     """
     formula = parse(formula) if isinstance(formula, str) else formula
     monitor = Online(formula, dt, semantics.kind)
@@ -184,10 +184,11 @@ def advance(
     """Compute the results of one more sample.
 
     **Arguments:**
-    - `now`: number of the sample.
+    - `now`: index of the sample.
     - `leaves`: margins of the plan's leaves.
     - `cells`: memory before the step.
-    **Returns:** the result of each formula, NaN where it has none yet, and the memory after it.
+    **Returns:** the result of each formula, NaN before its first result, and the memory after the
+    sample.
     """
     step = _Step(now, leaves, cells)
     values: list[Value] = []

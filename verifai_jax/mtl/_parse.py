@@ -38,14 +38,15 @@ def parse(
 
     **Arguments:**
     - `text`: see the grammar in the documentation; times are in seconds unless a unit follows.
-    - `constants`: numbers by name, also usable as the ends of intervals.
-    - `definitions`: sub-formulas by name, as text or formulas; a text may use the names before it.
+    - `constants`: numbers by name, which may also be ends of intervals.
+    - `definitions`: sub-formulas by name, as text or formulas; a definition may use the earlier
+      names.
 
-    A text has at most 10 000 words and symbols; parentheses stand at most 100 deep within each
-    other, and so do operators, of which `<->`, `xor`, weak until and release are made of several;
-    temporal operators stand at most 40 deep.
+    A text has at most 10 000 words and symbols. Parentheses may be nested 100 deep, and so may
+    operators (`<->`, `xor`, weak until and release count as several); temporal operators may be
+    nested 40 deep.
 
-    **Raises:** `FormulaSyntaxError`, with a caret under the error and what is expected there.
+    **Raises:** `FormulaSyntaxError`, with a caret under the error and the expected symbols.
     """
     known: dict[str, Formula] = {}
     constants = dict(constants or {})
@@ -115,7 +116,7 @@ _CONNECTIVES = ("iff", "impl", "or_", "and_", "bin", "negation", "temporal")
 
 
 class FormulaBuilder(ExpressionBuilder):
-    """Builder of the formula of one text, which refuses what is ambiguous or ill-typed."""
+    """Builder of the formula of one text, which refuses ambiguous or ill-typed parts."""
 
     def _before(self, tree: Tree) -> None:
         if tree.data == "iff":

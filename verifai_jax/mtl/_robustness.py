@@ -37,26 +37,27 @@ def robustness(
     end: End = "hold",
     compat: str | None = None,
 ) -> Float[Array, ""]:
-    """Compute how robustly a trace satisfies a formula at time 0: positive, it holds.
+    """Compute the robustness of a formula on a trace at time 0; it holds if this is positive.
 
     **Arguments:**
     - `formula`: a `Formula`, or its text.
-    - `trace`: signals `[time]` or `[time, k]`, evenly sampled. Batches by `jax.vmap`.
+    - `trace`: a trace with signals `[time]` or `[time, k]`, evenly sampled; use `jax.vmap` for
+      batches.
     - `semantics`: `hard` (in the unit of the predicates), `smooth(tau)`, or `boolean` (+1 / -1).
-    - `end`: what comes after the last sample: `"hold"`, the trace goes on with it for ever;
-      `"truncate"`, windows are cut there (an empty one is true under always, false under
-      eventually); `"strict"`, an error if the formula looks beyond it.
+    - `end`: how the trace continues after the last sample. `"hold"`: the last sample is held for
+      ever. `"truncate"`: windows are cut there (an empty one is true under always, false under
+      eventually). `"strict"`: it is an error if the formula looks beyond the end.
     - `compat`: `"pymtl"` for the right-open windows of metric-temporal-logic.
 
-    A NaN among the samples that matter gives NaN.
+    A NaN among the relevant samples gives NaN.
 
-    **Raises:** `UnknownNameError` for a signal the trace lacks, `IntervalError` for an interval
-    that is not a multiple of the sampling period, `HorizonError` under `"strict"`, `TypeError` for
-    a vector used as a scalar, `ValueError` for sample times that are not evenly spaced; all before
-    anything compiles.
+    **Raises:** `UnknownNameError` for a signal that the trace lacks, `IntervalError` for an
+    interval that is not a multiple of the sampling period, `HorizonError` under `"strict"`,
+    `TypeError` for a vector used as a scalar, `ValueError` for unevenly spaced sample times; all
+    before anything compiles.
 
     Source: A. Donze, O. Maler, "Robust satisfaction of temporal logic over real-valued signals",
-    FORMATS 2010; until is half-open and windows are closed.
+    FORMATS 2010. Until does not need its left side at the witness; windows are closed.
     """
     setting, signals, tau, valid = prepare(formula, trace, semantics, end, compat)
     return _root_compiled(setting, signals, tau, valid)
@@ -69,10 +70,11 @@ def robustness_signal(
     end: End = "hold",
     compat: str | None = None,
 ) -> Float[Array, " time"]:
-    """Compute the robustness at every sample of the trace; see `robustness`. Reverse mode only.
+    """Compute the robustness at every sample of the trace; only for reverse-mode gradients.
 
-    NaN, no verdict, where `end` leaves none: under `"strict"` at samples from which the formula
-    looks beyond the end, and under `"truncate"` and `"strict"` after the last valid sample.
+    It is NaN, no verdict, where `end` leaves none: under `"strict"` at samples from which the
+    formula looks beyond the end, and under `"truncate"` and `"strict"` after the last valid sample.
+    See `robustness` for the arguments.
     """
     setting, signals, tau, valid = prepare(formula, trace, semantics, end, compat)
     return _everywhere_compiled(setting, signals, tau, valid)[:: setting.stride]
@@ -81,11 +83,11 @@ def robustness_signal(
 def satisfied(
     formula: Formula | str, trace: Trace, end: End = "hold", compat: str | None = None
 ) -> Bool[Array, ""]:
-    """Return whether a trace satisfies a formula at time 0; at robustness 0 the comparison decides.
+    """Return whether a trace satisfies a formula at time 0; at robustness 0 the comparator decides.
 
-    Where a NaN leaves it open the answer is no verdict: an error, or `False` under `jit`.
+    If a NaN leaves it undecided, there is no verdict: an error, or `False` under `jit`.
 
-    **Raises:** as `robustness`, and `ValueError` for a NaN, naming signal and time.
+    **Raises:** the errors of `robustness`, and `ValueError` for a NaN, naming signal and time.
     """
     verdict = robustness(formula, trace, boolean, end, compat)
     if isinstance(verdict, Tracer):
@@ -98,7 +100,7 @@ def satisfied(
 
 
 def first_nan(formula: Formula, trace: Trace) -> str:
-    """Say where a signal of a formula is NaN, or that the value of the formula is."""
+    """Return a message that says where a signal is NaN, or that the formula's value is."""
     trace = trace.trim().finely()
     clock = np.asarray(trace.clock())
     for name in formula.signals():
@@ -248,7 +250,7 @@ _everywhere_compiled = jax.jit(_everywhere, static_argnums=0, inline=True)
 
 @runtime_checkable
 class Work(Protocol):
-    """A function of lanes: `out_axes` says where each of its results keeps them."""
+    """A function of lanes; `out_axes` gives the lane axis of each result."""
 
     out_axes: tuple[int, ...]
 
@@ -260,10 +262,10 @@ class Work(Protocol):
 def on_lanes(
     function: Work, lanes: int, axes: tuple[int, ...], spread: bool
 ) -> Callable[..., tuple[PyTree, ...]]:
-    """Give `function(lanes, *arguments)` a batching rule that adds a lane axis to the arguments.
+    """Give `function(lanes, *arguments)` a batching rule that adds a lane axis to arguments.
 
-    `axes` says where each argument (a pytree) keeps its lane axes. `spread` repeats arguments that
-    all lanes share, which a gradient with respect to them needs.
+    `axes` gives the lane axis of each argument (a pytree). `spread` repeats arguments that all
+    lanes share, which gradients with respect to them need.
     """
 
     @jax.custom_batching.custom_vmap
@@ -311,7 +313,7 @@ def in_chunks(
 ) -> tuple[PyTree, ...]:
     """Compute `function(*arguments)` over the first lane axis, a cache's worth at a time.
 
-    Arguments keep their lanes on `axes`, results on `out_axes`.
+    Arguments have their lanes on `axes`, results on `out_axes`.
     """
     sizes = {
         leaf.shape[axis]

@@ -21,7 +21,7 @@ from verifai_jax.mtl.tree import missing_case
 class SmoothingError(NamedTuple):
     """Bounds of the hard robustness: `smooth - tau * above <= hard <= smooth + tau * below`.
 
-    - `above`, `below`: in temperatures.
+    - `above`, `below`: the two bounds, in units of the temperature.
     """
 
     above: float
@@ -29,18 +29,18 @@ class SmoothingError(NamedTuple):
 
     @property
     def total(self) -> float:
-        """The greater of both: `|smooth - hard| <= tau * total`."""
+        """The larger of the two: `|smooth - hard| <= tau * total`."""
         return max(self.above, self.below)
 
 
 def smoothing_error(
     formula: Formula | str, trace: Trace, end: End = "hold", compat: str | None = None
 ) -> SmoothingError:
-    """Bound the distance of the smooth robustness of such a trace from the hard one.
+    """Bound the difference between smooth and hard robustness for traces of this form.
 
-    **Arguments:** as `robustness`; only the trace's length and period matter, not its values.
-    **Returns:** `above` and `below`, in temperatures: `smooth - tau * above <= hard <= smooth + tau
-    * below`.
+    **Arguments:** those of `robustness`; only the trace's length and period matter, not its values.
+    **Returns:** `above` and `below`, in units of the temperature: `smooth - tau * above <= hard <=
+    smooth + tau * below`.
     """
     setting, _, _, _ = prepare(formula, trace, hard, end, compat)
     return error_of_setting(setting)
@@ -48,7 +48,7 @@ def smoothing_error(
 
 @functools.lru_cache(maxsize=1024)
 def error_of_setting(setting: Setting, last: int = 0) -> SmoothingError:
-    """Bound the distance at any of the instants 0 to `last`."""
+    """Bound the difference at any of the instants 0 to `last`."""
     return slack(evaluator_of(setting, {}, None, None, 0), setting.formula, 0, last)
 
 
@@ -75,7 +75,7 @@ class _Slack:
 
 
 def slack(evaluator: Evaluator, f: Formula, first: int, last: int) -> SmoothingError:
-    """Return the bounds of `f`'s smooth value at any of the instants `first` to `last`."""
+    """Return bounds on the error of `f`'s smooth value at any instant from `first` to `last`."""
     return SmoothingError(*_slack(evaluator, f, first, last).settled())
 
 

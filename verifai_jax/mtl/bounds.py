@@ -14,7 +14,7 @@ from verifai_jax.mtl.formula import Formula, Predicate, Term
 
 
 def signal_bounds(formula: Formula, signal: str) -> list[tuple[Formula, list[Expression]]]:
-    """Return what predicates compare this signal with, as far as they can be solved for it.
+    """Return the values with which predicates compare this signal, if they can be solved for it.
 
     `abs(x - 1) <= 0.2` bounds x by 1.2 and 0.8, `y >= 2 * x` bounds y by 2 * x.
     """
@@ -39,7 +39,7 @@ def predicates_of(formula: Formula) -> list[Formula]:
 def constant_bounds(predicate: Formula) -> tuple[Term, list[float]] | None:
     """Return the expression on the left of a comparison, and the numbers that bound it.
 
-    `abs(x) <= 2` bounds `x` by 2 and -2. There are no numbers where signals are compared.
+    `abs(x) <= 2` bounds `x` by 2 and -2. If signals are compared there are no numbers.
 
     **Returns:** None for a formula that is not a comparison.
     """

@@ -223,20 +223,20 @@ def export_c(
     every: bool = False,
     sizes: Mapping[str, int] | None = None,
 ) -> str:
-    """Return one C99 header with a monitor of one formula, or of several by name.
+    """Return a C99 header with a monitor of one formula, or of several by name.
 
-    Its `NAME_start`, `NAME_step`, `NAME_interval` and `NAME_finish` do what `watch` does, with the
-    same values if it is compiled with `-ffp-contract=off`. It allocates nothing, and includes
-    `math.h`, `stdbool.h` and `stdint.h` alone.
+    Its `NAME_start`, `NAME_step`, `NAME_interval` and `NAME_finish` correspond to the methods of
+    `watch`, with the same values if compiled with `-ffp-contract=off`. It allocates no memory, and
+    includes only `math.h`, `stdbool.h` and `stdint.h`.
 
     **Arguments:**
     - `dt`: sampling period in seconds.
-    - `name`: the name of the type in C, and before the names of its functions.
+    - `name`: the name of the C type, and the prefix of its functions.
     - `semantics`: `hard` or `boolean`.
-    - `every`: whether each formula is asked at every instant, or at time 0.
-    - `sizes`: number of components of each signal whose norm the formulas take.
+    - `every`: whether each formula is evaluated at every instant, not only at time 0.
+    - `sizes`: number of components of each signal whose norm the formulas use.
     **Returns:** the text of the header.
-    **Raises:** as `watch`; `ValueError` for a name that is not an identifier of C.
+    **Raises:** the errors of `watch`; `ValueError` for a name that is not a C identifier.
     """
     if not re.fullmatch(r"[A-Za-z]\w*", name, re.ASCII):
         raise ValueError(
@@ -258,7 +258,7 @@ def export_c(
 
 
 def monitor_code(plan: Plan, front: Margins, name: str) -> str:
-    """Return the type of a monitor and its functions, without what they need."""
+    """Return the type of a monitor and its functions, without the functions they call."""
     code = _Code(plan.top)
     inner, counts = [], []
     for k, (count, (own, columns)) in enumerate(zip(plan.counts, front.counts, strict=True)):

@@ -39,7 +39,7 @@ TAUGHT = 20_000
 
 
 class Model(Protocol):
-    """A regressor that learns and predicts, as those of scikit-learn."""
+    """A regressor that learns and predicts, with the interface of scikit-learn."""
 
     def fit(self, x: np.ndarray, y: np.ndarray) -> object:
         """Learn from rows `[n, d]` and values `[n]`."""
@@ -54,10 +54,10 @@ class Forecast(NamedTuple):
     """A prediction at one sample.
 
     - `robustness`: the least robustness expected within the horizon.
-    - `low`: with probability `1 - alpha` it is no lower than this, at any sample of the run.
-    - `p_value`: share of the runs without violation in which a prediction was once as low.
+    - `low`: a lower bound on it; with probability `1 - alpha` it holds at every sample of the run.
+    - `p_value`: share of the runs without violation in which some prediction was as low.
     - `alarm`: whether the p-value is at most `alpha`. In a further run without violation an alarm
-      is raised with probability `alpha` at most.
+      is raised with probability at most `alpha`.
     """
 
     robustness: float
@@ -67,12 +67,12 @@ class Forecast(NamedTuple):
 
 
 class Distance(NamedTuple):
-    """A sample compared with those that were tested.
+    """A sample compared with the tested ones.
 
-    - `distance`: from the nearest of them, in standard deviations of the signals.
-    - `p_value`: share of the tested runs that were once as far from the others.
-    - `alarm`: whether it is at most `alpha`. In a further run like the tested ones an alarm is
-      raised with probability `alpha` at most.
+    - `distance`: distance from the nearest tested sample, in standard deviations of the signals.
+    - `p_value`: share of the tested runs with a sample as far from the other runs.
+    - `alarm`: whether the p-value is at most `alpha`. In a further run like the tested ones an
+      alarm is raised with probability at most `alpha`.
     """
 
     distance: float
@@ -96,10 +96,10 @@ class _Follows(abc.ABC, Generic[Said]):
 class PredictiveMonitor(_Follows[Forecast]):
     """A monitor that predicts violations; made by `predictive_monitor`.
 
-    - `horizon`: seconds that it looks ahead.
-    - `slack`: by how much a prediction is too high in at most a share `alpha` of runs.
-    - `caught`: the rate of the calibrating runs that violated the formula, those with an alarm
-      before that; None if there was none.
+    - `horizon`: prediction horizon in seconds.
+    - `slack`: the amount by which predictions are too high in at most a share `alpha` of runs.
+    - `caught`: of the calibration runs that violated the formula, the rate of those with an earlier
+      alarm; None if no run did.
     """
 
     formula: Formula
@@ -138,14 +138,14 @@ def predictive_monitor(
     """Learn to predict a violation of a requirement within the next seconds.
 
     **Arguments:**
-    - `formula`: a requirement; of `always f` the robustness of `f` at each instant is foretold.
-    - `traces`: runs of one system on one clock.
-    - `horizon`: seconds ahead, a multiple of the sampling period.
-    - `signals`: names of those that a prediction sees; all if None.
-    - `alpha`: probability of a false alarm in a run, and of a bound that is too high.
-    - `lags`: samples ago that a prediction sees.
-    - `model`: a regressor of scikit-learn's kind; a quadratic function if None.
-    - `seed`: the seed of the division into runs that teach and runs that calibrate.
+    - `formula`: a requirement; for `always f` the robustness of `f` at each instant is predicted.
+    - `traces`: runs of one system with the same sampling period.
+    - `horizon`: prediction horizon in seconds, a multiple of the sampling period.
+    - `signals`: names of the signals used for prediction; all if None.
+    - `alpha`: probability of a false alarm in a run, and of a lower bound that is too high.
+    - `lags`: how many samples ago the signals are used as well.
+    - `model`: a regressor with the interface of scikit-learn; a quadratic function if None.
+    - `seed`: the seed of the division into training and calibration runs.
     **Raises:** `ValueError` for too few runs without violation; `IntervalError` for a horizon that
     is not a multiple of the sampling period.
     """
@@ -198,7 +198,7 @@ class DomainMonitor(_Follows[Distance]):
     _farthest: np.ndarray
 
     def distances(self, trace: Trace) -> list[Distance]:
-        """Return the distance of every sample of a run."""
+        """Return the distance from the tested samples at every sample of a run."""
         return self._said(self._columns.rows(trace))
 
     def _said(self, rows: Rows) -> list[Distance]:
@@ -222,10 +222,10 @@ def domain_monitor(
 
     **Arguments:**
     - `traces`: the tested runs; for inputs without time, traces of one sample.
-    - `signals`: names of those that are compared; all if None.
-    - `alpha`: probability of an alarm in a run that is like the tested ones.
-    - `lags`: samples ago that are compared too.
-    - `seed`: the seed of the division into runs that are compared with and runs that calibrate.
+    - `signals`: names of the compared signals; all if None.
+    - `alpha`: probability of an alarm in a run like the tested ones.
+    - `lags`: how many samples ago the signals are compared as well.
+    - `seed`: the seed of the division into reference and calibration runs.
     **Raises:** `ValueError` for too few runs, and for a NaN.
     """
     from scipy.spatial import KDTree

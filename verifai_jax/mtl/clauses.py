@@ -38,7 +38,7 @@ evaluation of its clauses in every simulation."""
 class Goals:
     """The goals of formulas, over the margins of their predicates.
 
-    - `leaves`: the predicates; the margin of the i-th is the signal `leaf i`.
+    - `leaves`: the predicates; the margin of the i-th is a signal named `leaf i`.
     - `goals`: the clauses of each goal, over these signals.
     """
 
@@ -47,14 +47,14 @@ class Goals:
 
     @property
     def max_clauses(self) -> int:
-        """Clauses of the goal that has the most."""
+        """Maximum number of clauses of a goal."""
         return max(len(goal) for goal in self.goals)
 
     def margins(self, trace: Trace, end: End = "hold") -> Trace:
-        """Compute the margins of the predicates over their scale, as the signals of a trace.
+        """Compute the margins of the predicates divided by their scale, as the signals of a trace.
 
-        The scale is the standard deviation along the trace, with a share of the size of what the
-        predicate compares, for signals that are constant; it is not differentiated.
+        The scale is the standard deviation along the trace plus a share of the size of the compared
+        values, for constant signals; it is not differentiated.
         """
         # A search is guided by the samples of the clock; verdicts count all.
         trace = replace(trace, between=None)
@@ -78,7 +78,7 @@ class Goals:
     def values(
         self, trace: Trace, semantics: Semantics = hard, end: End = "hold"
     ) -> Float[Array, "goals clauses"]:
-        """Compute the robustness of each clause over scaled margins; `ABSENT` for a missing one."""
+        """Compute the robustness of each clause from scaled margins; `ABSENT` for a missing one."""
         scaled = self.margins(trace, end)
         rows = []
         for goal in self.goals:

@@ -15,7 +15,7 @@ FRACTIONS = {"s": 1, "ms": 10**3, "us": 10**6, "ns": 10**9}
 
 
 class LeftOut(str):
-    """A note on a `column` of a recording that is not a signal of its trace."""
+    """A note on a `column` of a recording that does not become a signal of its trace."""
 
     column: str
 
@@ -36,11 +36,11 @@ def is_numeric(column: Any) -> bool:
 
 
 def numbers_of(source: str, name: str, column: Any) -> np.ndarray:
-    """Return the numbers of an Arrow column, an empty cell as NaN.
+    """Return the numbers of an Arrow column; an empty cell is NaN.
 
-    **Returns:** `[time]`, or `[time, k]` of a column whose cells are lists of `k` numbers.
-    **Raises:** `ValueError` for a column without numbers, for one with a text among them, which it
-    names with its row, and for lists of different lengths.
+    **Returns:** `[time]`, or `[time, k]` if the cells are lists of `k` numbers.
+    **Raises:** `ValueError` for a column without numbers, for a text among numbers (with its row),
+    and for lists of different lengths.
     """
     from pyarrow import types
 
@@ -120,12 +120,12 @@ def _brief(value: object) -> str:
 def seconds_of(source: str, name: str, column: Any) -> tuple[np.ndarray, Fraction]:
     """Return the sample times of an Arrow column in seconds; NaN for an empty cell.
 
-    Dates, times of day and durations, also as ISO 8601 texts, become seconds since the first,
-    which is subtracted before anything is rounded.
+    Dates, times of day and durations, also as ISO 8601 texts, become seconds since the first one,
+    which is subtracted before rounding.
 
-    **Returns:** the times, and the instant that they are counted from, in seconds since 1970; 0
-    for numbers that are seconds already.
-    **Raises:** `ValueError` as `numbers_of`, and for lists of numbers.
+    **Returns:** the times, and their origin in seconds since 1970; 0 for numbers that are seconds
+    already.
+    **Raises:** the errors of `numbers_of`; `ValueError` for lists of numbers.
     """
     from pyarrow import types
 
@@ -158,9 +158,10 @@ def seconds_of(source: str, name: str, column: Any) -> tuple[np.ndarray, Fractio
 
 
 def epoch_unit(values: np.ndarray) -> str:
-    """Return the unit of numbers that are sample times: `s`, or that of a calendar's clock.
+    """Return the unit of sample times: `s`, or the unit of a calendar clock.
 
-    As seconds they would lie more than three thousand years after 1970.
+    A unit is chosen if the same numbers in seconds would lie more than three thousand years after
+    1970.
     """
     known = values[np.isfinite(values)]
     size = float(np.min(known)) if known.size and known.ndim == 1 else 0.0
@@ -168,7 +169,7 @@ def epoch_unit(values: np.ndarray) -> str:
 
 
 def moment_of(text: str) -> datetime.datetime:
-    """Return the moment of an ISO 8601 text, which may be a time of day alone.
+    """Return the time of an ISO 8601 text, which may be only a time of day.
 
     **Raises:** `ValueError` for any other text.
     """

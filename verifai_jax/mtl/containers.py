@@ -56,8 +56,8 @@ def matrix_column(array: np.ndarray) -> Any:
 def read_mcap(path: Path, time: str) -> list[Table]:
     """Read the topics of an MCAP file, each with the log times of its messages.
 
-    Fields of messages are columns, `/odom` and `twist.linear.x` as `odom.twist.linear.x`. Messages
-    may be JSON, ROS 2's or Protobuf's; topics of others are left out.
+    Fields of messages become columns: `/odom` and `twist.linear.x` become `odom.twist.linear.x`.
+    JSON, ROS 2 and Protobuf messages are read; other topics are left out.
 
     **Raises:** `MissingExtra`; `ValueError` for a file that is damaged or has no such topic.
     """
@@ -132,7 +132,7 @@ def _cells(cells: list[Any]) -> Any:
 
 
 def read_dataset(path: Path, time: str) -> list[Table]:
-    """Read the variables of a NetCDF file or a Zarr store, a table for each first dimension.
+    """Read the variables of a NetCDF file or a Zarr store as one table for each first dimension.
 
     **Raises:** `MissingExtra`; `ValueError` for a file that cannot be read.
     """
@@ -161,9 +161,9 @@ def _dimensions(dataset: Any, time: str) -> Iterator[Table]:
 
 
 def read_hdf5(path: Path, time: str) -> list[Table]:
-    """Read the data sets of an HDF5 file, each by the times of the nearest group around it.
+    """Read the data sets of an HDF5 file, each with the times of the nearest enclosing group.
 
-    Groups are parts of a name, `imu/gyro` as `imu.gyro`.
+    Group names become part of the name: `imu/gyro` becomes `imu.gyro`.
 
     **Raises:** `MissingExtra`; `ValueError` for a file that cannot be read.
     """
@@ -205,10 +205,10 @@ def episodes_of(files: Sequence[Path]) -> Iterator[Episode]:
 
 
 def read_parquet(path: Path, time: str, episode: int | None) -> list[Table]:
-    """Read a Parquet file; of a LeRobot data set one episode, with its own stamps as times.
+    """Read a Parquet file; for a LeRobot data set one episode, with its own time stamps.
 
-    **Raises:** `ValueError` for a file of several episodes where none is named, and for an episode
-    that it does not have.
+    **Raises:** `ValueError` for a file of several episodes if none is named, and for an episode
+    that it does not contain.
     """
     from pyarrow import compute, parquet
 

@@ -33,9 +33,9 @@ def deciding_instant(
     """Find the predicate and the instant that decide the least robustness of formulas on one trace.
 
     **Arguments:**
-    - `formulas`, `trace`, `end`: as for `robustness`; batches by `jax.vmap`.
-    **Returns:** the number of the predicate among `leaves_of(formulas)`, and of the sample, 0 and 0
-    without one, or if the robustness is not finite. If several decide equally, one of them.
+    - `formulas`, `trace`, `end`: as in `robustness`; use `jax.vmap` for batches.
+    **Returns:** the index of the predicate in `leaves_of(formulas)`, and of the sample; 0 and 0 if
+    there is none, or if the robustness is not finite. If several decide equally, one of them.
     """
     leaves = leaves_of(formulas)
     # A search is guided by the samples of the clock; verdicts count all.

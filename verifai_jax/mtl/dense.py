@@ -39,9 +39,9 @@ class Piecewise:
     """A function on `[times[0], inf)`.
 
     - `times`: breakpoints in seconds.
-    - `point`: the value at each; `right` and `left`: the limits at the beginning and at the end of
-      the piece between it and the next. The last piece is constant and has no end.
-    - `snap`: seconds within which two times are one.
+    - `point`: the value at each breakpoint; `right` and `left`: the limits at the start and at the
+      end of the piece that follows it. The last piece is constant and has no end.
+    - `snap`: times that differ by less than this many seconds are equal.
     """
 
     times: Values
@@ -51,7 +51,7 @@ class Piecewise:
     snap: float = 0.0
 
     def map(self, function: Callable[..., Values], *others: "Piecewise") -> "Piecewise":
-        """Apply a function that is linear on each piece; all have the same times."""
+        """Apply a function to several functions with equal times; it must be linear in pieces."""
         with np.errstate(all="ignore"):
             point, right, left = (
                 function(*(getattr(f, part) for f in (self, *others)))
@@ -65,13 +65,13 @@ class Piecewise:
         return bool(np.all((self.right == self.left) | np.isnan(self.right)))
 
     def index(self, times: Values, after: bool = False) -> np.ndarray:
-        """Count the breakpoints before each time, those at it included if `after`."""
+        """Count the breakpoints before each time, including those at it if `after`."""
         return np.searchsorted(self.times, times + (self.snap if after else -self.snap), "right")
 
     def pieces(self, times: Values, shift: float = 0.0) -> tuple[Values, Values]:
-        """Compute the limits at both ends of each piece from one time to the next, seen `shift` on.
+        """Compute the limits at both ends of each piece between times, shifted by `shift`.
 
-        No breakpoint may be within such a piece. What lies before the function is -inf.
+        No breakpoint may lie inside such a piece. Before its start the function is -inf.
         """
         gaps = np.append(np.diff(times), 1.0)
         k = self.index(times + gaps / 2 + shift, after=True) - 1
@@ -89,7 +89,7 @@ class Piecewise:
             return np.where(np.abs(end - at) <= self.snap, left, value)
 
     def inside(self, times: Values) -> Values:
-        """Compute the values at times within pieces."""
+        """Compute the values at times inside pieces."""
         return self._on_piece(self.index(times, after=True) - 1, times)
 
     def __call__(self, times: Values) -> Values:
@@ -99,18 +99,18 @@ class Piecewise:
         return np.where(at, self.point[k], self._on_piece(k, times))
 
     def at(self, times: Values) -> "Piecewise":
-        """Return the same function with more breakpoints, which include its own."""
+        """Return the same function with more breakpoints, which must include its own."""
         return Piecewise(times, self(times), *self.pieces(times), self.snap)
 
 
 def merged(times: Sequence[Values], snap: float) -> Values:
-    """Return the times of all, each once."""
+    """Return the times of all functions, each once."""
     ordered = np.sort(np.concatenate(times))
     return ordered[np.append(True, np.diff(ordered) > snap)]
 
 
 def aligned(*functions: Piecewise, crossings: bool = False) -> tuple[Piecewise, ...]:
-    """Return the functions on common breakpoints, those included where two of them cross."""
+    """Return the functions on common breakpoints, including those where two of them cross."""
     snap = functions[0].snap
     times = merged([f.times for f in functions], snap)
     made = tuple(f.at(times) for f in functions)
@@ -133,7 +133,7 @@ def _crossing(f: Piecewise, g: Piecewise) -> Values:
 
 
 def joined(functions: Sequence[Piecewise], sign: int) -> Piecewise:
-    """Return the greatest (least, for sign -1) of several functions."""
+    """Return the maximum (minimum, for sign -1) of several functions."""
     best = np.maximum if sign > 0 else np.minimum
     result, *others = functions
     for other in others:
@@ -146,7 +146,7 @@ def window(
     f: Piecewise, low: float, high: float, sign: int, open_right: bool = False,
     open_left: bool = False,
 ) -> Piecewise:  # fmt: skip
-    """Return the greatest (least) value of `f` over `[t + low, t + high]`, at every `t`."""
+    """Return the maximum (minimum) of `f` over `[t + low, t + high]`, at every `t`."""
     if sign < 0:
         negated = window(f.map(np.negative), low, high, 1, open_right, open_left)
         return negated.map(np.negative)
@@ -209,9 +209,9 @@ class _Highest:
 
 
 def witnessed(f: Piecewise, g: Piecewise, ahead: bool) -> Piecewise:
-    """Return `f` until `g`, over all that comes (`ahead`), or `f` since `g`, over all that was.
+    """Return `f` until `g` over the whole future (`ahead`), or `f` since `g` over the whole past.
 
-    `f` counts between now and the witness, at which it is not needed.
+    `f` must hold between now and the witness, but not at the witness.
     """
     f, g = aligned(f, g, crossings=True)
     n = len(f.times)
@@ -245,13 +245,13 @@ distance of kinks."""
 
 
 def dense_robustness(formula: Formula | str, trace: Trace, method: Method = "linear") -> float:
-    """Compute the robustness at the first sample, with all that is between the samples.
+    """Compute the robustness at the first sample, including the time between samples.
 
     **Arguments:**
-    - `trace`: with samples at any times; its last ones are held for ever.
-    - `method`: what a signal is between two samples: `"linear"`, or `"hold"` for its last sample.
-    **Raises:** `ValueError` for a NaN, for operators that count samples, and for expressions such
-    as `x * y` or `sin(x)` of signals that are not held, which are not straight between samples.
+    - `trace`: a trace with any sample times; its last sample is held for ever.
+    - `method`: how signals continue between samples: `"linear"`, or `"hold"` for the earlier value.
+    **Raises:** `ValueError` for a NaN, for operators that count samples, and for expressions of
+    linearly interpolated signals that are not piecewise linear, such as `x * y` or `sin(x)`.
     """
     return float(dense_signal(formula, trace, method).point[0])
 
@@ -259,13 +259,13 @@ def dense_robustness(formula: Formula | str, trace: Trace, method: Method = "lin
 def dense_gradient(
     formula: str, trace: Trace, values: Mapping[str, float], method: Method = "linear"
 ) -> dict[str, float]:
-    """Compute the slope of the robustness in each parameter `?name`, ends of intervals included.
+    """Compute the derivative of the robustness by each parameter `?name`, also in interval ends.
 
-    Between samples the robustness is piecewise linear in the times of intervals, so a quotient of
-    differences is the slope; at a kink it is the mean of both sides.
+    Between samples the robustness is piecewise linear in the ends of intervals, so a difference
+    quotient is the derivative; at a kink it is the mean of both sides.
 
     **Arguments:**
-    - `formula`: its text, as for `mine`.
+    - `formula`: its text, as in `mine`.
     - `values`: the values of all parameters.
     """
     template = read_parametric(formula)

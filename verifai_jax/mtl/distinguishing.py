@@ -30,12 +30,12 @@ APART = 1e12
 
 @dataclass(frozen=True)
 class Distinction(Drawn, InNotebook):
-    """A trace on which one of two formulas holds and the other does not; `str()` says which.
+    """A trace on which one of two formulas holds and the other does not, if one was found.
 
     - `trace`: None if none was found.
-    - `source`: where it is from.
-    - `holds`, `robustness`: of the first formula and of the second one on it.
-    - `tried`: traces that were looked at.
+    - `source`: the origin of the trace.
+    - `holds`, `robustness`: verdict and robustness of the first and the second formula on it.
+    - `tried`: number of traces that were tried.
     """
 
     one: Formula
@@ -81,18 +81,19 @@ def distinguish(
     budget: int = 2000,
     seed: int = 0,
 ) -> Distinction:
-    """Find a trace that tells two formulas apart.
+    """Find a trace that distinguishes two formulas: one holds on it, the other does not.
 
     **Arguments:**
     - `one`, `other`: formulas, or their texts.
-    - `signals`: a problem, which is simulated by a search for such a trace; or recordings, of which
-      the first that tells them apart is taken; signals that move freely when left out.
-    - `end`: what comes after the last sample, `"hold"` or `"truncate"`; of a problem it is its own.
-    - `dt`, `duration`: of a free trace, in seconds; they follow from the windows when left out.
-    - `budget`, `seed`: simulations of the search, and the seed of everything random in it.
-    **Returns:** the trace, if one was found; that none was found proves nothing.
-    **Raises:** `FormulaSyntaxError`; `ValueError` for recordings without the signals, and as
-    `falsify` does; `ValueError` for windows that need a clock of too many samples.
+    - `signals`: a problem, in which a search looks for such a trace; or recordings, of which the
+      first that distinguishes them is taken; when left out, signals may take any values.
+    - `end`: how a trace continues after the last sample, `"hold"` or `"truncate"`; a problem has
+      its own.
+    - `dt`, `duration`: those of a free trace, in seconds; by default they follow from the windows.
+    - `budget`, `seed`: number of simulations of the search, and the seed of all random draws.
+    **Returns:** the trace, if one was found; otherwise nothing is proved.
+    **Raises:** `FormulaSyntaxError`; `ValueError` for recordings without the signals, and for
+    windows that need too many samples; the errors of `falsify`.
     """
     one, other = as_formula(one), as_formula(other)
     if isinstance(signals, Simulated):
@@ -114,7 +115,7 @@ def distinguish(
 def distinction(
     one: Formula, other: Formula, traces: Sequence[Trace], source: str, end: End, tried: int
 ) -> Distinction:
-    """Return the first of some traces that tells two formulas apart, or that none does."""
+    """Return the first of some traces that distinguishes two formulas, or a result without one."""
     for trace in traces:
         values = HostValues.of(trace, end)
         holds = values.holds(one), values.holds(other)
@@ -133,7 +134,7 @@ def free_difference(
     duration: float | None = None,
     seed: int = 0,
 ) -> Trace | None:
-    """Return a trace of free signals that tells two formulas apart; None if none was found.
+    """Return a trace of free signals that distinguishes two formulas; None if none was found.
 
     **Arguments:**
     - `like`: recordings whose values the signals may have too.

@@ -49,11 +49,11 @@ def samples(time: float, dt: float, interval: Interval) -> float:
 
 
 def seconds_held(truth: Any, n: int, dt: float, xp: Any) -> Any:
-    """Return the seconds of the last `n` samples in which truth values were above zero.
+    """Return for how many seconds of the last `n` samples truth values were above zero.
 
     **Arguments:**
-    - `truth`: `[time, *lanes]`; what is counted is NaN while one of the values is.
-    - `xp`: the module of its arrays, NumPy or `jax.numpy`.
+    - `truth`: `[time, *lanes]`; the result is NaN while one of the values is.
+    - `xp`: the array module, NumPy or `jax.numpy`.
     """
 
     def within(marks: Any) -> Any:
@@ -75,7 +75,7 @@ def check_scalar(e: Term, shape: Sequence[int], lanes: int) -> None:
 
 
 def check_vector(name: str, shape: Sequence[int], lanes: int, text: str, index: int = 0) -> None:
-    """Refuse a signal without the component that `text` needs. **Raises:** `TypeError`."""
+    """Refuse a signal without the component that `text` uses. **Raises:** `TypeError`."""
     if len(shape) != 2 + lanes:
         raise TypeError(f"signal {name!r} is a scalar: {text} needs a vector [time, k]")
     if index >= shape[-1]:
@@ -86,10 +86,10 @@ def check_vector(name: str, shape: Sequence[int], lanes: int, text: str, index: 
 class Evaluator:
     """Evaluates sub-formulas of one trace (or of many, in lanes) under one semantics.
 
-    `kind` is the semantics' kind, `tau` its temperature (smooth only), `valid` the number of
-    samples that count, `[*lanes]` (truncate only; all when None). `lanes` is the number of lane
-    axes; `open_right` makes windows half-open, as in `compat="pymtl"`. `stride` samples stand for
-    one period `dt` (`Trace.finely`), so that windows, next and previous are as many times longer.
+    `kind` is the kind of semantics, `tau` its temperature (smooth only), `valid` the number of
+    valid samples, `[*lanes]` (truncate only; all when None). `lanes` is the number of lane axes;
+    `open_right` makes windows half-open, as with `compat="pymtl"`. One period `dt` is `stride`
+    samples long (`Trace.finely`), so windows, next and previous are that many times longer.
     """
 
     signals: Mapping[str, Float[Array, "time ..."]]
@@ -205,7 +205,7 @@ class Evaluator:
         return self._extended(value, last - first + 1)
 
     def expression(self, e: Term, start: int, stop: int) -> Array | float:
-        """Compute an expression at the samples `start` to `stop` (a float, if it is constant)."""
+        """Compute an expression at the samples `start` to `stop` (a float if it is constant)."""
         match e:
             case Number(value):
                 return value

@@ -47,7 +47,7 @@ four-thousandth, which single precision still tells from none."""
 
 @dataclass(frozen=True)
 class Examples(Drawn, InNotebook):
-    """Traces that satisfy a formula, barely satisfy it, and break it; None if none was found.
+    """Traces that satisfy a formula, barely satisfy it, and break it; None for one not found.
 
     - `robustness`: the robustness of each by its name.
     """
@@ -66,7 +66,7 @@ class Examples(Drawn, InNotebook):
         return {name: trace for name, trace in named.items() if trace is not None}
 
     def summary(self) -> str:
-        """Write the robustness of each trace, and which were not found."""
+        """Write the robustness of each trace, and which ones were not found."""
         lines = [str(self.formula)]
         lines += [f"  {name:<12}{value:>z12.4g}" for name, value in self.robustness.items()]
         if self.satisfying is None or self.breaking is None:
@@ -89,17 +89,17 @@ def examples(
     end: End = "hold",
     seed: int = 0,
 ) -> Examples:
-    """Find a trace that satisfies a formula, one that barely does, and one that breaks it.
+    """Find a trace that satisfies a formula, one that barely satisfies it, and one that breaks it.
 
     **Arguments:**
     - `formula`: a formula, or its text.
-    - `like`: recordings in whose range the signals move; near the bounds of the formula when left
-      out.
-    - `dt`, `duration`: of the traces, in seconds; they follow from the windows when left out.
-    - `end`: what comes after the last sample, `"hold"` or `"truncate"`.
+    - `like`: recordings that give the range of the signals; by default near the bounds of the
+      formula.
+    - `dt`, `duration`: those of the traces, in seconds; by default they follow from the windows.
+    - `end`: how a trace continues after the last sample, `"hold"` or `"truncate"`.
     - `seed`: the seed of the search.
-    **Raises:** `FormulaSyntaxError`; `ValueError` for windows that need a clock of too many
-    samples, and for a formula without signals.
+    **Raises:** `FormulaSyntaxError`; `ValueError` for windows that need too many samples, and for a
+    formula without signals.
     """
     formula = as_formula(formula)
     if not formula.signals():

@@ -88,7 +88,7 @@ class Expression(Term):
         return abs(self)
 
     def sqrt(self) -> "Expression":
-        """Return the square root; NaN where negative."""
+        """Return the square root; NaN for negative values."""
         return Arithmetic("sqrt", (self,))
 
     def sin(self) -> "Expression":
@@ -108,11 +108,11 @@ class Expression(Term):
         return Arithmetic("norm", (self,))
 
     def min(self, *others: "Expression | float") -> "Expression":
-        """Return the least of this and the others, at every instant."""
+        """Return the minimum of this and the others, at every instant."""
         return Arithmetic("min", (self, *map(expression, others)))
 
     def max(self, *others: "Expression | float") -> "Expression":
-        """Return the greatest of this and the others, at every instant."""
+        """Return the maximum of this and the others, at every instant."""
         return Arithmetic("max", (self, *map(expression, others)))
 
     def __ge__(self, other: "Expression | float") -> Formula:
@@ -200,16 +200,16 @@ class Signal(Expression):
         return (self.name,)
 
     def text(self, outer: int = 0) -> str:
-        """Return its name, in quotes where the grammar needs them."""
+        """Return its name, in quotes if the grammar needs them."""
         return name_text(self.name)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Duration(Signal):
-    """The seconds of the last `window` seconds in which a formula held, counted sample by sample.
+    """The number of seconds, within the last `window` seconds, in which a formula held.
 
-    Each sample stands for one period, and those before the first one do not count. It is like a
-    signal of the recording: with the end "hold" its last value is held.
+    Each sample counts as one period, and there are none before the first one. Like any signal of
+    the recording, it keeps its last value under the end "hold".
     """
 
     operand: Formula
@@ -229,15 +229,15 @@ class Duration(Signal):
 
     @property
     def is_signal(self) -> bool:
-        """False: its text is that of a function."""
+        """False, because its text is that of a function."""
         return False
 
     def below(self) -> tuple[Node, ...]:
-        """Return nothing: what walks over expressions meets no formula."""
+        """Return nothing, so that a walk over expressions meets no formula."""
         return ()
 
     def signals(self) -> tuple[str, ...]:
-        """Return the names of the signals of what is counted."""
+        """Return the names of the signals of the counted formula."""
         return self.operand.signals()
 
     def text(self, outer: int = 0) -> str:
@@ -246,12 +246,12 @@ class Duration(Signal):
 
 
 def duration(operand: Formula | Term, window: float) -> Duration:
-    """Count the seconds of the last `window` seconds in which a formula held.
+    """Count the seconds, within the last `window` seconds, in which a formula held.
 
     `always(duration(signal("speed") > 30, 60) <= 3)` is "at most 3 s in any 60 s", in text
     `always duration(speed > 30, 60) <= 3`.
 
-    **Raises:** `ValueError` for a formula that looks ahead, and a window that is not positive.
+    **Raises:** `ValueError` for a formula that looks ahead, and for a window that is not positive.
     """
     counted = formula(operand)
     return Duration(f"duration({counted}, {number_text(window)})", counted, float(window))
@@ -265,13 +265,13 @@ def durations_in(*formulas: Formula) -> tuple[Duration, ...]:
 
 
 def about_single_samples(*formulas: Formula) -> list[Formula]:
-    """Return the parts that a coarser or a longer sample would change: they count or order them."""
+    """Return the parts that depend on the sampling period: they count or order samples."""
     parts = (part for f in formulas for part in f.subformulas(valued=True))
     return [f for f in parts if isinstance(f, Next | Prev | Witness) or durations_in(f)]
 
 
 def with_counted(*formulas: Formula) -> list[Formula]:
-    """Return formulas, and those that their durations count."""
+    """Return formulas together with those that their durations count."""
     found = list(formulas)
     for each in found:
         found += [d.operand for d in durations_in(each) if d.operand not in found]
@@ -374,7 +374,7 @@ def constant_value(e: Expression) -> float | None:
 def expression(value: "Term | float") -> Expression:
     """Return `value` as an expression.
 
-    **Raises:** `TypeError` if it is neither one nor a number.
+    **Raises:** `TypeError` if it is neither an expression nor a number.
     """
     if isinstance(value, Expression):
         return value

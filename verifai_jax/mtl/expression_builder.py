@@ -31,7 +31,7 @@ MAX_TEMPORAL_DEPTH = 40
 
 @dataclass
 class Part:
-    """The meaning of a part of the text, and where it stands there."""
+    """The meaning of a part of the text, and its position."""
 
     value: Formula | Expression
     start: int
@@ -49,7 +49,7 @@ class ExpressionBuilder:
     **Arguments:**
     - `text`: the text of the formula.
     - `constants`, `known`: numbers and formulas by name.
-    - `reads`: whether a text is a formula; by default no text is offered in an error.
+    - `reads`: a function that says whether a text is a formula; without it errors suggest no text.
     """
 
     def __init__(

@@ -16,12 +16,12 @@ if TYPE_CHECKING:
 class Finding(NamedTuple):
     """Something suspicious about a formula.
 
-    - `requirement`: its identifier.
+    - `requirement`: the identifier of the requirement.
     - `kind`: `"signal"`, `"window"`, `"vacuous"`, `"never near"`, `"never holds"`, `"until"`,
       `"units"`, `"no effect"`, `"always true"`, `"always false"`, or `"no verdict"`.
-    - `part`: the part of the formula that it is about.
-    - `sentence`: the finding in words.
-    - `advice`: what was probably meant.
+    - `part`: the suspicious part of the formula.
+    - `sentence`: the finding as a sentence.
+    - `advice`: the probable intention.
     """
 
     requirement: str
@@ -33,10 +33,10 @@ class Finding(NamedTuple):
 
 @dataclass(frozen=True)
 class Findings(InNotebook):
-    """Findings on formulas; `str()` writes them, and `bool()` is False without any.
+    """Findings on formulas; `str()` writes them, and `bool()` is False if there are none.
 
-    - `recordings`: how many were looked at.
-    - `unread`: signals of the recordings that no formula reads.
+    - `recordings`: number of recordings that were used.
+    - `unread`: signals of the recordings that no formula uses.
     """
 
     requirements: tuple[Requirement, ...] = field(repr=False)
@@ -61,7 +61,7 @@ class Findings(InNotebook):
         return pd.DataFrame(list(self.findings), columns=list(Finding._fields))
 
     def summary(self) -> str:
-        """Write each finding as a sentence, below the formula that it is about."""
+        """Write each finding as a sentence, grouped by formula."""
         lines = [
             f"{counted(len(self.findings), 'finding')} on "
             f"{counted(len(self.requirements), 'formula')}, "

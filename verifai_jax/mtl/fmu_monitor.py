@@ -161,19 +161,19 @@ def export_fmu(
 ) -> Path:
     """Write a monitor as an FMU of FMI 2 for co-simulation, with its source in C.
 
-    Its inputs are the signals of the formulas. Its outputs are, for each formula, what `watch`
-    returns of a step and the ends of its interval: `robustness`, `robustness_low` and
-    `robustness_high`, or by the names of the formulas. A step takes a sample of the inputs that
-    were set before it.
+    Its inputs are the signals of the formulas. Its outputs are, for each formula, the result of a
+    step of `watch` and the ends of its interval: `robustness`, `robustness_low` and
+    `robustness_high`, or names made from those of the formulas. A step samples the inputs set
+    before it.
 
     **Arguments:**
-    - `dt`: sampling period in seconds; steps of communication have to be multiples of it.
+    - `dt`: sampling period in seconds; communication steps must be multiples of it.
     - `file`: the FMU to write.
     - `semantics`, `every`, `sizes`: as in `export_c`.
-    **Returns:** the path of the file. It has a binary for this machine where there is a compiler,
-    and else the source alone, which the importing tool has to compile.
-    **Raises:** as `export_c`; `ValueError` for a file whose name does not end in `.fmu`, and for a
-    formula that is named as a signal is.
+    **Returns:** the path of the file. It contains a binary for this machine if there is a compiler,
+    otherwise only the source, which the importing tool has to compile.
+    **Raises:** the errors of `export_c`; `ValueError` for a file whose name does not end in `.fmu`,
+    and for a formula with the name of a signal.
     """
     path = Path(file)
     if path.suffix != ".fmu":

@@ -69,7 +69,7 @@ class Formula(Tree):
         return Or((And((self, other)), And((Not(self), Not(other)))))
 
     def until(self, other: Formulaic, a: float = 0.0, b: float = math.inf) -> "Formula":
-        """Require `self` until `other` holds, `a` to `b` seconds ahead, not at the witness."""
+        """Require `other` `a` to `b` seconds ahead, and `self` at every earlier instant."""
         return Until(self, formula(other), Interval(a, b))
 
     def weak_until(self, other: Formulaic, a: float = 0.0, b: float = math.inf) -> "Formula":
@@ -77,7 +77,7 @@ class Formula(Tree):
         return Or((self.until(other, a, b), Always(self, Interval(0.0, b))))
 
     def release(self, other: Formulaic, a: float = 0.0, b: float = math.inf) -> "Formula":
-        """Require `other` up to and including the instant where `self` holds: the dual of until."""
+        """Require `other` up to and including the instant at which `self` holds: dual to until."""
         return Not(Until(Not(self), Not(formula(other)), Interval(a, b)))
 
     def since(self, other: Formulaic, a: float = 0.0, b: float = math.inf) -> "Formula":
@@ -85,30 +85,30 @@ class Formula(Tree):
         return Since(self, formula(other), Interval(a, b))
 
     def signals(self) -> tuple[str, ...]:
-        """Return the names of the signals that it speaks of, in order of appearance."""
+        """Return the names of the signals in it, in order of appearance."""
         terms = (term for part in self.subformulas() for term in part.terms())
         return tuple(dict.fromkeys(name for term in terms for name in term.signals()))
 
     def terms(self) -> tuple[Term, ...]:
-        """Return the expressions that a leaf compares; none for an operator."""
+        """Return the expressions compared by a leaf; none for an operator."""
         return ()
 
     @property
     def compared(self) -> "tuple[Term, str, Term] | None":
-        """Both sides of a comparison with its symbol between them; None for any other formula."""
+        """Both sides of a comparison with its symbol in between; None for any other formula."""
         return None
 
     @property
     def is_predicate(self) -> bool:
-        """True for a leaf with a margin: a comparison, or an expression by itself."""
+        """True for a leaf with a margin: a comparison, or a bare expression."""
         return bool(self.terms())
 
     def valued(self) -> tuple["Formula", ...]:
-        """Return the formulas whose values decide its own: its operands, but for `Derived`."""
+        """Return the formulas whose values determine its own: its operands, except in `Derived`."""
         return self.operands()
 
     def operands(self) -> tuple["Formula", ...]:
-        """Return the formulas that it is made of, left to right."""
+        """Return its operands, left to right."""
         parts: list[Formula] = []
         for name in self.children:
             value = getattr(self, name)
@@ -116,9 +116,9 @@ class Formula(Tree):
         return tuple(parts)
 
     def subformulas(self, valued: bool = False) -> Iterator["Formula"]:
-        """Yield itself and everything below, parents first, left to right, each part once.
+        """Yield this formula and all below it, parents first, left to right, each part once.
 
-        With `valued`, a `Derived` operator has its meaning below it instead of its operands.
+        With `valued`, the meaning of a `Derived` operator follows instead of its operands.
         """
         seen: set[int] = set()
         stack: list[Formula] = [self]
@@ -136,7 +136,7 @@ class Formula(Tree):
         )
 
     def text(self) -> Text:
-        """Return its text and what kind of text that is; `parse(str(f)) == f`."""
+        """Return its text and the kind of the text; `parse(str(f)) == f`."""
         word, operands, interval = surface(self)
         span = "" if interval is None or interval.everything else str(interval)
         return operator_text(word, span, [part.text() for part in operands])
@@ -229,7 +229,7 @@ class Not(Formula):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Join(Formula):
-    """The least (`sign` -1) or the greatest (1) value of two operands or more."""
+    """The minimum (`sign` -1) or maximum (1) of two or more operands."""
 
     parts: tuple[Formula, ...]
     children: ClassVar[tuple[str, ...]] = ("parts",)
@@ -237,20 +237,20 @@ class Join(Formula):
 
 
 class And(Join):
-    """`f & g & ...`, two operands or more."""
+    """`f & g & ...`, with two or more operands."""
 
     word, sign = "and", -1
 
 
 class Or(Join):
-    """`f | g | ...`, two operands or more."""
+    """`f | g | ...`, with two or more operands."""
 
     word, sign = "or", 1
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Window(Formula):
-    """The least (`sign` -1) or the greatest (1) value over an interval, ahead or back."""
+    """The minimum (`sign` -1) or maximum (1) over an interval, ahead or back."""
 
     operand: Formula
     children = ("operand",)
@@ -284,7 +284,7 @@ class Once(Window):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Next(Formula):
-    """`f` at the next sample; at the last one, `f` there, whatever the end of trace."""
+    """`f` at the next sample; at the last sample the value of `f` there, for any end of trace."""
 
     operand: Formula
     children = ("operand",)
@@ -293,7 +293,7 @@ class Next(Formula):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Prev(Formula):
-    """`f` at the previous sample; at the first one, false (or true, if `weak`)."""
+    """`f` at the previous sample; at the first sample false (or true, if `weak`)."""
 
     operand: Formula
     children = ("operand",)
@@ -301,13 +301,13 @@ class Prev(Formula):
 
     @property
     def word(self) -> str:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """The operator, which depends on `weak`."""
+        """The word of the operator, which depends on `weak`."""
         return "weak_prev" if self.weak else "prev"
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Witness(Formula):
-    """`right` at some instant of an interval, and `left` at every one between now and there."""
+    """`right` at some instant of an interval, and `left` at every instant from now to there."""
 
     left: Formula
     right: Formula
@@ -316,19 +316,19 @@ class Witness(Formula):
 
 
 class Until(Witness):
-    """`right` at some instant of the interval ahead, and `left` at every one before it."""
+    """`right` at some instant of the interval ahead, and `left` at every earlier instant."""
 
     word = "until"
 
 
 class Since(Witness):
-    """`right` at some instant of the interval before now, and `left` at every one after it."""
+    """`right` at some instant of the interval before now, and `left` at every later instant."""
 
     word = "since"
 
 
 class Derived(Formula, abc.ABC):
-    """An operator whose meaning is a formula of other operators, which gives it every semantics.
+    """An operator defined by a formula of other operators, which gives its value in all semantics.
 
     A subclass has its operands and its interval as fields, and defines `meaning`.
     """
@@ -346,7 +346,7 @@ class Derived(Formula, abc.ABC):
     @property
     @abc.abstractmethod
     def meaning(self) -> Formula:
-        """The formula of other operators that it stands for."""
+        """The formula of other operators that defines it."""
 
     def below(self) -> tuple[Node, ...]:
         return *super().below(), self.meaning
@@ -379,16 +379,16 @@ def build(word: str, operands: Iterable[Formula], interval: Interval = EVERYTHIN
 
     **Arguments:**
     - `word`: the name of the operator, a key of `OPERATORS`.
-    - `operands`: as many as the operator takes.
-    - `interval`: for an operator that takes one.
+    - `operands`: its operands, as many as it takes.
+    - `interval`: its interval, for an operator that takes one.
     """
     return NODES[word](*operands, *((interval,) if OPERATORS[word].timed else ()))
 
 
 def surface(f: Formula) -> tuple[str, tuple[Formula, ...], Interval | None]:
-    """Return how a formula reads: its operator's word, the operands, and the interval if any.
+    """Return how a formula is written: its operator's word, the operands, and the interval if any.
 
-    Sugar that was rewritten away, such as `->` or `rise`, is recognised.
+    Abbreviations that were expanded, such as `->` or `rise`, are recognised.
     """
     match f:
         case Not(Or((And((p, q)), And((Not(r), Not(s)))))) if p == r and q == s:
@@ -419,7 +419,7 @@ FALSE = Constant(False)
 def formula(value: Formulaic) -> Formula:
     """Return `value` as a formula; an expression is its own robustness.
 
-    **Raises:** `TypeError` if it is neither.
+    **Raises:** `TypeError` if it is neither a formula nor an expression.
     """
     if isinstance(value, Formula):
         return value
@@ -429,12 +429,12 @@ def formula(value: Formulaic) -> Formula:
 
 
 def conjunction(*parts: Formulaic) -> Formula:
-    """Return `f & g & ...`; one part alone is itself."""
+    """Return `f & g & ...`; a single part is returned itself."""
     return _joined(And, parts)
 
 
 def disjunction(*parts: Formulaic) -> Formula:
-    """Return `f | g | ...`; one part alone is itself."""
+    """Return `f | g | ...`; a single part is returned itself."""
     return _joined(Or, parts)
 
 

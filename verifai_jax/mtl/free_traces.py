@@ -46,11 +46,11 @@ Signals = dict[str, Values]
 
 @dataclass(frozen=True)
 class FreeTraces:
-    """Signals that may have any of their levels at any sample.
+    """Signals that may take any of their levels at any sample.
 
-    - `levels`: by signal.
-    - `widths`: components of each vector signal; 0 for a scalar one.
-    - `instants`: samples at which windows begin and end, where changes matter.
+    - `levels`: the possible values of each signal.
+    - `widths`: number of components of each vector signal; 0 for a scalar one.
+    - `instants`: samples at which windows start and end, where changes matter.
     """
 
     levels: Mapping[str, Float[np.ndarray, " levels"]]
@@ -69,12 +69,12 @@ class FreeTraces:
         duration: float | None = None,
         end: End = "hold",
     ) -> "FreeTraces":
-        """Return the free traces that formulas can tell apart.
+        """Return free traces with the levels and instants that formulas distinguish.
 
         **Arguments:**
-        - `like`: recordings whose values are levels too.
-        - `dt`, `duration`: in seconds; both follow from the windows when left out.
-        **Raises:** `ValueError` for windows that need a clock of more than 20 000 samples.
+        - `like`: recordings whose values are used as levels, too.
+        - `dt`, `duration`: period and duration in seconds; by default they follow from the windows.
+        **Raises:** `ValueError` for windows that need more than 20 000 samples.
         """
         formulas = with_counted(*formulas)
         dt, length, instants = _clock(formulas, dt, duration)
@@ -85,11 +85,11 @@ class FreeTraces:
 
     @property
     def scales(self) -> dict[str, float]:
-        """The distance from one level to the next of each signal, in the middle of all."""
+        """The median distance between neighbouring levels of each signal."""
         return {name: float(np.median(np.diff(own))) for name, own in self.levels.items()}
 
     def drawn(self, rng: np.random.Generator, lanes: int = LANES) -> Signals:
-        """Draw piecewise constant signals: some never change, others do at every third sample."""
+        """Draw piecewise constant signals: some never change, others at every third sample."""
         # A long clock has fewer traces, so that the memory is bounded.
         lanes = max(KEPT, min(lanes, 2**19 // self.length))
         shape = (self.length, lanes)
@@ -120,7 +120,7 @@ class FreeTraces:
         return np.take_along_axis(rng.choice(levels, shape), since, axis=0)
 
     def values(self, signals: Signals) -> HostValues:
-        """Return what computes formulas on lanes of signals; every operand counts a little."""
+        """Return a function that computes formulas on lanes, weighting all operands a little."""
         return HostValues(signals, self.dt, self.end, lanes=1, blend=BLEND)
 
     def search(
@@ -130,10 +130,10 @@ class FreeTraces:
         enough: float = math.inf,
         generations: int = GENERATIONS,
     ) -> tuple[Signals, float]:
-        """Find the trace of the greatest score by changing parts of the best ones again and again.
+        """Find the trace with the highest score by repeatedly changing parts of the best ones.
 
         **Arguments:**
-        - `score`: the score of `[lanes]` traces.
+        - `score`: a function from `[lanes]` traces to their scores.
         - `enough`: a score that ends the search.
         **Returns:** its signals `[time]`, and its score.
         """
@@ -246,7 +246,7 @@ def _levels(
 
 
 def states_of(formulas: Sequence[Formula]) -> set[str]:
-    """Return the signals that are states, such as modes and flags: they equal a value or do not."""
+    """Return the signals that are states, such as modes and flags: only equality is tested."""
     leaves = (leaf for f in with_counted(*formulas) for leaf in predicates_of(f))
     equal = (f for f in leaves if f.compared is None or f.compared[1] in ("==", "!="))
     return {name for leaf in equal for name in leaf.signals()}

@@ -19,7 +19,7 @@ what is shown of a text, so that a quotation and the advice fit."""
 
 
 class FormulaSyntaxError(ValueError):
-    """A text that is not a formula; the message shows where and what to write instead.
+    """An error for a text that is not a formula; the message shows the position and a correction.
 
     `position` is the offset of the error in the text.
     """
@@ -43,7 +43,7 @@ class FormulaSyntaxError(ValueError):
 
 @runtime_checkable
 class Extent(Protocol):
-    """A part of the text, from `start_pos` to before `end_pos`."""
+    """A part of the text, from `start_pos` up to `end_pos`, which is excluded."""
 
     start_pos: int
     end_pos: int
@@ -161,7 +161,7 @@ _GROUPS = (
 
 
 def explain_error(error: Exception, text: str) -> FormulaSyntaxError:
-    """Turn an error of the parser into one that shows where it is and the words expected there."""
+    """Turn an error of the parser into one that shows its position and the expected words."""
     import lark
 
     if not text.strip():

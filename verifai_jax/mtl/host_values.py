@@ -50,11 +50,11 @@ FUNCTIONS: dict[str, Callable[..., Values]] = {
 class HostValues:
     """The values of formulas on signals `[time, *lanes]`, or `[time, *lanes, k]` for vectors.
 
-    - `dt`: sampling period in seconds, for which `stride` samples stand.
-    - `end`: what comes after the last sample, `"hold"` or `"truncate"`.
+    - `dt`: sampling period in seconds, which is `stride` samples long.
+    - `end`: how the trace continues after the last sample, `"hold"` or `"truncate"`.
     - `lanes`: number of lane axes.
-    - `blend`: share of the sum of all operands that `&` and `|` add to the one that decides: a
-      search then sees an operand that gets better while another one decides. 0 for the robustness.
+    - `blend`: share of the sum of all operands that `&` and `|` add to the deciding one, so that a
+      search notices when another operand improves. 0 for the robustness.
     """
 
     signals: Mapping[str, Values]
@@ -70,7 +70,7 @@ class HostValues:
     def of(cls, trace: Trace, end: End = "hold") -> "HostValues":
         """Return the values on a trace.
 
-        **Raises:** `TypeError` for anything else; `ValueError` for sample times that are not even.
+        **Raises:** `TypeError` for another type; `ValueError` for unevenly spaced sample times.
         """
         check_trace(trace)
         dt, trace = period(trace), trace.trim()
@@ -85,7 +85,7 @@ class HostValues:
 
     @property
     def length(self) -> int:
-        """Number of samples, those between the others included."""
+        """Number of samples, including those between the periods."""
         return len(next(iter(self.signals.values())))
 
     def __call__(self, formula: Formula) -> Values:
@@ -93,13 +93,13 @@ class HostValues:
         return self._everywhere(formula, False)
 
     def truth(self, formula: Formula) -> Values:
-        """Compute +1 where it holds, -1 where not; a comparison decides at robustness 0."""
+        """Compute +1 where it holds, -1 where not; at robustness 0 the comparator decides."""
         return self._everywhere(formula, True)
 
     def first(self, formula: Formula, boolean: bool = False) -> Float[np.ndarray, "*lanes"]:
-        """Compute the robustness (or the truth) at the first sample alone, which takes less.
+        """Compute the robustness (or the truth) only at the first sample, which is faster.
 
-        Nothing is said of signals that are missing.
+        Missing signals raise no readable error here.
         """
         with np.errstate(all="ignore"):
             return self._first(formula, boolean, self._pad(formula))
@@ -130,11 +130,11 @@ class HostValues:
         return value > 0
 
     def forget(self) -> None:
-        """Drop what is known of formulas, for those who ask about thousands of them."""
+        """Clear the cache of formulas' values, for callers that evaluate thousands of formulas."""
         self._known.clear()
 
     def walk(self, formula: Formula) -> Walk:
-        """Return the way to what decides a formula at the first sample."""
+        """Return a walk to the part that decides a formula at the first sample."""
         pad = self._pad(formula)
 
         def values_of(part: Formula) -> Values:
@@ -276,7 +276,7 @@ def _look_back(formula: Formula, dt: float, stride: int) -> int:
 
 
 def numbers(signal: object) -> Values:
-    """Return a signal in double precision, a truth value as 1 or -1."""
+    """Return a signal in double precision, with 1 or -1 for truth values."""
     array = np.asarray(without_wrapping(signal))  # pyright: ignore[reportArgumentType]
     return np.where(array, 1.0, -1.0) if array.dtype == bool else array.astype(float)
 

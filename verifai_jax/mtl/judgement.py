@@ -28,10 +28,10 @@ MIN_RECORDINGS = 5
 class Row(NamedTuple):
     """One requirement on one recording.
 
-    - `verdict`: `"holds"`, `"fails"`, or nothing where there is no verdict.
-    - `instant`: in seconds, of the sample that decides; NaN where none does.
-    - `explanation`: the predicate that decides there, with its margin.
-    - `error`: why there is no verdict.
+    - `verdict`: `"holds"`, `"fails"`, or empty without a verdict.
+    - `instant`: time of the deciding sample in seconds; NaN if there is none.
+    - `explanation`: the predicate that decides at that time, with its margin.
+    - `error`: the reason why there is no verdict.
     """
 
     file: str
@@ -64,7 +64,7 @@ class Judgement(InNotebook):
 
     @property
     def failing(self) -> tuple[Row, ...]:
-        """The rows whose requirement fails, the first with the least robustness."""
+        """The rows whose requirement fails, by increasing robustness."""
         rows = [row for row in self.rows if row.verdict == "fails"]
         return tuple(sorted(rows, key=lambda row: row.robustness))
 
@@ -84,10 +84,10 @@ class Judgement(InNotebook):
 
     @property
     def tightest(self) -> Row | None:
-        """The row of the requirement that is nearest to its limit, or farthest beyond it.
+        """The row nearest to the limit of its requirement, or farthest beyond it.
 
-        Requirements have different units, so the robustness of each is divided by the median of
-        its absolute values over the fleet. None if nothing has a finite robustness.
+        Requirements have different units, so each robustness is divided by the median absolute
+        robustness of its requirement over the fleet. None if no robustness is finite.
         """
         best, lowest = None, math.inf
         for each in self.requirements:
@@ -101,12 +101,13 @@ class Judgement(InNotebook):
         return best
 
     def quantiles(self, shares: Sequence[float] = SHARES) -> "pd.DataFrame":
-        """Return how the robustness of each requirement is spread over the recordings.
+        """Return quantiles of the robustness of each requirement over the recordings.
 
         **Arguments:**
-        - `shares`: the shares of the recordings, from 0 (the least robustness) to 1 (the greatest).
+        - `shares`: quantile levels, from 0 (the minimum) to 1 (the maximum).
         **Returns:** a row for each requirement: how many recordings have a verdict, how many fail,
-        how many have none, and a column for each share, by the recording at that rank.
+        how many have none, and a column for each level with the robustness of the recording at that
+        rank.
         """
         import pandas as pd
 
@@ -128,15 +129,15 @@ class Judgement(InNotebook):
         return pd.DataFrame.from_dict(table, orient="index").rename_axis("requirement")
 
     def outliers(self, distance: float = 3.5) -> "pd.DataFrame":
-        """Return the rows whose robustness is unlike that of the other recordings.
+        """Return the rows whose robustness differs much from that of the other recordings.
 
-        The distance of a robustness is its difference from the median of the requirement over the
-        fleet, in units of their median absolute deviation times 1.4826, which is one standard
-        deviation of normal values. At least five recordings are needed.
+        The distance is the difference from the median of the requirement over the fleet, divided by
+        the median absolute deviation times 1.4826, which is one standard deviation for normal
+        values. At least five recordings are needed.
 
         **Arguments:**
-        - `distance`: from which on a row is an outlier.
-        **Returns:** rows of the table with their `distance`, the greatest first.
+        - `distance`: minimum distance of an outlier.
+        **Returns:** rows of the table with their `distance`, in decreasing order.
 
         Source: B. Iglewicz, D. Hoaglin, "How to Detect and Handle Outliers", ASQC 1993.
         """
@@ -157,7 +158,7 @@ class Judgement(InNotebook):
         return table.sort_values("distance", ascending=False, ignore_index=True)
 
     def summary(self) -> str:
-        """Return the summary as text: what fails, what has no verdict, how near the others are."""
+        """Return the summary as text: what fails, what has no verdict, how close the others are."""
         failing, missing = self.failing, self.without_verdict
         asked = (
             f"{counted(len(self.requirements), 'requirement')} on "
@@ -198,7 +199,7 @@ class Judgement(InNotebook):
     def junit(self, path: str | Path) -> Path:
         """Write the verdicts as JUnit XML: a suite for each requirement, a case for each recording.
 
-        A requirement that fails is a failure, and one without a verdict an error.
+        A requirement that fails is a failure; one without a verdict is an error.
 
         **Returns:** the path.
         """

@@ -38,7 +38,7 @@ _text = functools.lru_cache(1024)(Formula.__str__)
 
 
 class Reading(NamedTuple):
-    """The way in which recordings are read and judged."""
+    """Options for reading and judging recordings."""
 
     time: str
     dt: float | None
@@ -67,20 +67,21 @@ def judge(
 ) -> Judgement:
     """Judge every requirement on every recording, in double precision.
 
-    Recordings are read one after another, each once, and none is kept. What cannot be read or
-    judged is a row without a verdict that says why.
+    Recordings are read one after another, each once, and none is kept in memory. One that cannot be
+    read or judged gives a row without a verdict, with the reason.
 
     **Arguments:**
-    - `formulas`: one, a sequence, or a dictionary by identifier; `read_requirements` reads a file.
-    - `recordings`: paths of files, of folders (all recordings in and below them), traces or data
-      frames: one, a sequence, or a dictionary by name; or a problem, which is simulated.
-    - `time`, `dt`, `resample_to`, `method`, `missing`: as `read` takes them; a trace is resampled,
-      and its gaps are treated, too.
-    - `end`: as for `robustness`.
-    - `explain`: whether to find the predicate and the instant that decide.
-    - `executor`: anything with `concurrent.futures`' `submit` to read and judge in parallel; the
-      process pool must not fork.
-    - `ended`: called with the index and the rows of each recording as it ends.
+    - `formulas`: a formula, a sequence of formulas, or a dictionary by identifier;
+      `read_requirements` reads them from a file.
+    - `recordings`: paths of files, of folders (all recordings in them and their subfolders), traces
+      or data frames: one, a sequence, or a dictionary by name; or a problem, which is simulated.
+    - `time`, `dt`, `resample_to`, `method`, `missing`: as in `read`; given traces are resampled and
+      their gaps treated as well.
+    - `end`: as in `robustness`.
+    - `explain`: whether to find the deciding predicate and instant.
+    - `executor`: anything with the `submit` of `concurrent.futures`, to read and judge in parallel;
+      a process pool must not fork.
+    - `ended`: a function called with the index and the rows of each recording when it is done.
     - `progress`: whether to show one line of progress; see `core.display.progress` for the default.
     **Raises:** `ValueError` for no requirement, no recording, `resample_to` without `method`;
     `FileNotFoundError` for a folder or a file that does not exist.
@@ -118,7 +119,7 @@ def judge(
 def judge_recording(
     requirements: Sequence[Requirement], name: str, source: Recording, reading: Reading
 ) -> list[Row]:
-    """Return a row for each requirement on one recording; workers call it, too."""
+    """Return a row for each requirement on one recording; also called by workers."""
     try:
         return _judged(requirements, name, _trace(source, reading), reading)
     except (ValueError, TypeError, OSError) as error:

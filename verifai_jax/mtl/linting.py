@@ -48,16 +48,17 @@ def lint(
     units: Mapping[str, str] | None = None,
     end: End = "hold",
 ) -> Findings:
-    """Find parts of formulas that may not say what their author means.
+    """Find parts of formulas that may not say what their author meant.
 
     **Arguments:**
-    - `formulas`: one, a sequence, or a dictionary by identifier; `read_requirements` reads a file.
+    - `formulas`: a formula, a sequence of formulas, or a dictionary by identifier;
+      `read_requirements` reads them from a file.
     - `signals`: recordings (traces, files, folders, tables), or a problem, which is simulated 64
-      times. What only data tells is left out without any.
-    - `units`: the units of signals by name, in addition to those that recordings and names (`speed
-      (m/s)`, `speed_kmh`) have.
-    - `end`: what comes after the last sample, `"hold"` or `"truncate"`.
-    **Raises:** `FormulaSyntaxError`; as `read` for what cannot be read.
+      times. Without them only checks that need no data are made.
+    - `units`: the units of signals by name, in addition to those in recordings and names (`speed
+      (m/s)`, `speed_kmh`).
+    - `end`: how a trace continues after the last sample, `"hold"` or `"truncate"`.
+    **Raises:** `FormulaSyntaxError`; the errors of `read` for recordings that cannot be read.
     """
     requirements = tuple(r for r in requirements_of(formulas) if r.formula is not None)
     traces = {} if signals is None else named_traces(signals)

@@ -19,11 +19,11 @@ FEW = 64
 
 
 class Step(NamedTuple):
-    """One operation on results before it.
+    """One operation on earlier results.
 
-    - `kind`: as of `Arithmetic`; or `column` and `count` (the `number`-th of the sample, and of
-      what is counted), `number`, `power` (by the whole `number`), or `truth` (1 or -1 by the sign;
-      `number` is 1 where it is true at zero).
+    - `kind`: a kind of `Arithmetic`, or one of these: `column` and `count` (number `number` of the
+      sample, or of the counted durations), `number`, `power` (with the integer `number`), `truth`
+      (1 or -1 by the sign; `number` is 1 if zero counts as true).
     """
 
     kind: str
@@ -34,9 +34,9 @@ class Step(NamedTuple):
 class Margins(NamedTuple):
     """Operations that compute margins.
 
-    - `columns`: name of the signal, and the index of a component of a vector.
-    - `leaves`: the result that is each leaf's margin.
-    - `counts`: of each duration, the margins of what is counted, and its columns among these.
+    - `columns`: the name of each signal, and the index of a component of a vector.
+    - `leaves`: the index of the result that is each leaf's margin.
+    - `counts`: for each duration, the margins of the counted formula, and its columns among these.
     """
 
     columns: tuple[tuple[str, int | None], ...]
@@ -46,10 +46,10 @@ class Margins(NamedTuple):
 
 
 def margins(plan: Plan, sizes: Mapping[str, int]) -> Margins:
-    """Return the margins of a plan's leaves, each with its sign; what they share occurs once.
+    """Return the signed margins of a plan's leaves; common parts occur once.
 
     **Arguments:**
-    - `sizes`: number of components of the signals whose norm is taken.
+    - `sizes`: number of components of the signals whose norm is used.
     **Raises:** `ValueError` for a norm of a signal without a size.
     """
     made = _Builder(plan, sizes)

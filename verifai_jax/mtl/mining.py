@@ -48,16 +48,17 @@ class Mined(Drawn, InNotebook):
     """The tightest parameters that recordings satisfy.
 
     - `text`: the formula with its parameters.
-    - `values`: the tightest values by name; of a front, its most balanced corner.
-    - `front`: the corners of two parameters: none of both can be tighter without the other getting
-      looser. One entry for one parameter.
+    - `values`: the tightest values by name; for a front, its most balanced corner.
+    - `front`: the corners for two parameters: neither can be tighter unless the other gets looser.
+      One entry for one parameter.
     - `formula`: the formula with `values`, which the recordings satisfy.
-    - `tightest`: `"least"` or `"greatest"` by name, the side on which tight is.
-    - `sampled`: parameters in which the formula is monotone by the values that were tried, not by
-      its form.
-    - `recordings`, `satisfied`: how many there are, and how many satisfy `formula`.
-    - `broken`: the rate of recordings that do not satisfy it, with its interval.
-    - `searched`: simulations that did not break it, where a problem was searched; else None.
+    - `tightest`: for each name `"least"` or `"greatest"`, the direction in which the formula is
+      tighter.
+    - `sampled`: parameters in which the formula was found monotone by trying values, not from its
+      form.
+    - `recordings`, `satisfied`: number of recordings, and of those that satisfy `formula`.
+    - `broken`: the rate of recordings that break it, with its interval.
+    - `searched`: number of simulations that did not break it, if a problem was searched; else None.
     """
 
     text: str
@@ -73,7 +74,7 @@ class Mined(Drawn, InNotebook):
     _picture: ClassVar[tuple[str, str]] = ("requirements", "plot_mined")
 
     def summary(self) -> str:
-        """Write what was found, and on what it rests."""
+        """Write the parameters that were found, and what they rest on."""
         lines = [f"{self.text}"]
         for name, side in self.tightest.items():
             value = number_text(self.values[name])
@@ -119,16 +120,16 @@ def mine(
 
     **Arguments:**
     - `text`: a formula with one or two parameters `?name`, for numbers or ends of intervals.
-    - `recordings`: traces, files or tables; or a `Problem`, whose tightest values that a search
-      does not break are found, which proves nothing.
-    - `share`: the share of the recordings that are to satisfy it.
-    - `end`: what comes after the last sample, `"hold"` or `"truncate"`.
-    - `constants`, `definitions`: as of `parse`; a constant can fix a parameter's value.
+    - `recordings`: traces, files or tables. For a `Problem` a search looks for the tightest values
+      that it cannot break, which proves nothing.
+    - `share`: the share of the recordings that must satisfy it.
+    - `end`: how a trace continues after the last sample, `"hold"` or `"truncate"`.
+    - `constants`, `definitions`: as in `parse`; a constant can fix a parameter's value.
     - `confidence`: the confidence of the interval for the rate of recordings that break it.
-    - `budget`, `seed`: simulations of the search at most, and its seed, for a problem.
+    - `budget`, `seed`: maximum number of simulations of the search for a problem, and its seed.
     - `progress`: whether to show one line of progress for a problem; see `core.display.progress`.
     **Raises:** `FormulaSyntaxError`; `ValueError` for more than two parameters, one in which the
-    formula is not monotone, or one that nothing bounds or that no value satisfies.
+    formula is not monotone, or one that the data do not bound or that no value satisfies.
     """
     template = read_parametric(text, constants, definitions)
     if len(template.names) > 2:
@@ -151,7 +152,7 @@ def mine_template(
     end: End = "hold",
     confidence: float = 0.95,
 ) -> Mined:
-    """Find the tightest parameters of a formula that was read; see `mine`."""
+    """Find the tightest parameters of a parsed formula; see `mine`."""
     if len(template.names) == 2 and template.together(*template.names):
         raise ValueError(
             f"{' and '.join('?' + name for name in template.names)} stand in one comparison, so "

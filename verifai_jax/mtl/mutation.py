@@ -55,10 +55,10 @@ class Mutant:
     """A formula with one change.
 
     - `kind`: `"bound"`, `"window"`, `"operator"`, `"comparison"`, `"clause"` or `"guard"`.
-    - `change`: what became what.
-    - `killed_by`: the first recording with another verdict; nothing for one that survives.
-    - `example`: for one that survives, a free trace that would kill it; None if none was found, as
-      of a mutant that means the same.
+    - `change`: a description of the change.
+    - `killed_by`: the first recording with another verdict; empty for a mutant that survives.
+    - `example`: for a surviving mutant, a free trace that would kill it; None if none was found,
+      for example because it is equivalent.
     """
 
     kind: str
@@ -70,7 +70,7 @@ class Mutant:
 
 @dataclass(frozen=True)
 class Mutants(Tabular):
-    """The mutants of a formula, killed and surviving; `str()` lists those that survive."""
+    """The mutants of a formula, killed and surviving; `str()` lists the surviving ones."""
 
     formula: Formula
     mutants: tuple[Mutant, ...]
@@ -84,13 +84,13 @@ class Mutants(Tabular):
 
     @property
     def surviving(self) -> tuple[Mutant, ...]:
-        """The mutants that no recording kills, and that a trace would."""
+        """The mutants that no recording kills, although some trace would."""
         alive = (mutant for mutant in self.mutants if not mutant.killed_by)
         return tuple(mutant for mutant in alive if mutant.example is not None)
 
     @property
     def equivalent(self) -> tuple[Mutant, ...]:
-        """The mutants that no trace was found to tell from the formula."""
+        """The mutants for which no trace was found that distinguishes them from the formula."""
         alive = (mutant for mutant in self.mutants if not mutant.killed_by)
         return tuple(mutant for mutant in alive if mutant.example is None)
 
@@ -109,7 +109,7 @@ class Mutants(Tabular):
         return pd.DataFrame(rows, columns=["kind", "change", "formula", "killed_by", "state"])
 
     def summary(self) -> str:
-        """Write how many are killed, and each that survives."""
+        """Write how many were killed, and each one that survives."""
         killed = sum(bool(mutant.killed_by) for mutant in self.mutants)
         lines = [
             f"{self.formula}",
@@ -129,16 +129,16 @@ class Mutants(Tabular):
 def mutants(
     formula: Formula | str, signals: Recordings | None = None, *, end: End = "hold", seed: int = 0
 ) -> Mutants:
-    """Change a formula in one point at a time, and see which recordings notice.
+    """Change a formula in one point at a time, and find which recordings notice the change.
 
     **Arguments:**
     - `formula`: a formula, or its text.
     - `signals`: recordings (traces, files, folders, tables), or a problem, which is simulated 64
-      times. Without any all mutants survive, each with an example of a trace that would kill it.
-    - `end`: what comes after the last sample, `"hold"` or `"truncate"`.
+      times. Without them all mutants survive, each with an example of a trace that would kill it.
+    - `end`: how a trace continues after the last sample, `"hold"` or `"truncate"`.
     - `seed`: the seed of the free traces that are tried.
-    **Raises:** `FormulaSyntaxError`; as `read`; `ValueError` for a recording without the signals or
-    with gaps where they matter.
+    **Raises:** `FormulaSyntaxError`; the errors of `read`; `ValueError` for a recording without the
+    signals, or with gaps where they matter.
     """
     formula = as_formula(formula)
     traces = {} if signals is None else named_traces(signals)
@@ -170,10 +170,10 @@ def _example(
 
 
 def changes(formula: Formula, dt: float = 0.0) -> Iterator[Change]:
-    """Yield the formulas that differ from one in a single point.
+    """Yield all formulas that differ from the given one in a single point.
 
     **Arguments:**
-    - `dt`: period in seconds by which a window moves, at least.
+    - `dt`: minimum shift of a window in seconds, the sampling period.
     """
     if isinstance(formula, ast.Constant):
         return

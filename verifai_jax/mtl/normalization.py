@@ -23,14 +23,14 @@ from verifai_jax.mtl.setting import prepare
 
 
 def normalize(formula: Formula, scales: Mapping[str, float] | Trace) -> Formula:
-    """Divide each predicate of a formula by its scale: the same truth, a relative robustness.
+    """Divide each predicate of a formula by its scale; its truth stays, its robustness is relative.
 
     **Arguments:**
-    - `scales`: a typical magnitude for each signal by name; a predicate takes the greatest of its
-      signals among its signals; or a trace, from which each predicate takes the range of its margin
-      (1 where that is constant).
-    **Raises:** `UnknownNameError` for a scale of no signal of the formula, `ValueError` for a
-    signal without a scale, or a scale that is not positive and finite.
+    - `scales`: a typical magnitude for each signal by name, of which a predicate takes the largest
+      among its signals; or a trace, from which each predicate takes the range of its margin (1 if
+      that is constant).
+    **Raises:** `UnknownNameError` for a scale that belongs to no signal of the formula,
+    `ValueError` for a signal without a scale, or a scale that is not positive and finite.
     """
     if isinstance(scales, Trace):
         return _mapped(formula, _spreads(formula, scales))
@@ -53,9 +53,9 @@ def normalize(formula: Formula, scales: Mapping[str, float] | Trace) -> Formula:
 def anneal(
     step: Real[Array, ""] | float, steps: int, start: float = 0.3, end: float = 0.02
 ) -> Float[Array, ""]:
-    """Return the temperature at a step of an optimisation: geometric from `start` to `end`.
+    """Return the temperature at a step of an optimisation, geometric from `start` to `end`.
 
-    In units of the predicates' scale (see `normalize`). `step` may be traced.
+    It is in units of the predicates' scale (see `normalize`). `step` may be traced.
 
     **Raises:** `ValueError` for fewer than one step, or temperatures that are not positive.
     """

@@ -44,7 +44,7 @@ def once(operand: Formulaic, a: float = 0.0, b: float = math.inf) -> Formula:
 
 
 def until(left: Formulaic, right: Formulaic, a: float = 0.0, b: float = math.inf) -> Formula:
-    """Require `left` until `right` holds, `a` to `b` seconds ahead; not needed at the witness."""
+    """Require `right` `a` to `b` seconds ahead, and `left` at every earlier instant."""
     return formula(left).until(right, a, b)
 
 
@@ -69,22 +69,22 @@ def fall(operand: Formulaic) -> Formula:
 
 
 def phase(begins: Formulaic, ends: Formulaic) -> Formula:
-    """Return the formula that holds from the sample where `begins` does to before `ends` does."""
+    """Return a formula that holds from a sample where `begins` holds until `ends` holds."""
     return (~formula(ends)).since(formula(begins) & ~formula(ends))
 
 
 def during(phase: Formulaic, operand: Formulaic) -> Formula:
-    """Require `operand` at every instant of a phase, whenever and how often there is one."""
+    """Require `operand` at every instant of every phase."""
     return Always(formula(phase).implies(operand))
 
 
 def sometime_during(phase: Formulaic, operand: Formulaic) -> Formula:
-    """Require that each phase has an instant with `operand`, before it ends."""
+    """Require `operand` at some instant of each phase, before the phase ends."""
     now = formula(phase)
     begins = And((now, Prev(Not(now), weak=True)))
     return Always(begins.implies(now.until(now & formula(operand))))
 
 
 def prev(operand: Formulaic, weak: bool = False) -> Formula:
-    """Require `operand` at the previous sample; false at the first one (true, if `weak`)."""
+    """Require `operand` at the previous sample; at the first sample false (true, if `weak`)."""
     return Prev(formula(operand), weak)

@@ -23,7 +23,7 @@ def _shift(x: Series, by: int, reverse: bool, fill: float) -> Series:
 
 
 def windowed(n: int, reverse: bool, sign: int, x: Series) -> Series:
-    """Compute the maximum (minimum, for `sign` -1) of `n` samples from (up to) each instant."""
+    """Compute the maximum (minimum, for `sign` -1) of `n` samples from (or up to) each instant."""
     x, size = sign * x, 1
     while size < n:
         by = min(size, n - size)  # Windows may overlap: a maximum counts nothing twice.
@@ -33,7 +33,7 @@ def windowed(n: int, reverse: bool, sign: int, x: Series) -> Series:
 
 
 def windowed_smooth(n: int, reverse: bool, sign: int, x: Series, tau: Array | float) -> Series:
-    """Compute the same with `tau log sum exp(x / tau)` for the maximum."""
+    """Compute `windowed` with `tau log sum exp(x / tau)` for the maximum."""
     # An overlap would count samples twice, so windows are joined by the binary digits of n.
     never = 1e30
     pair = (sign * x, jnp.ones_like(x))
@@ -73,7 +73,7 @@ def until(reverse: bool, f: Series, g: Series) -> Series:
 
 
 def until_smooth(reverse: bool, f: Series, g: Series, tau: Array | float) -> Series:
-    """Compute the same with smooth maxima and minima."""
+    """Compute `until` with smooth maxima and minima."""
 
     # With X = exp(x / tau), smin(L, x) is LX / (X + L) and smax adds: a matrix
     # [[R + L, R L], [1, L]], all of whose entries are positive, so their logarithms exist.

@@ -51,10 +51,10 @@ _OPEN = {">=": ">", "<=": "<", "==": "=="}
 class Parametric:
     """A formula with parameters.
 
-    - `text`: as it was written.
-    - `tree`: the formula in which signals and times stand for the parameters.
+    - `text`: the text as written.
+    - `tree`: the formula with signals and times as placeholders for the parameters.
     - `names`: the parameters in order of appearance.
-    - `slots`: the times in the tree that stand for parameters.
+    - `slots`: the times in the tree that are placeholders for parameters.
     """
 
     text: str
@@ -70,7 +70,7 @@ class Parametric:
     def formula(self, values: Mapping[str, float]) -> Formula:
         """Return the formula with values for all parameters.
 
-        A comparison with a parameter includes equality, so that the formula holds at the tightest
+        A comparison with a parameter becomes non-strict, so that the formula holds at the tightest
         value too: `x > ?d` becomes `x >= 4.2`.
 
         **Raises:** `UnknownNameError` for values of other names; `ValueError` for an interval that
@@ -124,9 +124,9 @@ class Parametric:
         return e
 
     def direction(self, name: str) -> int:
-        """Return how the robustness changes as a parameter grows, as the tree has it.
+        """Return how the robustness changes as a parameter grows, judging from the formula.
 
-        **Returns:** 1, it never falls; -1, it never rises; 0, the tree does not tell.
+        **Returns:** 1 if it never falls, -1 if it never rises, 0 if the formula does not show it.
         """
         signs = self._signs(self.tree, name)
         return signs.pop() if len(signs) == 1 else 0
@@ -150,7 +150,7 @@ class Parametric:
         return signs
 
     def range_of_time(self, name: str) -> tuple[float, float]:
-        """Return the least and the greatest value of a time that the other times leave it."""
+        """Return the minimum and maximum of a time, given the other times."""
         low, high = 0.0, math.inf
         for part in postorder(self.tree):
             if isinstance(part, Formula) and part.side and part.operator.timed:
@@ -162,7 +162,7 @@ class Parametric:
         return low, high
 
     def together(self, one: str, other: str) -> bool:
-        """Return whether two parameters stand in one comparison."""
+        """Return whether two parameters occur in one comparison."""
         leaves = (part for part in self.tree.subformulas() if part.terms())
         return any({one, other} <= set(_parameters(*leaf.terms())) for leaf in leaves)
 
@@ -172,12 +172,12 @@ def read_parametric(
     constants: Mapping[str, float] | None = None,
     definitions: Mapping[str, Formula | str] | None = None,
 ) -> Parametric:
-    """Read a formula in which `?name` stands for numbers and for ends of intervals.
+    """Read a formula in which `?name` is a parameter for numbers or ends of intervals.
 
     **Arguments:**
-    - `constants`, `definitions`: as of `parse`.
-    **Raises:** `FormulaSyntaxError` as `parse`; `ValueError` for a name that is both a number and a
-    time, or a text without a parameter.
+    - `constants`, `definitions`: as in `parse`.
+    **Raises:** the `FormulaSyntaxError` of `parse`; `ValueError` for a name used both as a number
+    and as a time, or a text without a parameter.
     """
     if not isinstance(text, str):
         raise TypeError(f"the text of a formula with parameters is needed; got {text!r}")
@@ -246,16 +246,16 @@ def _sign(number: float) -> int:
 
 @dataclass(frozen=True)
 class Template:
-    """A requirement to start from.
+    """A requirement of the library to start from.
 
-    - `id`: by which it is found.
-    - `domain`: such as `"driving"`, `"flight"`, `"medical"`.
-    - `text`: the sentence that the formula stands for.
-    - `expression`: the formula as text, in which names stand for `constants`.
+    - `id`: its identifier.
+    - `domain`: its field, such as `"driving"`, `"flight"`, `"medical"`.
+    - `text`: the sentence that the formula formalises.
+    - `expression`: the formula as text, with names of `constants`.
     - `source`: a standard or a paper, with its number.
     - `signals`: units of the signals by name; `"1"` for flags and ratios.
-    - `unit`: the unit of the robustness, where it has one.
-    - `example`: whether the source gives the form alone, and the numbers are examples.
+    - `unit`: the unit of the robustness, if it has one.
+    - `example`: whether the source gives only the form, so that the numbers are examples.
     """
 
     id: str
@@ -270,11 +270,11 @@ class Template:
 
     @property
     def formula(self) -> Formula:
-        """The formula with the constants as they stand in the library."""
+        """The formula with the constants of the library."""
         return parse(self.expression, self.constants)
 
     def requirement(self, **constants: float) -> Requirement:
-        """Return it as a requirement, with other values of some constants.
+        """Return a requirement made from it, with new values for some constants.
 
         **Raises:** `UnknownNameError` for a constant that it does not have.
         """
@@ -292,12 +292,11 @@ class Template:
 
 
 def templates(words: str = "", domain: str | None = None) -> tuple[Template, ...]:
-    """Return the templates that have all of some words, in the order of the library.
+    """Return the templates that contain all of these words, in the order of the library.
 
     **Arguments:**
-    - `words`: looked for in all that a template says, whatever their case; all templates when left
-      out.
-    - `domain`: the domain of the templates; every one when left out.
+    - `words`: words to find in any field of a template, ignoring case; all templates when left out.
+    - `domain`: the domain of the templates; all domains when left out.
     **Raises:** `UnknownNameError` for a domain without templates.
     """
     library = _library()

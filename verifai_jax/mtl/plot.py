@@ -28,7 +28,7 @@ _MAX_ROWS = 14
 
 
 def draw(explanation: Explanation, path: str | Path | None = None) -> Figure:
-    """Draw an explanation; returns the matplotlib figure, saved to `path` if one is given."""
+    """Draw an explanation; returns the matplotlib figure, and saves it to `path` if given."""
     from matplotlib.patches import ConnectionPatch
 
     rows = _rows(explanation.tree)

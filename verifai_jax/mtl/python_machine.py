@@ -25,7 +25,7 @@ Join = Callable[[float, float], float]
 class PythonMachine:
     """The state of a monitor, and its step.
 
-    - `out`: what the last step gave, one number a formula.
+    - `out`: the results of the last step, one number for each formula.
     """
 
     def __init__(self, plan: Plan, front: Margins) -> None:
@@ -49,7 +49,7 @@ class PythonMachine:
         self._now = 0
 
     def step(self, sample: Sequence[float]) -> None:
-        """Take in one sample."""
+        """Process one sample."""
         numbers = [float(value) for value in sample]
         numbers += [count(numbers) for count in self._counts]
         v: list[float] = []
@@ -60,7 +60,7 @@ class PythonMachine:
         self._follow()
 
     def steps(self, rows: np.ndarray) -> np.ndarray:
-        """Take in samples `[time, columns]`, and return what came out `[time, formulas]`."""
+        """Process samples `[time, columns]`, and return the results `[time, formulas]`."""
         out = np.empty((len(rows), len(self.out)))
         for k, row in enumerate(rows.tolist()):
             self.step(row)
@@ -71,7 +71,7 @@ class PythonMachine:
         """Return the results `[steps, formulas]` of further steps without changing the state.
 
         **Arguments:**
-        - `leaf`: the margin of all leaves from now on, or None to hold what they are.
+        - `leaf`: the margin of all leaves from now on; None keeps their present margins.
         """
         before = self._now, list(self.out), self._leaves, self._steps
         self._steps = [(step, op, list(memory)) for step, op, memory in self._steps]

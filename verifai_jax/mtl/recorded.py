@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 @runtime_checkable
 class Simulated(Protocol):
-    """A problem (of a room above this one), whose traces are those of simulations."""
+    """A problem (defined in a higher layer), whose traces are those of simulations."""
 
     name: str
     formulas: Mapping[str, Formula]
@@ -35,7 +35,7 @@ Recordings: TypeAlias = Recording | Iterable[Recording] | Mapping[str, Recording
 
 
 def named_recordings(source: Recordings) -> Iterator[tuple[str, Recording]]:
-    """Yield recordings with their names, unread; files of a folder in the order of their paths.
+    """Yield recordings with their names, unread; files of a folder are sorted by path.
 
     **Raises:** `FileNotFoundError` for a file or a folder that does not exist; `ValueError` for a
     folder without a recording.
@@ -72,7 +72,7 @@ def named_recordings(source: Recordings) -> Iterator[tuple[str, Recording]]:
 def named_traces(source: Recordings) -> dict[str, Trace]:
     """Return recordings as traces by their names.
 
-    **Raises:** as `named_recordings` and `read`; `ValueError` for none.
+    **Raises:** the errors of `named_recordings` and `read`; `ValueError` for no recordings.
     """
     traces = {
         name: one if isinstance(one, Trace) else read(one) for name, one in named_recordings(source)

@@ -36,9 +36,9 @@ ENDINGS = (".csv", ".parquet", ".npz", ".mcap", ".nc", ".zarr", ".h5", ".hdf5")
 
 
 class TimeColumnError(ValueError):
-    """A recording without the column of its sample times.
+    """An error for a recording without the column of its sample times.
 
-    `fact` says so, without the advice of the message; `columns` are those it has.
+    `fact` is the message without its advice; `columns` are the existing columns.
     """
 
     def __init__(self, fact: str, columns: Sequence[str]) -> None:
@@ -62,34 +62,36 @@ def read(
 ) -> Trace:
     """Read a trace from a file or a table: its columns, topics or variables are signals.
 
-    Columns `p[0]`, `p[1]`, ... make one vector signal `p`, and so does a column of lists of one
-    length. Columns that hold no numbers are left out, with a note, unless named in `columns`. An
-    empty cell is a gap (NaN). In a CSV file commas, semicolons or tabs separate the columns,
-    whichever the first line has; numbers may have a decimal comma, if all of them do. Lines of
-    comments (`#`) before the names are passed over, and a row of units may stand below them.
+    Columns `p[0]`, `p[1]`, ... become one vector signal `p`, and so does a column of lists of equal
+    length. Columns without numbers are left out, with a note, unless named in `columns`. An empty
+    cell is a gap (NaN). In a CSV file commas, semicolons or tabs separate the columns, as the first
+    line shows; numbers may have a decimal comma if all of them do. Comment lines (`#`) before the
+    names are skipped, and a row of units may follow the names.
 
-    What has several clocks, such as the topics of an MCAP file, the groups of an HDF5 file or
-    several files, becomes one trace with all of their instants, and a signal has a gap where only
-    others have a sample. Resampling with `"hold"` then keeps each signal's own last value.
+    Data with several clocks, such as the topics of an MCAP file, the groups of an HDF5 file or
+    several files, become one trace with the instants of all clocks; a signal has a gap where only
+    others have a sample. Resampling with `"hold"` then repeats each signal's own last value.
 
     **Arguments:**
-    - `source`: the path of a `.csv` (first line: names), `.parquet`, `.npz` (an array is a column),
-      `.mcap`, `.nc`, `.h5` or `.hdf5` file, of a `.zarr` store, or of the folder of a LeRobot data
-      set; a `pandas.DataFrame`, whose index is read as a column if it has a name; several paths.
-    - `time`: the column of sample times in seconds, or of dates (ISO 8601 where they are text) or
-      durations, which become seconds since the first; so do numbers that can only be milli-, micro-
-      or nanoseconds since 1970, with a note. Of several clocks in one table, the columns that
-      each is the clock of, `{"t_imu": ["gyro"], "t_gps": ["speed"]}`.
-    - `dt`: the sampling period, instead of a column of times.
+    - `source`: the path of a `.csv` (first line: names), `.parquet`, `.npz` (each array is a
+      column), `.mcap`, `.nc`, `.h5` or `.hdf5` file, of a `.zarr` store, or of the folder of a
+      LeRobot data set; a `pandas.DataFrame`, whose index is a column if it has a name; or several
+      paths.
+    - `time`: the column of sample times in seconds, of dates (ISO 8601 as text) or of durations.
+      Dates and durations become seconds since the first one, and so do numbers that can only be
+      milli-, micro- or nanoseconds since 1970, with a note. For several clocks in one table, a
+      dictionary from each clock to its columns, `{"t_imu": ["gyro"], "t_gps": ["speed"]}`.
+    - `dt`: the sampling period, if there is no column of times.
     - `columns`: the signals to read; all when left out.
-    - `resample_to`, `method`: a period to resample to, and how (`"hold"` or `"linear"`).
-    - `missing`: what a gap becomes, for all signals or by name: `"hold"`, the signal's own last
-      value; `"interpolate"`, what is on the line between its neighbours; `"drop"`, the instant is
-      left out. A gap stays one when left out.
+    - `resample_to`, `method`: a period to resample to, and the method (`"hold"` or `"linear"`).
+    - `missing`: how to fill gaps, for all signals or by name: `"hold"`, with the signal's own last
+      value; `"interpolate"`, linearly between its neighbours; `"drop"` removes the instants. By
+      default gaps remain.
     - `episode`: number of an episode of a LeRobot data set.
     **Raises:** `FileNotFoundError`; `MissingExtra` for a kind of file whose package is not
-    installed; `ValueError` for another kind of file, no rows, a column that does not exist or holds
-    no numbers, a text among numbers, times that do not increase, or `resample_to` without `method`.
+    installed; `ValueError` for another kind of file, no rows, a column that does not exist or
+    contains no numbers, a text among numbers, times that do not increase, or `resample_to` without
+    `method`.
     """
     if (resample_to is None) != (method is None):
         raise ValueError('resampling needs both: resample_to=PERIOD, method="hold" or "linear"')
@@ -342,7 +344,7 @@ THOUSANDS = r"^\s*[-+]?(\d{1,3}|[1-9]\d{0,2},\d{3})\s*$"
 
 
 def read_csv(path: Path) -> Table:
-    """Read a CSV file as an Arrow table, whatever separates its columns and its decimals."""
+    """Read a CSV file as an Arrow table with any separator of columns and decimals."""
     from pyarrow import csv
 
     with open(path, encoding="utf-8", errors="replace") as file:

@@ -46,17 +46,18 @@ FIELDS: tuple[str, ...] = (
 
 @dataclass(frozen=True)
 class Requirement:
-    """A demand with an identifier, and its formula.
+    """A requirement with an identifier, and its formula.
 
-    - `id`: by which tables and reports name it.
-    - `formula`: what is required; None if a problem has the formula, or if it is not written yet.
-    - `text`: the sentence that the formula stands for.
+    - `id`: its identifier in tables and reports.
+    - `formula`: the required property; None if a problem has the formula, or if it is not written
+      yet.
+    - `text`: the sentence that the formula formalises.
     - `unit`: the unit of its robustness.
     - `source`: a standard or a document, with its number.
-    - `rationale`: why it is required.
-    - `severity`: how grave a violation is, in the words of the project.
-    - `links`: other requirements that it comes from, or documents.
-    - `file`: that it was read from.
+    - `rationale`: the reason for the requirement.
+    - `severity`: the severity of a violation, in the project's terms.
+    - `links`: other requirements or documents from which it is derived.
+    - `file`: the file from which it was read.
     """
 
     id: str
@@ -80,7 +81,7 @@ class Requirement:
         return self.formula
 
     def entry(self) -> dict[str, str]:
-        """Return what is said of the requirement as texts by field; what is empty is left out."""
+        """Return its fields as texts; empty ones are left out."""
         formula = "" if self.formula is None else str(self.formula)
         said = {name: getattr(self, name) for name in FIELDS}
         said |= {"formula": formula, "links": " ".join(self.links)}
@@ -92,10 +93,10 @@ Requirements = Formula | str | Mapping[str, Formula | str] | Iterable[Formula | 
 
 
 def requirements_of(formulas: Requirements) -> tuple[Requirement, ...]:
-    """Return formulas as requirements; those without an identifier are `R1`, `R2`, ...
+    """Return formulas as requirements; those without an identifier become `R1`, `R2`, ...
 
-    **Raises:** `ValueError` for none, for an identifier that stands twice, and for a text that is
-    no formula.
+    **Raises:** `ValueError` for no formulas, for a duplicate identifier, and for a text that is not
+    a formula.
     """
     if isinstance(formulas, Formula | str):
         formulas = [formulas]
@@ -118,16 +119,16 @@ def read_requirements(
 
     A TOML file has a table `[[requirement]]` for each, and may have tables `[constants]` and
     `[definitions]` of names that the formulas use; a YAML file has the same as a list
-    `requirements` and two mappings. A CSV file has a row for each, below the names of its columns.
-    A requirement has `id` and `formula`, and may have `text`, `unit`, `source`, `rationale`,
-    `severity` and `links`. Attributes of a ReqIF file count by their long names, such as
-    `ReqIF.ForeignID` (the id) and `ReqIF.Text`; others are left out.
+    `requirements` and two mappings. A CSV file has a row for each, below the column names. A
+    requirement has `id` and `formula`, and may have `text`, `unit`, `source`, `rationale`,
+    `severity` and `links`. Attributes of a ReqIF file are recognised by their long names, such as
+    `ReqIF.ForeignID` (the id) and `ReqIF.Text`; others are ignored.
 
     **Arguments:**
-    - `constants`, `definitions`: further names; they come before those of the file.
-    - `need_formulas`: whether an entry without a formula is refused.
-    **Raises:** `FileNotFoundError`; `ValueError` that names the entry for one that is not as it
-    should be, and for XML with a document type or entities, which are refused unread.
+    - `constants`, `definitions`: further names, which come before those of the file.
+    - `need_formulas`: whether to refuse an entry without a formula.
+    **Raises:** `FileNotFoundError`; `ValueError` that names an invalid entry, and for XML with a
+    document type or entities, which is refused unread.
     """
     path = Path(path)
     if not path.exists():
@@ -166,7 +167,8 @@ def write_requirements(requirements: Iterable[Requirement], path: str | Path) ->
     """Write requirements to a CSV or a ReqIF file, which `read_requirements` reads again.
 
     **Returns:** the path.
-    **Raises:** `ValueError` for another ending, and for what `read_requirements` would refuse.
+    **Raises:** `ValueError` for another file ending, and for content that `read_requirements` would
+    refuse.
     """
     path = Path(path)
     suffix = path.suffix.lower()
@@ -250,10 +252,10 @@ def read_reqif(path: Path, fields: Sequence[str]) -> list[dict[str, object]]:
     """Read the objects of a ReqIF file.
 
     **Arguments:**
-    - `fields`: the fields of a requirement; attributes of other names are left out.
-    **Returns:** a dictionary of texts for each object that has one of the fields. An object without
-    an id has its identifier in the file as one. Its `links` are those that it has, and the targets
-    of its relations.
+    - `fields`: the fields of a requirement; other attributes are left out.
+    **Returns:** a dictionary of texts for each object with at least one of the fields. An object
+    without an id gets its identifier in the file. Its `links` are its own, and the targets of its
+    relations.
     **Raises:** `ValueError` for a file that is not ReqIF, or declares a document type.
     """
     root = read_xml(path.read_bytes(), str(path))
@@ -324,11 +326,11 @@ def _text(value: Element, choices: Mapping[str, str]) -> str:
 def reqif_document(
     entries: Sequence[Mapping[str, str]], fields: Sequence[str], title: str
 ) -> bytes:
-    """Write entries as a ReqIF document: an object each, in one specification.
+    """Write entries as a ReqIF document: an object for each, in one specification.
 
     **Arguments:**
-    - `entries`: texts by field.
-    - `fields`: that an object may have.
+    - `entries`: texts by field, one dictionary for each object.
+    - `fields`: the possible fields of an object.
     """
     now = datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
 

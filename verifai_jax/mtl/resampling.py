@@ -28,13 +28,13 @@ MAX_SAMPLES = 100_000_000
 def resample(trace: Trace, dt: float, method: Method) -> Trace:
     """Resample signals on an even clock, from the first sample time to the last.
 
-    Verdicts on the result are those of the new samples and of the recorded ones together: what was
-    recorded between two of them is kept in `between`. A missing sample (NaN) of a signal is no
-    sample of it, as in a log of topics that arrive at different times: `"hold"` keeps the signal's
-    last value, and a note says so; `"linear"` leaves a gap.
+    Verdicts on the result use both the new samples and the recorded ones: those recorded between
+    new samples are kept in `between`. A missing value (NaN) is not a sample of its signal, as in a
+    log of topics that arrive at different times: `"hold"` keeps the signal's last value, with a
+    note; `"linear"` leaves a gap.
 
     **Arguments:**
-    - `trace`: with `times` or another period; NumPy or JAX arrays, not under `jit`.
+    - `trace`: a trace with `times` or another period; NumPy or JAX arrays, not under `jit`.
     - `dt`: the new sampling period in seconds.
     - `method`: `"hold"` keeps each value until the next sample; `"linear"` interpolates.
     **Raises:** `ValueError` for a period that is not positive or makes more than 100 million
@@ -123,14 +123,14 @@ def _positions(cells: Int[np.ndarray, " passed"], count: int) -> Int[np.ndarray,
 
 
 def gaps(values: np.ndarray) -> np.ndarray:
-    """Return in which rows a signal has no value, or a vector lacks one."""
+    """Return the rows in which a signal, or a component of a vector, has no value."""
     if values.dtype.kind != "f":
         return np.zeros(len(values), bool)
     return np.asarray(np.any(np.isnan(values).reshape(len(values), -1), axis=1))
 
 
 def held(values: np.ndarray) -> np.ndarray:
-    """Return each column with its last value for a missing one; nothing before the first."""
+    """Return each column with its last value in gaps; a gap remains before the first value."""
     if not gaps(values).any():
         return values
     columns = values.reshape(len(values), -1)
@@ -158,9 +158,9 @@ def _interpolated(
 
 
 def filled(values: np.ndarray, elapsed: Float[np.ndarray, " time"]) -> np.ndarray:
-    """Return a signal with its missing values on the line between its own neighbours.
+    """Return a signal with its gaps interpolated linearly between its own neighbours.
 
-    A row in which a signal has no value hides none of it; the samples of the clock show the gap.
+    Rows in which a signal has no value are ignored; the gap shows only at samples of the clock.
     """
     if not gaps(values).any():
         return values
@@ -174,10 +174,10 @@ def filled(values: np.ndarray, elapsed: Float[np.ndarray, " time"]) -> np.ndarra
 def joined(
     stamps: Sequence[tuple[np.ndarray, Fraction]], parts: Sequence[dict[str, np.ndarray]]
 ) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-    """Return the instants of several clocks in one order, and columns with gaps at those of others.
+    """Merge the instants of several clocks, and return columns with gaps at instants of others.
 
     **Arguments:**
-    - `stamps`: times of each clock in seconds, and the instant that they are counted from.
+    - `stamps`: times of each clock in seconds, and their origin.
     """
     origin = min(start for _, start in stamps)
     clocks = [seconds + float(start - origin) for seconds, start in stamps]
@@ -193,7 +193,7 @@ def joined(
 
 
 def without_gaps(trace: Trace, missing: Missing | Mapping[str, Missing]) -> Trace:
-    """Fill the gaps of signals, or leave out the instants at which they have one."""
+    """Fill the gaps of signals, or remove the instants with gaps."""
     ways = missing if isinstance(missing, Mapping) else dict.fromkeys(trace.signals, missing)
     check_names("signal", ways, trace.signals)
     check_names("way to treat a gap", ways.values(), ("hold", "drop", "interpolate"))
@@ -221,7 +221,7 @@ def without_gaps(trace: Trace, missing: Missing | Mapping[str, Missing]) -> Trac
 
 
 def check_increasing(times: np.ndarray) -> None:
-    """Raise `ValueError` that names the row whose time is not finite, or not after the one before.
+    """Raise `ValueError` that names a row whose time is not finite, or not after its predecessor.
 
     Rows are counted from 1.
     """

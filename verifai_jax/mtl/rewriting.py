@@ -16,10 +16,9 @@ from verifai_jax.mtl.words import COMPARISONS
 def nnf(f: Formula) -> Formula:
     """Return the negation normal form: `!` only on equalities and bare signals.
 
-    It has the same robustness.
-    Inequalities absorb their negation (`!(x > 1)` is `x <= 1`). The dual of until has no node of
-    its own, so that one case stays `!(f until g)` with `f` and `g` in normal form; the same for
-    since.
+    It has the same robustness. Inequalities absorb their negation (`!(x > 1)` becomes `x <= 1`).
+    There is no node for the dual of until, so `!(f until g)` remains, with `f` and `g` in normal
+    form; the same for since.
     """
     return _nnf(f, True, {})
 
@@ -54,11 +53,11 @@ def _nnf_node(f: Formula, positive: bool, known: dict[tuple[Formula, bool], Form
 
 
 def simplify(f: Formula) -> Formula:
-    """Return a formula of the same robustness on every trace under `hold`, with fewer nodes.
+    """Return a formula with fewer nodes and the same robustness on every trace under `hold`.
 
-    Folds constants, double negations, duplicates in `&` and `|`, nested `always always` and
-    `eventually eventually`, and operators over `[0,0]`. Windows cut at the end of a trace
-    (`end="truncate"`) may tell the nested windows apart where one is empty.
+    It removes constants, double negations, duplicates in `&` and `|`, nested `always always` and
+    `eventually eventually`, and operators over `[0,0]`. Under `end="truncate"` nested windows may
+    differ from the merged one if a window is empty.
     """
     return _simplified(f, {})
 
@@ -128,14 +127,14 @@ def _simplified_join(parts: tuple[Formula, ...], neutral: Formula, absorbing: Fo
 
 
 def rebuild(f: Formula, operands: tuple[Formula, ...]) -> Formula:
-    """Return the same operator over other operands."""
+    """Return the same operator with other operands."""
     if isinstance(f, ast.Leaf):
         return f
     return ast.build(f.operator.word, operands, *([f.interval] if f.operator.timed else ()))
 
 
 def replaced(f: Formula, parts: Mapping[Formula, Formula]) -> Formula:
-    """Return the formula with other formulas in place of some of its parts."""
+    """Return the formula with some of its parts replaced by other formulas."""
     if f in parts:
         return parts[f]
     return rebuild(f, tuple(replaced(part, parts) for part in f.operands()))

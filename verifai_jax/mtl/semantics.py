@@ -26,7 +26,7 @@ Bound = Literal["none", "lower", "upper"]
 )
 @dataclass(frozen=True)
 class Semantics:
-    """The way to give a formula its value; made by `hard`, `boolean` and `smooth`."""
+    """A definition of a formula's value; made by `hard`, `boolean` and `smooth`."""
 
     # JAX rebuilds the class with placeholders, which are no numbers.
     __no_type_check__ = True
@@ -49,15 +49,15 @@ def smooth(
     error: float | None = None,
     bound: Bound = "none",
 ) -> Semantics:
-    """Return quantitative semantics by log-sum-exp, differentiable everywhere.
+    """Return quantitative semantics with log-sum-exp, which is differentiable everywhere.
 
     **Arguments:**
-    - `tau`: temperature, positive, in the unit of the predicates; may be traced. As it tends to 0
-      the value tends to the hard one. It is not itself differentiated.
-    - `error`: instead of `tau`, the greatest distance from the hard value that is acceptable; the
-      temperature follows from the certificate (see `certificate`).
-    - `bound`: shift the value by the certificate so that it never exceeds the hard one (`"lower"`),
-      never falls below it (`"upper"`), or leave it (`"none"`). The gradient is the same.
+    - `tau`: the temperature, positive, in the unit of the predicates; may be traced. As it tends to
+      0 the value tends to the hard one. The temperature itself is not differentiated.
+    - `error`: instead of `tau`, the largest acceptable difference from the hard value, from which
+      the temperature is computed (see `smoothing_error`).
+    - `bound`: `"lower"` shifts the value so that it never exceeds the hard one, `"upper"` so that
+      it never falls below it; `"none"` does not shift. The gradient is the same.
     **Raises:** `ValueError` unless exactly one of `tau` and `error` is given and positive.
     """
     if (tau is None) == (error is None):
@@ -76,9 +76,9 @@ def compared(comparison: str, left: Any, right: Any, boolean: bool, xp: ModuleTy
 
     **Arguments:**
     - `left`, `right`: arrays that broadcast, or numbers.
-    - `boolean`: whether the value is +1 where it holds and -1 where not, or else the margin.
+    - `boolean`: whether to return +1 where it holds and -1 where not, instead of the margin.
     - `xp`: `jax.numpy`, or `numpy` on the host.
-    **Returns:** the value, NaN where the margin is.
+    **Returns:** the value; NaN where the margin is NaN.
     """
     match comparison:
         case ">" | ">=":

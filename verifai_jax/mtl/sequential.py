@@ -59,7 +59,7 @@ def _row(x: Shaped[Array, "time *lanes"], k: Each) -> Shaped[Array, "*lanes"]:
 
 @partial(jax.custom_vjp, nondiff_argnums=(0, 1, 2))
 def windowed(n: int, reverse: bool, sign: int, x: Series) -> Series:
-    """Compute the maximum (minimum, for `sign` -1) of `n` samples from (up to) each instant."""
+    """Compute the maximum (minimum, for `sign` -1) of `n` samples from (or up to) each instant."""
     return _windowed(n, reverse, sign, x, keep=False)[0]
 
 
@@ -202,7 +202,7 @@ def _pairs(
 
 @partial(jax.custom_vjp, nondiff_argnums=(0, 1, 2))
 def windowed_smooth(n: int, reverse: bool, sign: int, x: Series, tau: Number) -> Series:
-    """Compute the same with `tau log sum exp(x / tau)` for the maximum."""
+    """Compute `windowed` with `tau log sum exp(x / tau)` for the maximum."""
     return _pairs(n, reverse, sign, x, None, tau, lambda m, s: sign * (m + tau * jnp.log(s)))
 
 
@@ -308,7 +308,7 @@ until.defvjp(_until_forward, _until_backward)
 
 @partial(jax.custom_vjp, nondiff_argnums=(0,))
 def until_smooth(reverse: bool, f: Series, g: Series, tau: Number) -> Series:
-    """Compute the same with smooth maxima and minima."""
+    """Compute `until` with smooth maxima and minima."""
     return _until(reverse, f, g, tau, "u")[1]
 
 
@@ -328,7 +328,7 @@ until_smooth.defvjp(_until_smooth_forward, _until_smooth_backward)
 
 @jax.custom_vjp
 def until_first(f: Series, g: Series) -> Array:
-    """Compute the first value of `until`, without storing the others."""
+    """Compute only the first value of `until`, without storing the others."""
     return _until(True, f, g, None, "")[0]
 
 
@@ -346,7 +346,7 @@ until_first.defvjp(_until_first_forward, _until_first_backward)
 
 @jax.custom_vjp
 def until_first_smooth(f: Series, g: Series, tau: Number) -> Array:
-    """Compute the first value of `until_smooth`, without storing the others."""
+    """Compute only the first value of `until_smooth`, without storing the others."""
     return _until(True, f, g, tau, "")[0]
 
 

@@ -22,9 +22,9 @@ from verifai_jax.mtl.semantics import Semantics
 
 
 class HorizonError(ValueError):
-    """A formula that looks beyond the end of a trace, under `end="strict"`.
+    """An error for a formula that looks beyond the end of a trace, under `end="strict"`.
 
-    `fact` says by how much, without the advice of the message.
+    `fact` is the message without its advice.
     """
 
     def __init__(self, fact: str) -> None:
@@ -33,9 +33,9 @@ class HorizonError(ValueError):
 
 
 class SamplingError(ValueError):
-    """A trace whose samples are not evenly spaced.
+    """An error for a trace whose samples are not evenly spaced.
 
-    `fact` says where, without the advice of the message; `dt` is the usual step in seconds.
+    `fact` is the message without its advice; `dt` is the usual step in seconds.
     """
 
     def __init__(self, fact: str, dt: float) -> None:
@@ -47,10 +47,10 @@ class SamplingError(ValueError):
 
 
 class Setting(NamedTuple):
-    """Everything static about one evaluation.
+    """All static settings of one evaluation.
 
-    `length` counts samples, of which `stride` stand for one period `dt`: more than one where
-    something was recorded between the samples.
+    `length` counts samples. One period `dt` is `stride` samples long: more than one if values were
+    recorded between the samples.
     """
 
     formula: Formula
@@ -73,7 +73,7 @@ def as_formula(formula: Formula | str) -> Formula:
 
 
 def check_trace(trace: object) -> None:
-    """Refuse anything that is not a trace, and say how to make one of it."""
+    """Refuse anything that is not a trace, with advice on how to make one."""
     if isinstance(trace, Trace):
         return
     if hasattr(trace, "columns"):
@@ -93,7 +93,7 @@ def check_trace(trace: object) -> None:
 def prepare(
     formula: Formula | str, trace: Trace, semantics: Semantics, end: End, compat: str | None
 ) -> tuple[Setting, dict[str, Array], Array | None, Array | None]:
-    """Check an evaluation; return its setting, its signals, its temperature and valid length."""
+    """Check an evaluation; return its setting, signals, temperature and valid length."""
     formula = as_formula(formula)
     check_trace(trace)
     if end not in ("hold", "truncate", "strict"):
@@ -134,7 +134,7 @@ def _missing_signal(name: str, trace: Trace) -> Exception:
 
 
 def numbers_of_signals(signals: dict[str, Samples]) -> dict[str, Array]:
-    """Return the signals as arrays of one floating type; true counts as +1 and false as -1."""
+    """Return the signals as arrays of one floating type, with +1 for true and -1 for false."""
     arrays = {name: as_array(value) for name, value in signals.items()}
     floats = [a.dtype for a in arrays.values() if jnp.issubdtype(a.dtype, jnp.floating)]
     dtype = jnp.result_type(*floats) if floats else jnp.result_type(float)
@@ -147,7 +147,7 @@ def numbers_of_signals(signals: dict[str, Samples]) -> dict[str, Array]:
 def period(trace: Trace) -> float:
     """Return the trace's sampling period in seconds.
 
-    **Raises:** `ValueError` if its sample times are not evenly spaced, or not known yet.
+    **Raises:** `ValueError` if its sample times are not evenly spaced, or are not known yet.
     """
     if trace.dt is not None:
         return float(trace.dt)
@@ -193,10 +193,10 @@ EVEN = 1e-3
 
 
 def since_first(times: Real[np.ndarray, " time"]) -> tuple[Float[np.ndarray, " time"], float]:
-    """Return the seconds since the first sample time, and what the stamps can tell apart.
+    """Return the seconds since the first sample time, and the resolution of the time stamps.
 
-    The origin is subtracted before anything is rounded. Stamps in single precision, as a JAX clock
-    gives them, are no better than that.
+    The origin is subtracted before rounding. Stamps in single precision, as JAX gives them, keep
+    their coarse resolution.
     """
     if times.dtype.kind in "iu":
         # Integers are exact, whatever their width and their origin.
@@ -209,12 +209,12 @@ def since_first(times: Real[np.ndarray, " time"]) -> tuple[Float[np.ndarray, " t
 
 
 def plain_period(dt: float, error: float) -> float:
-    """Return the period, or the rate, with the fewest digits that may be meant by `dt`.
+    """Return the period, or rate, with the fewest digits that agrees with `dt`.
 
-    Stamps are rounded, and so 0.1 s comes as 0.09999 s, and a thirtieth as 0.033333334 s.
+    Stamps are rounded, so 0.1 s may appear as 0.09999 s, and a thirtieth as 0.033333334 s.
 
     **Arguments:**
-    - `error`: seconds by which `dt` may be off.
+    - `error`: the possible error of `dt` in seconds.
     """
     error = max(error, 1e-9 * dt)
     for digits in range(1, 10):

@@ -26,17 +26,18 @@ LARGEST = 2**27
 
 
 class Op(NamedTuple):
-    """One operation; its `kind` is a case in every backend.
+    """One operation; every backend has a case for each `kind`.
 
-    - `leaf`: margin number `n`; `number`: the `number`.
-    - `join`: least (`sign` -1) or greatest (1) of the inputs.
-    - `delay`: the input `n` samples ago, at first the `number`.
-    - `begun`: the input from sample `n` on, before that the `number`.
-    - `window`, `running`: extreme of the last `n` samples, or of all; at first the `number`.
-    - `until`: `max(g[0], min(f[0], max(g[1], ...)))` over the last `n` pairs, from the oldest on,
-      and `since` from the newest on; for `sign` -1 with least and greatest exchanged.
-    - `recur`: since over all samples.
-    - `accumulate`, `reach`: always (or eventually) and until from `start` to `end` at time 0, of
+    - `leaf`: margin number `n`; `number`: the constant `number`.
+    - `join`: minimum (`sign` -1) or maximum (1) of the inputs.
+    - `delay`: the input `n` samples ago; before that exists, `number`.
+    - `begun`: the input from sample `n` on; before, `number`.
+    - `window`, `running`: extreme of the last `n` samples, or of all; initially `number`.
+    - `until`: `max(g[0], min(f[0], max(g[1], ...)))` over the last `n` pairs, starting with the
+      oldest, and `since` starting with the newest; for `sign` -1 with minimum and maximum
+      exchanged.
+    - `recur`: since, over all samples.
+    - `accumulate`, `reach`: always (or eventually) and until from `start` to `end` at time 0, with
       inputs that are `n` samples late.
     """
 
@@ -52,11 +53,11 @@ class Op(NamedTuple):
 class Output(NamedTuple):
     """The result of one formula.
 
-    - `slot`: number of its operation.
-    - `delay`: samples by which it is late; 0 if it is asked at time 0.
-    - `wait`: samples after which a constant input has reached it: asked at time 0, all of it has
-      settled; asked at every instant, it is of the latest sample.
-    - `ends`: whether no operator looks ahead without end.
+    - `slot`: index of its operation.
+    - `delay`: number of samples by which it is late; 0 if it is evaluated at time 0.
+    - `wait`: number of samples after which constant inputs determine it: at time 0, its final
+      value; at every instant, the value of the latest sample.
+    - `ends`: whether all operators look ahead by a finite time.
     """
 
     slot: int
@@ -66,7 +67,7 @@ class Output(NamedTuple):
 
 
 class Count(NamedTuple):
-    """A duration that leaves read: the plan of what is counted in `n` samples, `dt` apart."""
+    """A duration that leaves use: the plan of its formula, counted over `n` samples, `dt` apart."""
 
     duration: Duration
     plan: "Plan"
@@ -75,12 +76,12 @@ class Count(NamedTuple):
 
 
 class Plan(NamedTuple):
-    """The operations of monitors of several formulas at each sample.
+    """The operations at each sample of monitors of several formulas.
 
-    - `formulas`: by name.
-    - `leaves`: the leaves with the sign of their margin.
-    - `top`: the greatest value: infinity, or 1 for truth values.
-    - `counts`: the durations that the leaves read.
+    - `formulas`: the formulas by name.
+    - `leaves`: the leaves with the signs of their margins.
+    - `top`: the maximum value: infinity, or 1 for truth values.
+    - `counts`: the durations that the leaves use.
     """
 
     formulas: Mapping[str, Formula]
@@ -92,7 +93,7 @@ class Plan(NamedTuple):
 
     @property
     def memory(self) -> int:
-        """Samples that the windows hold."""
+        """Number of samples stored in the windows."""
         held = {"delay": 1, "window": 1, "until": 2, "since": 2}
         counted = sum(count.n + count.plan.memory for count in self.counts)
         return counted + sum(op.n * held.get(op.kind, 0) for op in self.ops)
@@ -104,14 +105,15 @@ def streams(
     semantics: Semantics = hard,
     every: bool = False,
 ) -> Plan:
-    """Lay out the operations of one formula or several; what they have in common occurs once.
+    """Plan the operations of one or several formulas; common parts occur once.
 
     **Arguments:**
     - `dt`: sampling period in seconds.
     - `semantics`: `hard` or `boolean`.
-    - `every`: whether each formula is asked at every instant, or at time 0.
+    - `every`: whether each formula is evaluated at every instant, not only at time 0.
     **Raises:** `IntervalError` for an interval that is not a multiple of `dt`; `ValueError` for no
-    formula, smooth semantics, a period that is not positive, and what no bounded memory can follow.
+    formula, smooth semantics, a period that is not positive, and formulas that need unbounded
+    memory.
     """
     named = formulas if isinstance(formulas, Mapping) else {"": formulas}
     parsed = {name: parse(f) if isinstance(f, str) else f for name, f in named.items()}

@@ -20,15 +20,15 @@ N = TypeVar("N", bound="Node")
 
 
 class MissingCaseError(TypeError):
-    """A walk over a formula has no case for a kind of node, such as one made outside of here."""
+    """An error for a kind of node that a walk over a formula does not handle, such as a user's."""
 
 
 def missing_case(walk: str, node: object) -> MissingCaseError:
-    """Return the error for a node that a walk over a formula has no case for.
+    """Return the error for a node that a walk over a formula does not handle.
 
     **Arguments:**
-    - `walk`: what the walk gives, such as `"the horizon"`.
-    - `node`: the node; its own text is not asked for, since that is a walk, too.
+    - `walk`: the result of the walk, such as `"the horizon"`.
+    - `node`: the node; its text is not used, since writing it is a walk, too.
     """
     kind = type(node)
     return MissingCaseError(
@@ -38,7 +38,7 @@ def missing_case(walk: str, node: object) -> MissingCaseError:
 
 
 class Node(ForUsers):
-    """A node of a tree, which is compared by its kind and its fields."""
+    """A node of a tree; nodes are compared by kind and fields."""
 
     _internal = frozenset((
         "asked", "below", "children", "compared", "depth", "first_look_ahead", "interval",
@@ -106,9 +106,9 @@ def _fields(kind: type) -> tuple[str, ...]:
 
 
 def postorder(root: N, known: str = "") -> Iterator[N]:
-    """Yield a node and all below it, each once, children first.
+    """Yield a node and all nodes below it, each once, children first.
 
-    Nodes that have the attribute `known` already are left out, with what is below them.
+    Nodes that already have the attribute `known` are left out, with all below them.
     """
     seen: set[int] = set()
     stack: list[tuple[Any, bool]] = [(root, False)]
@@ -123,7 +123,7 @@ def postorder(root: N, known: str = "") -> Iterator[N]:
 
 
 class Term(Node, abc.ABC):
-    """A number at every instant, which predicates compare; made as an `Expression`."""
+    """A number at every instant, which predicates compare; instances are `Expression`s."""
 
     @abc.abstractmethod
     def text(self, outer: int = 0) -> str:
@@ -165,7 +165,7 @@ class Interval:
 
     @property
     def everything(self) -> bool:
-        """True for `[0, inf]`, which the text leaves out."""
+        """True for `[0, inf]`, which is not written."""
         return self.start == 0 and self.end == math.inf
 
     def __str__(self) -> str:
@@ -177,7 +177,7 @@ EVERYTHING = Interval()
 
 
 class Tree(Node):
-    """A node that has an operator over other nodes, or that is a leaf."""
+    """A node that is an operator over other nodes, or a leaf."""
 
     word: ClassVar[str] = ""
     """Its operator, a key of `OPERATORS`; none for a leaf."""
@@ -194,14 +194,14 @@ class Tree(Node):
         return OPERATORS[self.word]
 
     def valued(self) -> tuple["Tree", ...]:
-        """Return the formulas whose values decide its own."""
+        """Return the formulas whose values determine its own."""
         raise NotImplementedError
 
     def horizon(self, dt: float = 0.0) -> float:
-        """Return the seconds of trace beyond an instant on which its truth there depends.
+        """Return the number of seconds after an instant on which its value there depends.
 
-        Infinite for an unbounded future operator. Past operators look back, so they never add (and
-        are not subtracted, which keeps the bound simple).
+        Infinite for an unbounded future operator. Past operators look back, so they add nothing
+        (and are not subtracted, which keeps the bound simple).
 
         **Arguments:**
         - `dt`: sampling period in seconds, by which `next` looks ahead.
@@ -209,7 +209,7 @@ class Tree(Node):
         return self._total_reach(dt, "ahead")
 
     def history(self, dt: float = 0.0) -> float:
-        """Return the seconds of trace before an instant on which its truth there depends.
+        """Return the number of seconds before an instant on which its value there depends.
 
         **Arguments:**
         - `dt`: sampling period in seconds, by which `prev` looks back.
@@ -225,13 +225,13 @@ class Tree(Node):
         return reach[id(self)]
 
     def first_look_ahead(self, dt: float, start: float = 0.0) -> float:
-        """Return the end of the latest window if every operator begins at its earliest.
+        """Return the end of the latest window if each operator is evaluated at its first instant.
 
-        Unbounded windows end with the trace and do not count.
+        Unbounded windows end with the trace and are ignored.
 
         **Arguments:**
         - `dt`: sampling period in seconds, by which `next` looks ahead.
-        - `start`: instant at which the formula is asked, in seconds.
+        - `start`: instant at which the formula is evaluated, in seconds.
         """
         first, last = self.span(dt) if self.side == "ahead" else (0.0, 0.0)
         latest = start + (last if math.isfinite(last) else first)
@@ -239,8 +239,7 @@ class Tree(Node):
         return max([latest, *below])
 
     def asked(self, dt: float = 0.0) -> dict["Tree", tuple[float, float]]:
-        """Return the interval of time in which each part is evaluated if the whole is at 0, in
-        seconds.
+        """Return the interval in seconds in which each part is evaluated if the whole is at 0.
 
         **Arguments:**
         - `dt`: sampling period in seconds, by which `next` and `prev` look.
@@ -263,7 +262,7 @@ class Tree(Node):
 
     @property
     def depth(self) -> int:
-        """Operators that stand within each other; 0 for a leaf."""
+        """Nesting depth of operators; 0 for a leaf."""
         for part in postorder(self, "_depth"):
             if isinstance(part, Tree):
                 below = [p.__dict__["_depth"] + 1 for p in part.valued()]
@@ -272,7 +271,7 @@ class Tree(Node):
 
     @property
     def temporal_depth(self) -> int:
-        """Temporal operators that stand within each other."""
+        """Nesting depth of temporal operators."""
         for part in postorder(self, "_temporal_depth"):
             if isinstance(part, Tree):
                 below = max((p.__dict__["_temporal_depth"] for p in part.valued()), default=0)
@@ -282,12 +281,11 @@ class Tree(Node):
 
     @property
     def side(self) -> str:
-        """Where its own operator looks: `"ahead"`, `"back"`, or nowhere."""
+        """The direction of its own operator: `"ahead"`, `"back"`, or none."""
         return "" if self.timeless else self.operator.side
 
     def span(self, dt: float) -> tuple[float, float]:
-        """Return the first and the last second, relative to an instant, at which its operator
-        looks.
+        """Return the first and the last second, relative to an instant, that its operator reads.
 
         **Arguments:**
         - `dt`: sampling period in seconds, by which `next` and `prev` look.

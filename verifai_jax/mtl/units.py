@@ -30,7 +30,7 @@ NONE = {"", "1", "-", "none", "n/a", "bool", "boolean", "flag", "enum", "mode", 
 
 
 def units_of(names: Iterable[str], given: Mapping[str, str]) -> dict[str, str]:
-    """Return the units of signals: those given, or else those that their names say."""
+    """Return the units of signals: the given ones, or else those in their names."""
     found = {}
     for name in names:
         said = IN_NAME.search(name)
@@ -42,7 +42,7 @@ def units_of(names: Iterable[str], given: Mapping[str, str]) -> dict[str, str]:
 
 
 def plain_unit(unit: str) -> str:
-    """Return the usual way of writing a unit; nothing for a word that means none."""
+    """Return the usual spelling of a unit; empty for an unknown one."""
     unit = " ".join(unit.split())
     return "" if unit.lower() in NONE else SAME.get(unit.lower(), unit.replace(" / ", "/"))
 
@@ -50,10 +50,10 @@ def plain_unit(unit: str) -> str:
 def unit_of(e: Term, units: Mapping[str, str], faults: list[str]) -> str | None:
     """Return the unit of an expression; None if it is unknown, as for a number alone.
 
-    That of `2 * speed` is unknown, too, since the number may stand for seconds.
+    The unit of `2 * speed` is unknown too, since the number may have a unit.
 
     **Arguments:**
-    - `faults`: gets a sentence on each two units that are added, and on a sine of degrees.
+    - `faults`: a list that receives a sentence on each sum of two units, and on a sine of degrees.
     """
     match e:
         case Duration():

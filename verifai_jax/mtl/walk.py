@@ -26,13 +26,13 @@ Operands = list[tuple[Formula, int]]
 
 @dataclass(frozen=True)
 class Walk:
-    """Follows the operand that decides each minimum and maximum.
+    """A walk that follows the deciding operand of each minimum and maximum.
 
-    - `values_of(formula)`: its robustness at every sample, `[time]`, the last value for ever after.
+    - `values_of(formula)`: its robustness at every sample, `[time]`; the last value holds for ever.
     - `span(interval)`: the first and the last sample of an interval, relative to now.
     - `length`: number of samples of the trace.
-    - `end`: what comes after the last sample.
-    - `stride`: number of samples of one period.
+    - `end`: how the trace continues after the last sample.
+    - `stride`: number of samples in one period.
     """
 
     values_of: Callable[[Formula], Float[np.ndarray, " time"]]
@@ -58,7 +58,7 @@ class Walk:
         return (f, i) if f.is_predicate else None
 
     def operands(self, f: Formula, i: int) -> Operands:
-        """Return the operands at the instants that matter for `f` at `i`; none if vacuous."""
+        """Return the operands of `f` at the relevant instants, seen from `i`; none if vacuous."""
         match f:
             case ast.Not(p):
                 return [(p, i)]
@@ -81,7 +81,7 @@ class Walk:
         raise missing_case("the explanation", f)
 
     def deciding(self, f: Formula, i: int, operands: Operands) -> int | None:
-        """Return the number of the operand that has the value of `f`."""
+        """Return the index of the operand that has the value of `f`."""
         if not operands:
             return None
         values = [self.at(p, j) for p, j in operands]

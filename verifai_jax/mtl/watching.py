@@ -58,7 +58,7 @@ void ahead(const monitor *m, monitor *scratch, long n, int held, double leaf, do
 class CompiledMachine:
     """The machine of `python_machine` in machine code.
 
-    **Raises:** `Unavailable` where it cannot be compiled.
+    **Raises:** `Unavailable` if it cannot be compiled.
     """
 
     def __init__(self, plan: Plan, front: Margins) -> None:
@@ -86,12 +86,12 @@ class CompiledMachine:
         self._pointers = ctypes.byref(self._state), ctypes.byref(self.sample)
 
     def step(self, sample: Sequence[float]) -> None:
-        """Take in one sample."""
+        """Process one sample."""
         self.sample[:] = sample
         self._step(*self._pointers)
 
     def steps(self, rows: np.ndarray) -> np.ndarray:
-        """Take in samples `[time, columns]`, and return what came out `[time, formulas]`."""
+        """Process samples `[time, columns]`, and return the results `[time, formulas]`."""
         rows = np.ascontiguousarray(rows, float)
         out = np.empty((len(rows), len(self.out)))
         count, x, to = ctypes.c_long(len(rows)), rows.ctypes, out.ctypes
@@ -101,7 +101,7 @@ class CompiledMachine:
         return out
 
     def ahead(self, steps: int, leaf: float | None) -> np.ndarray:
-        """Return what further steps would give `[steps, formulas]`; the state stays."""
+        """Return the results `[steps, formulas]` of further steps without changing the state."""
         out = np.empty((steps, len(self.out)))
         value = ctypes.c_double(0.0 if leaf is None else leaf)
         to = ctypes.c_void_p(out.ctypes.data)
@@ -111,10 +111,10 @@ class CompiledMachine:
 
 
 class Watch(Generic[R]):
-    """A monitor of formulas that share what they have in common; made by `watch`.
+    """A monitor of formulas that compute common parts once; made by `watch`.
 
-    - `delays`: samples by which the value of each formula is late, with `every`.
-    - `compiled`: whether the machine's compiler made the step.
+    - `delays`: number of samples by which the value of each formula is late, with `every`.
+    - `compiled`: whether the step was compiled by the machine's C compiler.
     """
 
     def __init__(self, plan: Plan, front: Margins, result: Callable[[Numbers], R]) -> None:
@@ -132,12 +132,12 @@ class Watch(Generic[R]):
         self._step, self._out = self._machine.step, self._machine.out
 
     def step(self, sample: Mapping[str, Any]) -> R:
-        """Take in one more sample, numbers (or vectors `[k]`) by signal name.
+        """Process one more sample: numbers (or vectors `[k]`) by signal name.
 
-        **Returns:** the robustness at time 0 if all stayed as it is now, or with `every` that at
-        the newest instant that is decided, `delays` samples ago; NaN until the first one is
-        decided.
-        **Raises:** `UnknownNameError` for a signal that the sample lacks.
+        **Returns:** the robustness at time 0 if all signals kept their present values. With
+        `every`, the robustness at the newest decided instant, `delays` samples ago; NaN until there
+        is one.
+        **Raises:** `UnknownNameError` for a signal that the sample does not contain.
         """
         try:
             numbers = self._read(sample)
@@ -150,11 +150,12 @@ class Watch(Generic[R]):
         return self._result(self._out)
 
     def steps(self, signals: Mapping[str, Any]) -> Float[np.ndarray, "time *formulas"]:
-        """Take in many samples, `[time]` (or `[time, k]`) by signal name.
+        """Process many samples, `[time]` (or `[time, k]`) by signal name.
 
-        **Returns:** what `step` would, sample by sample; a column a formula if there are several.
-        **Raises:** `UnknownNameError` for a signal that is missing; `ValueError` for signals of
-        several lengths.
+        **Returns:** the results of `step` for each sample; a column for each formula if there are
+        several.
+        **Raises:** `UnknownNameError` for a missing signal; `ValueError` for signals of different
+        lengths.
         """
         arrays: dict[str, np.ndarray] = {}
         for name, _ in self._columns:
@@ -174,24 +175,25 @@ class Watch(Generic[R]):
         return self._columns_of(out)
 
     def interval(self) -> tuple[R, R]:
-        """Return the lowest and the greatest robustness that further samples allow.
+        """Return the minimum and maximum robustness that further samples allow.
 
-        It is that at time 0, or with `every` at the latest sample.
+        It is the robustness at time 0, or with `every` at the latest sample.
         """
         low, high = (self._end_with(value) for value in (-self._top, self._top))
         return self._result(low), self._result(high)
 
     def finish(self) -> R:
-        """Return the robustness if this was the last sample, and is held: the offline value.
+        """Return the robustness if this was the last sample, which is held, as computed offline.
 
-        It is that at time 0, or with `every` at the last sample. NaN before the first sample.
+        It is the robustness at time 0, or with `every` at the last sample. NaN before the first
+        sample.
         """
         return self._result(self._end_with(None))
 
     def rest(self) -> Float[np.ndarray, "time *formulas"]:
-        """Return the values that are still to come if this was the last sample, with `every`.
+        """Return the remaining values if this was the last sample, with `every`.
 
-        After those that `steps` returned they complete the robustness at every sample.
+        Together with the results of `steps` they are the robustness at every sample.
         """
         return self._columns_of(self._machine.ahead(max(self.delays), None))
 
@@ -245,20 +247,19 @@ def watch(
     every: bool = False,
     sizes: Mapping[str, int] | None = None,
 ) -> "Watch[float] | Watch[dict[str, float]]":
-    """Follow one formula, or several by name, on samples `dt` seconds apart.
+    """Monitor one formula, or several by name, on samples `dt` seconds apart.
 
     Values are those of `robustness` in double precision, bit for bit, except for the last digit of
     `sin`, `cos`, `exp` and powers.
 
     **Arguments:**
-    - `semantics`: `hard`, or `boolean`, by which the value is 1 where a formula holds and -1 where
-      it does not.
-    - `every`: whether each formula is asked at every instant, or at time 0. With it no formula may
-      look ahead without end.
-    - `sizes`: number of components of each signal whose norm the formulas take.
+    - `semantics`: `hard`, or `boolean`: 1 if a formula holds and -1 if not.
+    - `every`: whether each formula is evaluated at every instant, not only at time 0. No formula
+      may then look ahead without bound.
+    - `sizes`: number of components of each signal whose norm the formulas use.
     **Returns:** a monitor; its results are numbers, or dictionaries for several formulas.
     **Raises:** `IntervalError` for an interval that is not a multiple of `dt`; `ValueError` for
-    smooth semantics, for what looks ahead without end within another temporal operator, and for a
+    smooth semantics, for an unbounded future operator inside another temporal operator, and for a
     norm without a size.
     """
     plan = streams(formulas, dt, semantics, every)

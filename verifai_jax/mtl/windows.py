@@ -29,7 +29,7 @@ def _form() -> ModuleType:
 def extreme(
     x: Float[Array, "time *lanes"], sign: int = 1, tau: Tau = None
 ) -> Float[Array, " *lanes"]:
-    """Compute the greatest value along time (least, for sign -1); smooth at a temperature `tau`."""
+    """Compute the maximum (minimum, for sign -1) along time; smooth at a temperature `tau`."""
     m = jnp.max(x, axis=0) if sign > 0 else jnp.min(x, axis=0)
     if tau is None or x.shape[0] == 1:
         return m
@@ -38,7 +38,7 @@ def extreme(
 
 
 def join(values: list[Array], sign: int = 1, tau: Tau = None) -> Array:
-    """Compute the greatest of several arrays (the least, for sign -1), element by element."""
+    """Compute the maximum (minimum, for sign -1) of several arrays, element by element."""
     m = values[0]
     for value in values[1:]:
         m = jnp.maximum(m, value) if sign > 0 else jnp.minimum(m, value)
@@ -57,9 +57,10 @@ def windowed(
     reverse: bool = True,
     form: ModuleType | None = None,
 ) -> Float[Array, "time *lanes"]:
-    """Compute the maximum of `n` samples that begin at each instant; end there, if not `reverse`.
+    """Compute the maximum over `n` samples from each instant on, or, if not `reverse`, up to it.
 
-    The minimum, for sign -1. Windows are cut at the ends of the array. Time `O(time)` on a CPU.
+    For sign -1 it is the minimum. Windows are cut at the ends of the array. Time `O(time)` on a
+    CPU.
 
     Source: M. van Herk, Pattern Recognition Letters 13 (1992); J. Gil, M. Werman, IEEE PAMI 15
     (1993).
@@ -82,7 +83,7 @@ def until(
 ) -> Float[Array, "time *lanes"]:
     """Compute `u[t] = max(g[t], min(f[t], u[t+1]))`, and `u = g` at the last sample.
 
-    Backwards, if not `reverse`: `u[t] = max(g[t], min(f[t], u[t-1]))`, which is since.
+    If not `reverse`, backwards: `u[t] = max(g[t], min(f[t], u[t-1]))`, which is since.
     """
     form = form or _form()
     if g.shape[0] == 1:

@@ -26,7 +26,7 @@ ANGLES = {"deg": math.pi / 180, "rad": 1.0}
 
 
 class Comparison(NamedTuple):
-    """A comparison of two expressions in LaTeX and in English, and the one that is its negation."""
+    """A comparison of two expressions in LaTeX and in English, and that which negates it."""
 
     latex: str
     english: str
@@ -46,16 +46,16 @@ COMPARISONS = {
 
 @dataclass(frozen=True)
 class Operator:
-    """The description of an operator; its meaning is that of its node in `formula`.
+    """The description of an operator; its node in `formula` defines its meaning.
 
-    - `words`: the words and symbols that are read as it, the one that names it first.
+    - `words`: the words and symbols that are read as this operator; the first is its name.
     - `latex`: symbol in LaTeX.
     - `english`: sentence, with `{0}` and `{1}` for the operands and `{when}` for the interval.
-    - `operands`: 1 for an operator in front of its operand, 2 for one between its operands.
-    - `side`: where it looks from an instant on, or nothing for a Boolean connective.
+    - `operands`: 1 for a prefix operator, 2 for an infix operator.
+    - `side`: the direction in which it looks; empty for a Boolean connective.
     - `timed`: whether it takes an interval.
-    - `symbol`: what is printed instead of the first word.
-    - `dual`: the operator to which a negation turns it when it moves inwards: `!always f` is
+    - `symbol`: the symbol printed instead of the first word.
+    - `dual`: the operator that replaces it when a negation moves inwards: `!always f` is
       `eventually !f`; empty without a dual node.
     """
 
@@ -70,7 +70,7 @@ class Operator:
 
     @property
     def word(self) -> str:
-        """The word that names it."""
+        """The word that is its name."""
         return self.words[0]
 
 
@@ -154,27 +154,26 @@ RESERVED = frozenset(w for words in WORDS.values() for w in words if NAME.fullma
 class Text(NamedTuple):
     """The text of a formula.
 
-    - `text`: without parentheses around it.
-    - `kind`: what it is within another operator: a `name` or constant, another `leaf`, a
-      `negation`, another operator in front of its one operand (`prefix`), or one between operands
-      (`infix`).
+    - `text`: the text without outer parentheses.
+    - `kind`: the kind of the text, which decides on parentheses: a `name` or constant, another
+      `leaf`, a `negation`, another `prefix` operator, or an `infix` operator.
     """
 
     text: str
     kind: Literal["name", "leaf", "negation", "prefix", "infix"]
 
     def wrapped(self) -> str:
-        """Return the text in parentheses, which a name does without."""
+        """Return the text in parentheses, except for a name."""
         return self.text if self.kind == "name" else f"({self.text})"
 
 
 def number_text(value: float) -> str:
-    """Return the shortest text that reads back as the same float; `inf` for infinity."""
+    """Return the shortest text that parses to the same float; `inf` for infinity."""
     return str(int(value)) if abs(value) < 1e16 and value == int(value) else repr(value)
 
 
 def name_text(name: str) -> str:
-    """Return a signal's name, quoted where the grammar would not take it bare."""
+    """Return a signal's name, quoted if the grammar requires it."""
     taken = name in RESERVED or name in FUNCTIONS or name in NUMBERS
     bare = NAME.fullmatch(name) and not taken
     return name if bare else f'"{name}"'

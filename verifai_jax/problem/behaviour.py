@@ -25,7 +25,7 @@ MAX_CELLS = 512
 
 @dataclass(frozen=True)
 class Axis:
-    """A signal cut into `cells` equally wide cells from `low` to `high`; the outer ones go on."""
+    """A signal cut into `cells` cells of equal width; the end cells are unbounded."""
 
     name: str
     low: float
@@ -43,14 +43,14 @@ class Axis:
 
 @dataclass(frozen=True, init=False)
 class Behaviour:
-    """Numbers of what a trace shows.
+    """A classification of traces by the cells they visit and the clauses nearest to breaking.
 
     **Arguments:**
-    - `cells`: signal -> `(low, high, cells)`: it is cut into so many equally wide cells. The cells
-      of all signals together that a trace visits are what it shows.
-    - `formulas`: the formulas of which the clause nearest to breaking is shown too; none when left
-      out.
-    **Raises:** `ValueError` for a signal without a range, or too many cells together.
+    - `cells`: signal -> `(low, high, cells)`: the range and the number of equally wide cells of the
+      signal. A cell of the behaviour is one combination of cells of all these signals.
+    - `formulas`: the formulas whose clause nearest to breaking also counts; none when left out.
+    **Raises:** `ValueError` for a signal without a range, or if the cells of all signals are too
+    many.
     """
 
     axes: tuple[Axis, ...]
@@ -91,17 +91,17 @@ class Behaviour:
 
     @property
     def size(self) -> int:
-        """Number of coverage ids of a trace."""
+        """Number of coverage ids that one trace has."""
         return self.cells + bool(self.formulas)
 
     @property
     def total(self) -> int:
-        """Number of different coverage_ids: cells first, then clauses."""
+        """Number of all possible coverage ids: cells first, then clauses."""
         goals = self.goals
         return self.cells + (0 if goals is None else len(goals.goals))
 
     def cell_name(self, number: int) -> str:
-        """Return a cell in words, such as `mode 2 to 3, speed 10 to 20`."""
+        """Describe a cell, for example `mode 2 to 3, speed 10 to 20`."""
         parts = []
         for axis in reversed(self.axes):
             number, cell = divmod(number, axis.cells)

@@ -35,10 +35,10 @@ from verifai_jax.problem.problem import Problem
 
 
 class Slopes(NamedTuple):
-    """The derivative of a robustness by the features, as far as it is known without simulating.
+    """The derivative of a robustness with respect to the features, as far as tracing shows it.
 
-    - `depends`: whether it can be anything but zero.
-    - `lacking`: the steps on its way that have no derivative, for people; often none.
+    - `depends`: whether the derivative can be different from zero.
+    - `lacking`: descriptions of the steps that have no derivative; often none.
     """
 
     depends: bool
@@ -59,9 +59,9 @@ def has_gradient(problem: Problem) -> bool:
 
 
 def without_derivative(problem: Problem) -> str | None:
-    """Return which steps from the features to the robustness have no derivative; traced once.
+    """Return the steps from the features to the robustness that have no derivative; traced once.
 
-    None if all have one, and for a black box, which JAX does not trace.
+    None if every step has one, and for a black box, which JAX does not trace.
     """
     lacking = () if problem.black_box else _slopes(problem).lacking
     return " and ".join(lacking) if lacking else None
@@ -74,9 +74,9 @@ def _slopes(problem: Problem) -> Slopes:
 def depends_on_key(problem: Problem) -> bool:
     """Return whether the verdict of a simulation depends on its random key; traced once.
 
-    A key that is split, or from which numbers are drawn that nothing monitored uses, decides
-    nothing. A black box says whether it is given a seed, and one that is counts as one that draws:
-    no number of simulations could show that it does not.
+    Splitting a key, or drawing numbers that no monitored signal uses, does not count. A black box
+    that is given a seed counts as one that draws: no number of simulations could show that it does
+    not.
     """
     return problem.programs.get(KEY, None, lambda: _uses_key(problem))
 

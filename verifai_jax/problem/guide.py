@@ -34,16 +34,17 @@ class Guide:
 
     The search receives `(1 - weight) * robustness + weight * t` of a simulation that keeps the
     property, where `t = (1 + g / (abs(g) + scale)) / 2` lies between 0 and 1 and rises with the
-    term's value `g`; so it never takes a safe simulation for a failure. Of one that breaks the
-    property it receives the robustness.
+    term's value `g`; so a safe simulation never looks like a failure. For a simulation that breaks
+    the property it receives the robustness.
 
     **Arguments:**
-    - `term`: a formula or its text, whose robustness is used, or a function of the trace and
-      the features, pure and traceable by JAX, also for a black box; less is nearer to a failure.
-    - `weight`: the weight of the term, above 0; with 1 the robustness of safe simulations says
-      nothing.
-    - `scale`: the size of values of the term that matters, in its unit.
-    **Raises:** `TypeError` for a term that is neither; `ValueError` for a formula that does not
+    - `term`: a formula or its text, whose robustness is the value of the term; or a pure function
+      of the trace and the features that JAX can trace, even if the system is a black box. Lower
+      values mean nearer to a failure.
+    - `weight`: the weight of the term, above 0; with 1 the search ignores the robustness of safe
+      simulations.
+    - `scale`: the size of differences of the term that matter, in its unit.
+    **Raises:** `TypeError` for a term of another type; `ValueError` for a formula that does not
     parse, or numbers out of range.
     """
 
@@ -72,7 +73,7 @@ class Guide:
     ) -> Float[Array, ""]:
         """Return the value of the term on one trace; traced by JAX.
 
-        **Raises:** what the formula does for a signal that does not exist; `TypeError` for a
+        **Raises:** the errors of the formula, such as that for an unknown signal; `TypeError` for a
         function that returns no number.
         """
         if isinstance(self.term, Formula):
@@ -85,7 +86,7 @@ class Guide:
         return value.astype(jnp.result_type(float))
 
     def share(self, value: Float[Array, "*n"]) -> Float[Array, "*n"]:
-        """Return what a value of the term adds, between 0 and 1; 1 where it is not a number."""
+        """Return the contribution of a value of the term, between 0 and 1; 1 for NaN."""
         part = value / (jnp.abs(value) + self.scale)
         # An infinite value is the end of what can be added.
         part = jnp.where(jnp.isinf(value), jnp.sign(value), part)
@@ -94,10 +95,10 @@ class Guide:
     def steer(
         self, observed: Float[np.ndarray, " n"], value: Float[np.ndarray, " n"]
     ) -> Float[np.ndarray, " n"]:
-        """Return what a search receives instead; failures, and rows without a verdict, as they are.
+        """Return the numbers that the search receives; failures and rows without a verdict stay.
 
         **Arguments:**
-        - `observed`: the robustness, or what a search receives otherwise.
+        - `observed`: the robustness, or the objective of the search.
         - `value`: the value of the term.
         """
         # In NumPy: of an array of JAX each first use of this kind compiles a program.

@@ -11,9 +11,9 @@ from verifai_jax.problem.problem import Problem
 def digest_of_model(problem: Problem) -> str:
     """Return a hash of the system, the features and the constraint of a problem.
 
-    It is taken from what JAX traces, so that other text in the same file leaves it as it is.
+    The hash is taken from the traced program, so other text in the same file does not change it.
 
-    **Returns:** hexadecimal digits; nothing for a black box, and where JAX cannot look into a part.
+    **Returns:** hexadecimal digits; empty for a black box, and where JAX cannot look into a part.
     """
     if problem.black_box:
         return ""

@@ -47,7 +47,7 @@ from verifai_jax.systems.base import System, as_system
 
 
 class ProblemError(ValueError):
-    """The parts of a problem do not fit together."""
+    """An error for parts of a problem that do not fit together."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,34 +55,34 @@ class Problem(InNotebook):
     """A feature space, a system and the properties it must keep, under a name.
 
     **Arguments:**
-    - `name`: how the command line and the report call it.
+    - `name`: the name on the command line and in reports.
     - `space`: a `FeatureSpace`, or a dictionary of domains.
     - `system`: any function `(features, key) -> Trace`, pure and traceable by JAX, or a `System`;
       stored as a `System`.
     - `spec`: a formula (text or `Formula`), or several by name; the overall robustness of a
       simulation is the least of them.
-    - `nominal`: features of an ordinary day; must lie in the space.
+    - `nominal`: the features of normal operation; must lie in the space.
     - `description`: one line for `verifai-jax list`.
     - `end`: what a formula sees after the end of a trace; `"hold"` repeats the last sample.
-    - `priority`: which of several formulas matter more: names in falling order, or pairs
-      `(higher, lower)` of a graph (`rulebook.Rulebook`). A search then looks for the gravest
-      counterexamples instead of the least robustness.
-    - `behaviour`: what a trace shows, as numbers of cells (`Behaviour`), for a search guided by
-      coverage.
-    - `guide`: a term in addition to the robustness that steers searches and decides nothing: a
-      formula, its text, a function of the trace and the features, or a `Guide` with its weight.
-    - `draw`: draws one instant for an animation: `(axes, trace, sample, features)`.
-    - `requirements`: what the formulas stand for: a file (`mtl.read_requirements`), or requirements
-      themselves; a formula belongs to the requirement whose identifier is its name. See
+    - `priority`: which of several formulas matter more: names in falling order, or pairs `(higher,
+      lower)` of a graph (`rulebook.Rulebook`). A search then looks for the gravest counterexamples,
+      not for the least robustness.
+    - `behaviour`: how traces are classified (`Behaviour`), for a search guided by coverage.
+    - `guide`: a term that steers searches in addition to the robustness and never decides a
+      verdict: a formula, its text, a function of the trace and the features, or a `Guide` with its
+      weight.
+    - `draw`: a function `(axes, trace, sample, features)` that draws one frame of an animation.
+    - `requirements`: the requirements that the formulas formalise: a file (`mtl.read_requirements`)
+      or requirement objects. A formula belongs to the requirement whose identifier is its name. See
       `trace_matrix`.
-    - `made_in`: the modules whose code makes the problem, for the record of its runs; those on the
-      stack when left out, and where a problem is made of another one, those of the other.
+    - `made_in`: the modules whose code defines the problem, recorded with its runs. By default the
+      modules on the call stack, or those of the problem from which this one was derived.
 
-    `formulas` holds the parsed spec by name; `rulebook` their order, None without a priority;
-    `programs` what has been compiled for this problem.
+    `formulas` holds the parsed spec by name; `rulebook` the order of the formulas, None without a
+    priority; `programs` the programs compiled for this problem.
 
     **Raises:** `ValueError` for an empty name or spec, a formula that does not parse, nominal
-    features outside the space, or a priority that names no formula or goes round in a circle.
+    features outside the space, or a priority that has a cycle or names no formula.
     """
 
     _internal = frozenset((
@@ -169,32 +169,32 @@ class Problem(InNotebook):
 
     @property
     def monitored(self) -> tuple[str, ...]:
-        """Names of the signals that the formulas speak of."""
+        """Names of the signals that the formulas use."""
         return tuple(dict.fromkeys(n for f in self.formulas.values() for n in f.signals()))
 
     @property
     def black_box(self) -> bool:
-        """True where the system runs on the host, and JAX cannot trace it."""
+        """True if the system runs on the host, where JAX cannot trace it."""
         return self.system.black_box
 
     def sources(self, first: int = 0) -> Sources:
-        """Return the files that make the problem, with their hashes, and versions.
+        """Return the files that define the problem, with hashes, and versions of libraries.
 
         **Arguments:**
-        - `first`: the row of a table from which on that holds.
+        - `first`: the first row of the table to which they apply.
         """
         return sources_of(self, made=self.made_in or (), first=first)
 
     def requirement_entries(self) -> dict[str, dict[str, str]]:
-        """Return what the requirements of the formulas say, by identifier, as plain data."""
+        """Return the content of the formulas' requirements, by identifier, as plain data."""
         return {each.id: each.entry() for each in self.requirements if each.id in self.formulas}
 
     @truncate_silently()
     def draws(self) -> bool:
         """Return whether the system uses its random key; abstract evaluation, nothing compiles.
 
-        JAX draws other numbers in float64 than in float32, so a replay of such a system is only
-        the same simulation in the precision of its run. A black box gets an integer seed.
+        JAX draws different numbers in float64 than in float32, so a replay of such a system is the
+        same simulation only in the precision of its run. A black box gets an integer seed.
         """
         if self.black_box:
             return False
@@ -209,11 +209,11 @@ class Problem(InNotebook):
         return {**self.__dict__, "programs": ProgramCache()}
 
     def on_backend(self, backend: str) -> "Problem":
-        """Return the same problem on one backend of its system, made once.
+        """Return the same problem on one backend of its system; repeated calls return one object.
 
-        A problem whose system has no backends, or is on this one already, is itself.
+        Returns this problem if its system has no backends, or uses this one already.
 
-        **Raises:** what the system's `with_backend` does, for one that it lacks.
+        **Raises:** the error of the system's `with_backend` for a backend that it lacks.
         """
         system = self.system
         if not system.backends or system.backend == backend:
@@ -223,11 +223,11 @@ class Problem(InNotebook):
         )
 
     def only(self, *features: str, nominal: Mapping[str, Any] | None = None) -> "Problem":
-        """Return the same problem with these features varied alone, others at nominal values.
+        """Return the same problem with only these features varied, the others at nominal values.
 
-        - `nominal`: values to fix the others at, where they differ from the problem's own.
+        - `nominal`: values for the fixed features, where they differ from the problem's own.
 
-        **Raises:** `ValueError` for an unknown feature, or one to be fixed without a nominal value.
+        **Raises:** `ValueError` for an unknown feature, or a fixed one without a nominal value.
         """
         fixed = {**(self.nominal or {}), **(nominal or {})}
         own = None if self.nominal is None else fixed
@@ -237,14 +237,14 @@ class Problem(InNotebook):
         """Return the same problem with faults of its sensors and actuators among its features.
 
         **Arguments:**
-        - `faults`: the faults of `vj.faults`, in the order in which those of one channel apply.
-          The numbers of a fault that vary are a feature with the name of the fault; its nominal
-          value is the weakest, shortest and latest fault.
-        - `by_simulator`: whether the simulator applies them itself, as `vj.faults.on_host` helps
-          it to; for `remote`, and for a `blackbox` of one's own.
+        - `faults`: the faults of `vj.faults`; those of one channel apply in this order. The varying
+          numbers of a fault become a feature with the fault's name, whose nominal value is the
+          weakest, shortest and latest fault.
+        - `by_simulator`: whether the simulator applies the faults itself, for which
+          `vj.faults.on_host` helps; for `remote`, and for your own `blackbox`.
         **Raises:** `UnknownNameError` for a channel that the system does not have, with the nearest
-        one; `ValueError` for a name that exists already, a fault that a channel cannot have, and
-        a system whose loop is not known.
+        one; `ValueError` for a name that exists already, a fault that a channel cannot have, and a
+        system whose loop is not known.
         """
         function = lazy_import("verifai_jax.faults.injection", "with_faults")
         return function(self, faults, by_simulator)
@@ -263,30 +263,30 @@ class Problem(InNotebook):
 
         **Arguments:**
         - `semantics`: `mtl.hard`, the margin of the verdict, or `mtl.smooth(temperature)`.
-        - `of`: what it is a function of: `"unit"`, a point `[dim]` of the unit cube, or
+        - `of`: the argument of the function: `"unit"`, a point `[dim]` of the unit cube, or
           `"features"`, a dictionary by name.
         - `key`: random key of the simulation; `jax.random.key(0)` when left out.
-        - `formula`: name of the one formula to evaluate; the least over all when left out.
+        - `formula`: name of the one formula to evaluate; the least robustness over all when left
+          out.
         **Returns:** a function `(point, key=key)` to a scalar: positive where the property holds,
-        NaN where the simulation has no verdict. Whether a point lies in its domains, and keeps the
-        constraint of the space, is not checked.
+        NaN where the simulation has no verdict. It does not check that a point lies in its domains
+        and keeps the constraint of the space.
         **Raises:** `ProblemError` for a system that JAX does not trace; `UnknownNameError` for an
-        `of` or a formula that does not exist; what `check` raises.
+        `of` or a formula that does not exist; the errors of `check`.
         """
         function = lazy_import("verifai_jax.evaluation.objective", "objective")
         return function(self, semantics, of, key, formula)
 
     @truncate_silently()
     def check(self) -> None:
-        """Trace the system and its monitor abstractly: no simulation, nothing compiles.
+        """Trace the system and its monitor abstractly; nothing is simulated or compiled.
 
-        A system may have its own say: `check(features)`, with features as `jax.ShapeDtypeStruct`s,
-        and `abstract(features)`, the form of its traces, for one that JAX does not trace or not
-        quickly.
+        A system may define its own `check(features)`, with features as `jax.ShapeDtypeStruct`s, and
+        `abstract(features)`, which returns the shapes of its traces if JAX cannot trace it quickly.
 
-        **Raises:** what the system's own check does; `ProblemError` for a system that raises or
-        returns no `Trace`; what the monitor says for a formula over a signal that the system does
-        not produce.
+        **Raises:** the errors of the system's own check; `ProblemError` for a system that raises or
+        returns no `Trace`; the monitor's error for a formula over a signal that the system does not
+        produce.
         """
         features = self.space.feature_form
         try:
@@ -318,9 +318,9 @@ class Problem(InNotebook):
                 jax.eval_shape(lambda t, f=leaf: robustness(f, t), Trace(forms, dt=1.0))
 
     def form(self) -> Trace | None:
-        """Return the form of the system's traces, signals as `jax.ShapeDtypeStruct`; traced once.
+        """Return the shapes of the system's traces, signals as `jax.ShapeDtypeStruct`; traced once.
 
-        None if nothing but a simulation can tell.
+        None if only a simulation can show them.
 
         **Raises:** `ProblemError` for a system that raises, or returns no `Trace`.
         """
@@ -328,7 +328,7 @@ class Problem(InNotebook):
 
     @property
     def duration(self) -> float | None:
-        """Seconds of a whole trace; None if nothing but a simulation can tell."""
+        """Duration of a whole trace in seconds; None if only a simulation can show it."""
         form = self.form()
         return None if form is None or form.dt is None else (form.length - 1) * form.dt
 

@@ -29,13 +29,13 @@ MAX_RULES = 30
 
 @dataclass(frozen=True)
 class Rulebook:
-    """Rules by name, and pairs `(higher, lower)`: the first matters more.
+    """Rules by name, with pairs `(higher, lower)` of which the first matters more.
 
-    `order` lists the rules so that each comes after all that matter more: topologically, in the
-    order of `names` where the edges leave it open.
+    `order` lists each rule after all those that matter more: a topological order, which follows
+    `names` where the edges leave it open.
 
-    **Raises:** `ValueError` for a name that is not a rule, edges that go round in a circle, or more
-    than `MAX_RULES` rules.
+    **Raises:** `ValueError` for a name that is not a rule, edges with a cycle, or more than
+    `MAX_RULES` rules.
     """
 
     names: tuple[str, ...]
@@ -58,9 +58,9 @@ class Rulebook:
     def graver(self, one: Violation, other: Violation) -> bool:
         """Return whether `one` is a graver counterexample than `other`.
 
-        Each says by how much every rule is broken, in the order of `names`: a number that is 0
-        where the rule is kept, or a truth value. One is graver if they differ and wherever the
-        other breaks a rule by more, `one` breaks a rule above it by more.
+        Both arguments list how far each rule is broken, in the order of `names`: a number that is 0
+        where the rule is kept, or a truth value. `one` is graver if they differ and, for each rule
+        that `other` breaks more, `one` breaks a higher rule more.
         """
         first, second = np.asarray(one, np.float64), np.asarray(other, np.float64)
         return bool(self._outdone(second[None], first[None])[0, 0])
@@ -68,9 +68,10 @@ class Rulebook:
     def front(
         self, violations: Shaped[np.ndarray, "n k"] | Sequence[Sequence[float]]
     ) -> Bool[np.ndarray, " n"]:
-        """Mark the rows that no other row outdoes: the Pareto set of counterexamples.
+        """Mark the rows that no other row dominates: the Pareto set of counterexamples.
 
-        Equal rows are all in it or all not. Rows that break nothing are in it only if all do.
+        Equal rows are marked together. Rows that break nothing are marked only if no row breaks a
+        rule.
         """
         broken = np.asarray(violations, np.float64).reshape(-1, len(self.names))
         unique, index = np.unique(broken, axis=0, return_inverse=True)
@@ -84,9 +85,10 @@ class Rulebook:
     def grade(
         self, violated: Bool[np.ndarray, "n k"] | Float[np.ndarray, "n k"]
     ) -> Float[np.ndarray, " n"]:
-        """Return one number for what is broken: larger for a graver row, equal for equal rows.
+        """Return a number for each row: larger for graver rows, equal for equal rows.
 
-        A linear extension of the order: of two rows that cannot be compared one is larger too.
+        This extends the partial order to a linear one, so rows that cannot be compared are ordered
+        too.
         """
         indices = [self.names.index(name) for name in self.order]
         weights = 2.0 ** np.arange(len(indices) - 1, -1, -1)
@@ -135,10 +137,10 @@ class Rulebook:
 class Objective:
     """The objective of a search over several rules, in one number.
 
-    Positive for what is less grave than the gravest counterexample so far, negative for what is
-    as grave: as soon as an important rule is broken, breaking lesser ones is no success any more.
-    Within one grade the margins of the rules decide, weighed in the same order. `state` is all
-    that it remembers; keep it to resume later.
+    Positive for rows that are less grave than the gravest counterexample so far, negative for rows
+    that are as grave: once an important rule is broken, breaking a lesser one alone is no success.
+    Within one grade the weighted margins of the rules decide. `state` holds its whole memory; keep
+    it to resume later.
     """
 
     def __init__(self, rulebook: Rulebook) -> None:

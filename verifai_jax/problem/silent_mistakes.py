@@ -43,9 +43,9 @@ Program: TypeAlias = Any
 
 
 def silent_mistakes(problem: Problem) -> tuple[str, ...]:
-    """Return a sentence for each mistake of a problem that no error tells; found once.
+    """Return a sentence for each likely mistake in a problem that raises no error; cached.
 
-    **Raises:** what tracing the system raises.
+    **Raises:** the errors of tracing the system.
     """
 
     def found() -> tuple[str, ...]:
@@ -55,9 +55,9 @@ def silent_mistakes(problem: Problem) -> tuple[str, ...]:
 
 
 def beyond_the_trace(problem: Problem) -> Iterator[str]:
-    """Yield the formulas that look beyond the end of a whole trace even at its first instant.
+    """Yield the formulas that look beyond the end of a whole trace already at its first instant.
 
-    What they ask at later instants may well lie after the end: windows that slide do so.
+    Evaluated at later instants many formulas look beyond the end: sliding windows do.
     """
     form, duration = problem.form(), problem.duration
     if form is None or form.dt is None or duration is None or problem.end not in END_OF_TRACE:
@@ -75,7 +75,7 @@ def beyond_the_trace(problem: Problem) -> Iterator[str]:
 
 
 def mistakes_of_the_system(problem: Problem) -> Iterator[str]:
-    """Yield what two tracings of the system show; nothing for one that is not quick to trace."""
+    """Yield the mistakes that two tracings of the system show; none if it is slow to trace."""
     if problem.black_box or not traced_by_default(problem.system):
         return
     features = problem.space.feature_form
@@ -99,7 +99,7 @@ def mistakes_of_the_system(problem: Problem) -> Iterator[str]:
 
 
 def traced_by_default(system: System) -> bool:
-    """Return whether JAX traces the system itself to know the form of its traces."""
+    """Return whether the shapes of the system's traces come from tracing it with JAX."""
     function = getattr(system, "function", None)
     return type(system).abstract is System.abstract or (
         function is not None and not callable(getattr(function, "abstract", None))
@@ -107,7 +107,7 @@ def traced_by_default(system: System) -> bool:
 
 
 def is_quick(problem: Problem) -> bool:
-    """Return whether a system was quick to trace, so that it is likely quick to simulate."""
+    """Return whether a system was quick to trace, and so is likely quick to simulate."""
     seconds = problem.programs.peek(SECONDS, None)
     return seconds is not None and seconds <= PATIENCE
 
@@ -171,9 +171,9 @@ def _order(problem: Problem) -> Iterator[tuple[str, ...]]:
 
 
 def difference(one: Program, other: Program) -> tuple[bool, str | None]:
-    """Return whether two programs compute with other numbers, and the line of it where known.
+    """Return whether two programs use different constants, and the source line where known.
 
-    Operations, the constants among their operands, and plain parameters are compared.
+    Compares operations, constants among their operands, and plain parameters.
     """
     # From JAX 0.12 on both are one class; before, a program inside an operation has no constants.
     constants, others = (getattr(each, "consts", ()) for each in (one, other))
@@ -212,7 +212,7 @@ def _same_operands(one: JaxprEqn, other: JaxprEqn) -> bool:
 
 
 def programs_read(parameters: dict[str, Any]) -> Iterator[Program]:
-    """Yield the programs inside an operation, such as the body of a loop."""
+    """Yield the programs nested in an operation, such as the body of a loop."""
     for value in parameters.values():
         for part in value if isinstance(value, tuple | list) else (value,):
             if isinstance(part, (Jaxpr, PROGRAM)):

@@ -69,7 +69,7 @@ _WRAPPERS = {"diverse": "Diverse", "likeliest": "Likeliest", "suggested": "Sugge
 
 
 def names() -> tuple[str, ...]:
-    """Return the names that `named` knows."""
+    """Return the names of all searches that `named` can build."""
     return tuple(_SEARCHES)
 
 
@@ -89,12 +89,12 @@ def named(name: str, **options: Any) -> "Search":
 
 
 def split(parts: "Mapping[str, str | Search]", rest: "str | Search" = "uniform") -> "Split":
-    """Build a search that has one for each part of the space; see `Split`.
+    """Build a search with a separate search for each part of the space; see `Split`.
 
     **Arguments:**
-    - `parts`: feature name -> search, or the name of one.
+    - `parts`: feature name -> search, or the name of a search.
     - `rest`: the search of all other features.
-    **Raises:** as `named` and `Split`.
+    **Raises:** the errors of `named` and `Split`.
     """
     from verifai_jax.search._split import Split
 
@@ -135,7 +135,7 @@ def to_json(search: "Search") -> dict[str, Any] | None:
 def from_json(data: Mapping[str, Any]) -> "Search":
     """Build the search that `to_json` described.
 
-    **Raises:** `ValueError` as `named`, and for data that describes no search.
+    **Raises:** the errors of `named`; `ValueError` for data that describes no search.
     """
     if "split" in data:
         from verifai_jax.search._split import Split

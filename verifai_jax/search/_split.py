@@ -24,16 +24,16 @@ from verifai_jax.search.base import Asked, Observations, Plan, Search, Wants
 
 @dataclass(frozen=True, init=False)
 class Split(Search[tuple[PyTree, ...]]):
-    """A search for each part of the space, and one for the rest.
+    """A separate search for each part of the space, and one for the rest.
 
     **Arguments:**
     - `parts`: feature name -> search; `"cars"` means all of `cars[0].x`, `cars[0].v`, ...; several
       names for one search are written `"x0, v0"`.
     - `rest`: the search of all other features.
 
-    A composition ends when its first finite part (a grid) does, samples the prior if all parts do,
-    and takes the temperature of its first part that wants gradients, the plan of its first part
-    that has one.
+    The composition ends when its first finite part (a grid) ends, and samples the prior if all
+    parts do. The first part that wants gradients sets the temperature, the first one that plans its
+    rounds sets the plan.
 
     **Raises:** `ValueError` for no parts; `TypeError` for a part that is not a search. `check`
     raises `ValueError` for a name that is not a feature, a feature in two parts, or a part that
@@ -55,7 +55,7 @@ class Split(Search[tuple[PyTree, ...]]):
 
     @property
     def searches(self) -> tuple[Search, ...]:
-        """The searches, one a part, that of the rest last."""
+        """The searches of the parts, with that of the rest last."""
         return (*(search for _, search in self.parts), self.rest)
 
     @property
@@ -66,7 +66,7 @@ class Split(Search[tuple[PyTree, ...]]):
 
     @property
     def fallback(self) -> "Split | None":
-        """The same with the fallback of each part that follows derivatives."""
+        """The same composition with the fallback of each part that follows derivatives."""
         parts = [each.fallback if each.wants.derivatives else each for each in self.searches]
         known = [each for each in parts if each is not None]
         if not self.wants.derivatives or len(known) < len(parts):

@@ -56,15 +56,15 @@ class AnnealingState(NamedTuple):
 
 @dataclass(frozen=True)
 class Annealing(Search[AnnealingState]):
-    """Parallel tempering; each row of the batch is a chain at a temperature of its own.
+    """Parallel tempering; each row of the batch is a chain at its own temperature.
 
     **Arguments:**
-    - `chains`: minimum number of chains; more than the batch has rows take turns.
-    - `hottest`, `coldest`: temperatures, geometric in between, in units of the robustness' spread
-      (from the best to the median) where the chains start.
-    - `exploration`: share of chains that draw from the prior, for ever; at least one.
-    - `patience`: proposals in a row that a chain may refuse before it starts again elsewhere.
-    **Raises:** `ValueError` for values out of range, `coldest` above `hottest` included.
+    - `chains`: minimum number of chains; if there are more than rows in a batch, they take turns.
+    - `hottest`, `coldest`: the extreme temperatures, geometric in between, in units of the spread
+      of the robustness at the start (from the best to the median).
+    - `exploration`: share of chains that always draw from the prior; at least one chain.
+    - `patience`: number of consecutive proposals a chain may refuse before it restarts elsewhere.
+    **Raises:** `ValueError` for values out of range, or `coldest` above `hottest`.
     """
 
     chains: int = 8
@@ -156,7 +156,7 @@ class Annealing(Search[AnnealingState]):
     def warm_start(
         self, state: AnnealingState, cube: Cube, observations: Observations
     ) -> AnnealingState:
-        """Put the chains at the best points, the best at the coldest."""
+        """Set the chains to the best points, the coldest chain to the best one."""
         new = observations.score
         u, energy = keep_best(observations.u, new, state.u, state.energy)
         spread = jnp.where(state.spread == 0, best_to_median(new), state.spread)
@@ -198,7 +198,7 @@ class Annealing(Search[AnnealingState]):
 
 
 def best_to_median(energy: Float[Array, " n"]) -> Float[Array, ""]:
-    """Return the spread of the finite entries, which a few large ones do not change."""
+    """Return the spread of the finite entries in a way that a few large ones do not affect."""
     known = jnp.sum(jnp.isfinite(energy))
     ranked = jnp.sort(energy)
     return jnp.where(known > 0, ranked[jnp.maximum(known - 1, 0) // 2] - ranked[0], 0.0)
@@ -211,7 +211,7 @@ def reflect(u: Float[Array, "n d"]) -> Float[Array, "n d"]:
 
 
 def partners_of(chains: int) -> Int[np.ndarray, "matchings chains"]:
-    """Return partners for exchanges; distances halve, so that a point can get anywhere at once."""
+    """Return partners for exchanges; distances halve, so a point can quickly reach any chain."""
     index = np.arange(chains, dtype=np.int32)
     matchings = []
     for distance in (1 << i for i in reversed(range((chains - 1).bit_length()))):
@@ -227,7 +227,7 @@ def exchange(
     coldness: Float[Array, " chains"],
     chance: Float[Array, "matchings chains"],
 ) -> Int[Array, " chains"]:
-    """Return the chain from which each chain takes its point; hot ones get the missing points."""
+    """Return for each chain the chain whose point it takes; hot ones get the remaining points."""
     index = jnp.arange(len(energy), dtype=jnp.int32)
 
     def exchange(

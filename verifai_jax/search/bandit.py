@@ -46,17 +46,17 @@ class BanditState(NamedTuple):
 
 @dataclass(frozen=True)
 class Bandit(Search[BanditState]):
-    """Upper confidence bounds over buckets of each coordinate, and buckets of those buckets.
+    """Upper confidence bounds over buckets of each coordinate, which are split recursively.
 
-    Ordered cells of discrete coordinates are grouped into buckets; unordered ones are an arm each.
+    Ordered cells of discrete coordinates are grouped into buckets; each unordered one is an arm.
 
     **Arguments:**
-    - `buckets`: how many a coordinate has, and each bucket again.
-    - `depth`: how often buckets are split, the first time included.
-    - `optimism`: factor on the bonus; the larger, the more even the draws.
-    - `best`: share of the remembered points that gets rewards.
-    - `window`: how many points are remembered; at least two batches.
-    - `exploration`: share of points drawn from the prior, for ever.
+    - `buckets`: number of buckets of a coordinate, and of parts into which a bucket is split.
+    - `depth`: number of levels of buckets.
+    - `optimism`: factor on the bonus; larger values make the draws more even.
+    - `best`: share of the remembered points that get rewards.
+    - `window`: number of points that are remembered; at least two batches.
+    - `exploration`: share of points that are always drawn from the prior.
     **Raises:** `ValueError` for values out of range, and for more than 10 000 buckets in all.
     """
 
@@ -186,10 +186,10 @@ def fill_cells(
     budget: Float[Array, "*nodes 1"],
     bonus: Float[Array, "*nodes 1"],
 ) -> Float[Array, "*nodes arms"]:
-    """Share `budget` draws, which go one by one to the arm with the highest bound.
+    """Distribute `budget` draws one by one, each to the arm with the highest bound.
 
-    The bound of an arm after `n` more draws is `mean + sqrt(bonus / (count + n))`, so that it gets
-    `bonus / (level - mean)^2 - count` draws until its bound is down at `level`.
+    The bound of an arm after `n` more draws is `mean + sqrt(bonus / (count + n))`. So the arm gets
+    `bonus / (level - mean)^2 - count` draws until its bound has fallen to `level`.
     """
 
     def draws(level: Array) -> Array:
@@ -215,7 +215,7 @@ def draw_cells(
     edges: Float[np.ndarray, "d leaves+1"],
     even: Float[Array, "n d"],
 ) -> Float[Array, "n d"]:
-    """Return quantiles of the density, which is constant in each leaf."""
+    """Return quantiles of a density that is constant in each leaf."""
     limits = jnp.cumsum(density, axis=1)
     limits = limits / limits[:, -1:]
     find = jax.vmap(lambda limit, x: jnp.searchsorted(limit, x, side="right"), (0, 1), 1)

@@ -35,17 +35,17 @@ class Observations(NamedTuple):
     - `u`: the points, in the unit cube.
     - `rho`: robustness; negative is a failure.
     - `valid`: False for padding and for simulations without a verdict: such a row must not
-      influence the search, whatever its other entries are (NaN included).
+      influence the search, even if its other entries are NaN.
     - `gradient`: the gradient of the smooth robustness with respect to `u`.
-    - `clauses`: values of the clauses to violate together, without unit, all negative in a failure;
-      very low where there are fewer than `CLAUSES`.
+    - `clauses`: dimensionless values of the clauses, which are all negative in a failure; very low
+      values fill up to `CLAUSES`.
     - `clause_gradients`: their gradients with respect to `u`; zero in rounds whose plan does not
       differentiate.
-    - `outcomes`: what happened (`core.values.clauses`), NaN if unknown.
-    - `coverage_ids`: numbers of what each simulation covered, -1 for nothing; `coverage_ids //
-      KIND` is the kind of thing.
+    - `outcomes`: a description of what happened (`core.values.clauses`), NaN if unknown.
+    - `coverage_ids`: ids of the items that each simulation covered, -1 for none; `coverage_ids //
+      KIND` is the kind of item.
 
-    All after `valid` are None for a search whose `Wants` do not name them.
+    Fields after `valid` are None unless the search's `Wants` name them.
     """
 
     u: Float[Array, "n d"]
@@ -64,7 +64,7 @@ class Observations(NamedTuple):
 
     @property
     def score(self) -> Float[Array, " n"]:
-        """Robustness with all failures equally good, 0; infinite in rows that are not usable."""
+        """Robustness with 0 for all failures; infinite in rows that are not usable."""
         return jnp.where(self.usable, jnp.maximum(self.rho, 0.0), jnp.inf)
 
 
@@ -74,14 +74,14 @@ def check_options(
     shares: Sequence[str] = (),
     sizes: Sequence[str] = (),
 ) -> None:
-    """Check the options of a search, attributes of the same names.
+    """Check the options of a search, which are its attributes of the same names.
 
     **Arguments:**
-    - `options`: the search.
-    - `counts`: names of whole numbers, and the smallest value of each.
-    - `shares`: names of those in `(0, 1]`.
-    - `sizes`: names of those that are positive and finite.
-    **Raises:** `ValueError` that names the first one out of range.
+    - `options`: the search object.
+    - `counts`: names of whole numbers, with the smallest value of each.
+    - `shares`: names of options in `(0, 1]`.
+    - `sizes`: names of options that must be positive and finite.
+    **Raises:** `ValueError` that names the first option out of range.
     """
     for name, smallest in (counts or {}).items():
         check_count(name, getattr(options, name), smallest)
@@ -93,14 +93,14 @@ def check_options(
 
 @dataclass(frozen=True)
 class TraceOptions:
-    """Options of a model of the traces, which the loop keeps for a search and descends on.
+    """Options of a model of the traces, which the loop fits for a search and descends on.
 
     **Arguments:**
-    - `initial`: points of the prior before the model has a say.
-    - `share`: the share of the points that the model proposes; the others are those of the search.
-    - `capacity`: maximum number of rows that the model knows, the best half and the last ones.
-    - `starts`: descents for each proposal, the best one of which is simulated.
-    - `steps`: steps of a descent.
+    - `initial`: number of points of the prior before the model proposes any.
+    - `share`: share of the points that the model proposes; the search proposes the others.
+    - `capacity`: maximum number of rows in the model: the best half and the latest ones.
+    - `starts`: number of descents for each proposal; the best one is simulated.
+    - `steps`: number of steps of a descent.
     **Raises:** `ValueError` for values out of range.
     """
 
@@ -116,22 +116,21 @@ class TraceOptions:
 
 @dataclass(frozen=True)
 class Wants:
-    """Needs of a search from the loop, in addition to the robustness of its points.
+    """The data that a search needs from the loop, in addition to the robustness of its points.
 
     **Arguments:**
     - `gradient`: `Observations.gradient`, at the `temperature` of the search.
-    - `clauses`: `Observations.clauses`. Such a search plans its rounds (`plan`).
+    - `clauses`: `Observations.clauses`. A search with this plans its rounds (`plan`).
     - `clause_gradients`: `Observations.clause_gradients`, in the rounds whose plan says so.
     - `coverage_ids`: `Observations.coverage_ids`.
     - `outcomes`: `Observations.outcomes`.
-    - `no_verdict_rows`: simulations without a verdict as valid rows whose robustness is NaN, so
-      that a model of the robustness learns to stay away from them.
-    - `traces`: a model of the traces that proposes some of the points, with these options.
-    - `likelihood`: an objective by which failures are the better the likelier they are, in the
-      place of the robustness.
-    - `max_batch`: points in a round beyond which more rounds are worth more than larger ones. The
-      default is a size at which compiled simulators run at three quarters of their greatest speed
-      or more (`benchmarks/RESULTS.md`, "The engine on real dynamics").
+    - `no_verdict_rows`: whether simulations without a verdict are valid rows with robustness NaN,
+      so that a model of the robustness learns to avoid them.
+    - `traces`: options of a model of the traces that proposes some of the points; None without one.
+    - `likelihood`: whether the objective prefers likely failures, instead of the robustness.
+    - `max_batch`: size of a round beyond which more rounds are better than larger ones. At the
+      default size compiled simulators run at three quarters of their maximum speed or more
+      (`benchmarks/RESULTS.md`, "The engine on real dynamics").
     """
 
     gradient: bool = False
@@ -158,7 +157,7 @@ class Wants:
         return Wants(**either)
 
     def only(self, observations: Observations) -> Observations:
-        """Return observations without the parts that are not wanted."""
+        """Return observations with only the wanted parts."""
         wanted = {
             "gradient": self.gradient,
             "clauses": self.clauses,
@@ -173,8 +172,8 @@ class Wants:
 
         **Arguments:**
         - `cube`: the cube that is searched.
-        - `batch`: rows of a round.
-        - `coverage_ids`: coverage ids of a row.
+        - `batch`: number of rows in a round.
+        - `coverage_ids`: number of coverage ids of a row.
         """
 
         def array(*shape: int, dtype: DTypeLike = jnp.float32) -> Any:
@@ -194,14 +193,13 @@ class Wants:
 
 
 class Plan(NamedTuple):
-    """The simulations that a search that wants clauses wants of its last proposals.
+    """The simulations of its last proposals that a search with clauses asks for.
 
-    - `rows`: number of proposals to simulate, from the first on; the search gets the others as rows
-      that are not valid.
-    - `differentiate`: whether to compute the gradients of the clauses too, which costs as much as
-      another simulation or two.
-    - `temperature`: the temperature of the smooth robustness to differentiate, row by row, without
-      unit.
+    - `rows`: number of proposals to simulate, counted from the first; the others are returned as
+      rows that are not valid.
+    - `differentiate`: whether to compute the gradients of the clauses as well, which costs as much
+      as one or two more simulations.
+    - `temperature`: the dimensionless temperature of the smooth robustness, for each row.
     """
 
     rows: Int[Array, ""]
@@ -219,11 +217,11 @@ Asked: TypeAlias = tuple[Float[Array, "batch d"], State]
 
 
 class Search(ForUsers, abc.ABC, Generic[State]):
-    """The contract; `verifai_jax.testing.check_search` tests it.
+    """The contract of searches; `verifai_jax.testing.check_search` tests it.
 
-    `cube` and `batch` are static under `jit`. A state from `init` with one `batch` takes part in
-    calls with that `batch` only. `ask` may be called several times before a `tell`: where a
-    constraint refuses rows, they are replaced by the same rows of the next proposals.
+    `cube` and `batch` are static under `jit`. A state from `init` may only be used in calls with
+    the same `batch`. `ask` may be called several times before a `tell`: rows that a constraint
+    refuses are replaced by the same rows of the next proposals.
     """
 
     _internal = frozenset((
@@ -233,7 +231,7 @@ class Search(ForUsers, abc.ABC, Generic[State]):
 
     @property
     def wants(self) -> Wants:
-        """Needs of this search; a class states them in one line, `wants = Wants(...)`."""
+        """The needs of this search; a class states them in one line, `wants = Wants(...)`."""
         return Wants()
 
     @property
@@ -243,12 +241,12 @@ class Search(ForUsers, abc.ABC, Generic[State]):
 
     @property
     def samples_prior(self) -> bool:
-        """True if points are independent samples of the prior, so that failure rates are known."""
+        """True if points are independent samples of the prior, so that they give failure rates."""
         return False
 
     @property
     def origin(self) -> Origin:
-        """Origin of the points, which decides what their rows are evidence of."""
+        """The origin of the points, which determines what their rows are evidence of."""
         if self.samples_prior:
             return "prior"
         if not self.learns:
@@ -257,27 +255,27 @@ class Search(ForUsers, abc.ABC, Generic[State]):
 
     @property
     def sequence(self) -> tuple[str, str]:
-        """Words for the points of a search that ends, and for their order, in a note."""
+        """The words for the points of a finite search, and for their order, in a note."""
         return "search", "in its order"
 
     @property
     def fallback(self) -> "Search | None":
-        """The search to use instead where the loop cannot give what this one wants.
+        """The search to use instead if the loop cannot provide what this one wants.
 
-        None for a search that is of no use then.
+        None if there is no such search.
         """
         return None
 
     @property
     def needs_derivatives(self) -> bool:
-        """True if the search follows derivatives and can do nothing without them."""
+        """True if the search follows derivatives and cannot work without them."""
         return self.wants.derivatives and self.fallback is None
 
     def check(self, cube: Cube) -> None:
         """Raise `ValueError` if this search cannot work on this cube."""
 
     def total(self, cube: Cube) -> int | None:
-        """Return the number of points in all; None for a search that never ends."""
+        """Return the total number of points; None for a search that never ends."""
         return None
 
     @abc.abstractmethod
@@ -290,45 +288,45 @@ class Search(ForUsers, abc.ABC, Generic[State]):
 
     @abc.abstractmethod
     def tell(self, state: State, cube: Cube, observations: Observations) -> State:
-        """Learn from the points of the last `ask`, row by row."""
+        """Learn from the results of the points of the last `ask`, row by row."""
 
     def warm_start(self, state: State, cube: Cube, observations: Observations) -> State:
-        """Learn from a batch of an earlier table's points, before the first `ask`."""
+        """Learn from points of an earlier table, before the first `ask`."""
         return self.tell(state, cube, observations)
 
     def start_from(self, state: State, cube: Cube, observations: Observations) -> State:
-        """Learn from points that somebody suggested between two rounds, and start from them."""
+        """Learn from points that a user suggested between two rounds, and start from them."""
         return self.warm_start(state, cube, observations)
 
     def distinct(self, state: State) -> Int[Array, ""] | None:
-        """Return the number of failures so far that are far from each other.
+        """Return the number of failures found so far that are far from each other.
 
-        None for a search that does not tell them apart.
+        None for a search that does not count them.
         """
         return None
 
     def stage(self, state: State | None, cube: Cube, batch: int) -> "Search[State]":
-        """Return the search for the next round: this one, or only the parts of it that take part.
+        """Return the search for the next round: this one, or only its members that take part.
 
-        A stage has the states of the whole, and does what the whole does, by smaller programs: of
-        parts that may never take part nothing is compiled.
+        A stage uses the state of the whole search and behaves like it, but with smaller programs:
+        members that may never take part are not compiled.
 
         **Arguments:**
-        - `state`: before an `ask`; None for that of `init`.
+        - `state`: the state before an `ask`; None for that of `init`.
         """
         return self
 
     def plan(self, state: State, cube: Cube, batch: int) -> Plan:
-        """Return the simulations wanted of the last proposals, for a search that wants clauses."""
+        """Return the simulations wanted of the last proposals, if the search wants clauses."""
         raise NotImplementedError(f"{type(self).__name__} has no plans")
 
     def temperature(self, state: State) -> Float[Array, ""]:
-        """Return the temperature of the smooth robustness, for one that wants a gradient."""
+        """Return the temperature of the smooth robustness, if the search wants a gradient."""
         raise NotImplementedError(f"{type(self).__name__} uses no gradient")
 
 
 class PointSequence(Search[State]):
-    """A search whose points follow from the key alone, whatever comes of them."""
+    """A search whose points depend only on the key, not on results."""
 
     @property
     def learns(self) -> bool:
@@ -339,9 +337,9 @@ class PointSequence(Search[State]):
 
 
 class SlopeSearch(Search[State]):
-    """A search that follows the gradients of clauses, from points that are offered too.
+    """A search that follows gradients of clauses, and can also start from suggested points.
 
-    Its state has the points `offered` as its next starts, and how `near` to failing they are.
+    Its state has the points `offered` as next starts, and `near`, how near each is to failing.
     """
 
     @property
@@ -357,7 +355,7 @@ class SlopeSearch(Search[State]):
             )
 
     def warm_start(self, state: State, cube: Cube, observations: Observations) -> State:
-        """Start the first descents from the points nearest to failing, failures left out."""
+        """Start the first descents from the points nearest to failing, without failures."""
         its: Any = state
         # Of the batch and of earlier points, whose robustness is infinite where there is none.
         usable = observations.usable & (observations.rho >= 0)
@@ -371,5 +369,5 @@ Part = TypeVar("Part", bound=PyTree)
 
 
 def choose(first: Bool[Array, ""], one: Part, two: Part) -> Part:
-    """Return one of two states of the same form; what is the same in both is left alone."""
+    """Return one of two states of the same form; equal parts are not selected but shared."""
     return jax.tree.map(lambda a, b: a if a is b else jnp.where(first, a, b), one, two)

@@ -66,18 +66,19 @@ class BayesState(NamedTuple):
 
 @dataclass(frozen=True)
 class Bayes(Search[BayesState]):
-    """Gaussian process on the robustness; asks where it may be negative.
+    """A Gaussian process on the robustness; proposes points where it may be negative.
 
     **Arguments:**
     - `acquisition`: `"thompson"` or `"expected_improvement"`.
-    - `capacity`: maximum number of points that the process knows. Of more it keeps the best half
-      (of equally good ones a random choice) and a random choice of all others.
-    - `candidates`: points among which each step of the acquisition chooses.
-    - `initial`: points of the prior before the process has a say.
-    - `exploration`: share of the points that are drawn from the prior, for ever; it grows while
-      there is neither a failure nor progress.
+    - `capacity`: maximum number of points in the process. If there are more, it keeps the best half
+      (a random choice among equally good ones) and a random choice of the others.
+    - `candidates`: number of points among which each step of the acquisition chooses.
+    - `initial`: number of points of the prior before the process proposes any.
+    - `exploration`: share of points that are always drawn from the prior; it grows while there is
+      neither a failure nor progress.
 
-    Hyper-parameters are fitted again, from the last ones on, when there are a quarter more points.
+    Hyper-parameters are refitted, starting from the last ones, whenever there are a quarter more
+    points.
 
     **Raises:** `ValueError` for values out of range.
     """

@@ -29,14 +29,14 @@ roundings of float32, as a constant robustness may have from the arithmetic of a
 
 
 class SeenBehaviour(NamedTuple):
-    """Outcomes seen so far, and the ranges of signals in them.
+    """The outcomes seen so far, and the ranges of their signals.
 
     - `archive`: the archive of failures.
-    - `best`: of the points to begin afresh from.
-    - `memory`: the last outcomes, whatever the robustness; not finite where there is none.
-    - `index`: row of the memory that the next one takes.
-    - `low`, `high`: of each signal.
-    - `lowest`, `highest`: robustness of safe points.
+    - `best`: the best points, from which to restart.
+    - `memory`: the latest outcomes, whatever their robustness; rows that are not finite are empty.
+    - `index`: the row of the memory for the next outcome.
+    - `low`, `high`: the range of each signal.
+    - `lowest`, `highest`: the extreme robustness of safe points.
     """
 
     archive: Float[Array, "capacity outcome"]
@@ -65,17 +65,17 @@ class SeenBehaviour(NamedTuple):
 
     @property
     def level(self) -> Bool[Array, ""]:
-        """True where the robustness of all safe points is the same, so that it says nothing."""
+        """True if all safe points have the same robustness, so that it gives no direction."""
         return self.highest - self.lowest <= ALIKE * jnp.abs(self.highest)
 
     def widened(
         self, outcomes: Float[Array, "n outcome"], safe: Float[Array, " n"]
     ) -> "SeenBehaviour":
-        """Return the memory with ranges that hold these outcomes too.
+        """Return the memory with ranges widened to these outcomes.
 
         **Arguments:**
         - `outcomes`: the outcomes of a round.
-        - `safe`: the robustness of safe points, NaN of others.
+        - `safe`: the robustness of safe points, NaN for others.
         """
         known = is_known(outcomes)[:, None, None]
         shape = _shape(outcomes)
@@ -91,7 +91,7 @@ class SeenBehaviour(NamedTuple):
         )
 
     def recorded(self, outcomes: Float[Array, "n outcome"]) -> "SeenBehaviour":
-        """Return the memory with these outcomes among the last ones; unknown ones are left out."""
+        """Return the memory with these outcomes as the latest ones; unknown ones are left out."""
         known = is_known(outcomes)
         number = self.index + jnp.cumsum(known) - 1
         slot = jnp.where(known, number % MEMORY, MEMORY)
@@ -103,10 +103,10 @@ class SeenBehaviour(NamedTuple):
     def familiarity(
         self, outcomes: Float[Array, "n outcome"], radius: Float[Array, ""]
     ) -> Float[Array, " n"]:
-        """Return 1 for what has happened often, falling to 0 at a radius from what is remembered.
+        """Return 1 for outcomes that are often seen, falling to 0 at a radius from all seen.
 
-        The mean over the nearest outcomes, as of novelty search, so that what happened once is
-        not well known.
+        It is a mean over the nearest outcomes, as in novelty search, so an outcome seen once is not
+        familiar.
         """
         far = jnp.where(is_known(self.memory), self.unlike(outcomes, self.memory), jnp.inf)
         _, nearest = jax.lax.top_k(-far, NEIGHBOURS)
@@ -116,11 +116,11 @@ class SeenBehaviour(NamedTuple):
     def unlike(
         self, one: Float[Array, "n outcome"], other: Float[Array, "m outcome"]
     ) -> Float[Array, "n m"]:
-        """Return how unlike outcomes are, from 0 to 1; infinite where one is not known.
+        """Return the dissimilarity of outcomes, from 0 to 1; infinite if one is unknown.
 
-        1 where another predicate decides; otherwise the greater of the difference of the instants
-        and that of the shapes: of each signal the root mean square over the parts of its time, as a
-        share of the range in which it was seen, and of these the greatest.
+        It is 1 if different predicates decide; otherwise the larger of the difference of the times
+        and that of the shapes. The latter is the maximum over signals of the root mean square
+        difference, as a share of the signal's observed range.
         """
         later = jnp.abs(one[:, None, 1] - other[None, :, 1])
         span = jnp.where(self.high > self.low, self.high - self.low, 1.0)[:, None]

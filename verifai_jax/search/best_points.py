@@ -14,8 +14,8 @@ def newest_first(
     """Return the points of a round before those of a memory, with their scores.
 
     **Arguments:**
-    - `u`, `new`: of the round; a score is infinite where there is nothing to learn.
-    - `points`, `score`: of the memory; a score is infinite where there is no point.
+    - `u`, `new`: points and scores of the round; a score is infinite if there is nothing to learn.
+    - `points`, `score`: those of the memory; a score is infinite in an empty row.
     """
     u = jnp.where(jnp.isinf(new)[:, None], 0.5, u)
     return jnp.concatenate([u, points]), jnp.concatenate([new, score])
@@ -27,9 +27,9 @@ def keep_best(
     points: Float[Array, "k d"],
     score: Float[Array, " k"],
 ) -> tuple[Float[Array, "k d"], Float[Array, " k"]]:
-    """Return the best points of a round and a memory, sorted; of equal ones the newest.
+    """Return the best points of a round and a memory, sorted; of equal ones the newest first.
 
-    **Arguments:** as of `newest_first`.
+    **Arguments:** those of `newest_first`.
     """
     points, scores = newest_first(u, new, points, score)
     _, best = jax.lax.top_k(-scores, len(score))

@@ -36,16 +36,16 @@ class CECompatState(NamedTuple):
 
 @dataclass(frozen=True)
 class CECompat(Search[CECompatState]):
-    """VerifAI's one-sample histogram rule, exactly.
+    """The one-sample histogram rule of VerifAI, reproduced exactly.
 
-    Histograms start at the prior. Those of continuous coordinates have equally wide buckets, those
-    of discrete ones a bin for each cell. Lengths of arrays are always drawn from the prior, and
-    each combination of them has histograms of its own.
+    Histograms start as the prior. A continuous coordinate has equally wide buckets, a discrete one
+    a bin for each cell. Lengths of arrays are always drawn from the prior, and each combination of
+    lengths has its own histograms.
 
     **Arguments:**
-    - `buckets`: the buckets of a continuous coordinate.
-    - `alpha`: share that a histogram keeps of itself at each failure.
-    - `threshold`: robustness below which a point is a failure; at it, it is none.
+    - `buckets`: number of buckets of a continuous coordinate.
+    - `alpha`: share of a histogram that remains at each failure.
+    - `threshold`: points with a robustness strictly below this are failures.
     **Raises:** `ValueError` for values out of range. `check` raises it for more than 1024
     combinations of lengths, or histograms that would not fit into memory.
     """

@@ -23,7 +23,7 @@ def without_clauses(observations: Observations) -> Observations:
 
 
 def comparable_clauses(observed: Observations) -> Float[Array, "n clauses"]:
-    """Return the clauses, and of a single one the robustness, whose scale does not change."""
+    """Return the clauses; a single one is replaced by the robustness, whose scale never changes."""
     assert observed.clauses is not None
     several = observed.clauses[:, 1] > NOTHING
     first = jnp.where(several, observed.clauses[:, 0], observed.rho)

@@ -78,21 +78,21 @@ class CMAESState(NamedTuple):
 
 @dataclass(frozen=True)
 class CMAES(Search[CMAESState]):
-    """Covariance matrix adaptation, with restarts; a generation is a batch.
+    """CMA-ES, covariance matrix adaptation, with restarts; a generation is a batch.
 
-    Batches smaller than a population should be (`4 + 3 log d`) are collected until there is one.
+    Batches smaller than a population should be (`4 + 3 log d`) are collected until they are enough.
 
     **Arguments:**
-    - `step`: standard deviation, in unit coordinates, with which a run from the prior begins.
-    - `small_step`: that of a run around a point of exploration.
-    - `exploration`: share of the points drawn from the prior, for ever, in up to five coordinates;
-      in more of them it is less, in proportion.
-    - `full_up_to`: coordinates up to which there is a whole covariance matrix.
-    - `min_std`: standard deviation at which a run has converged, if all coordinates are below.
+    - `step`: initial standard deviation of a run that starts from the prior, in unit coordinates.
+    - `small_step`: initial standard deviation of a run that starts from an explored point.
+    - `exploration`: share of points that are always drawn from the prior, in up to five
+      coordinates; proportionally less in more.
+    - `full_up_to`: maximum number of coordinates for a full covariance matrix.
+    - `min_std`: a run has converged when the standard deviations of all coordinates are below this.
     - `patience`: generations without progress after which a run ends, in addition to four times
-      those in which the covariance is learned (25 in all in four coordinates with batches of 16,
-      130 in ten with batches of 10).
-    - `failures`: after this many failing points, and no fewer than two generations', a run ends.
+      those needed to learn the covariance (25 in total in four coordinates with batches of 16, 130
+      in ten with batches of 10).
+    - `failures`: a run ends after this many failing points, but not before two generations' worth.
     **Raises:** `ValueError` for values out of range.
     """
 
@@ -161,7 +161,7 @@ class CMAES(Search[CMAESState]):
         return choose(complete, self._next(state, cube), state)
 
     def warm_start(self, state: CMAESState, cube: Cube, observations: Observations) -> CMAESState:
-        """Begin with small steps at the best of these points."""
+        """Start with small steps at the best of these points."""
         u, score = _scored(observations)
         # The best of all calls so far is the mean of the run that would begin now.
         better = jnp.min(score, initial=jnp.inf) < state.best

@@ -25,11 +25,11 @@ COVERAGE_IDS = 4
 
 
 class SearchError(ValueError):
-    """A search that breaks the contract of searches."""
+    """An error for a search that breaks the contract of searches."""
 
 
 def is_user_defined(search: Search) -> bool:
-    """Return whether a search, or a part of it, is defined outside of this package."""
+    """Return whether a search, or a part of it, is defined outside this package."""
     if type(search).__module__.partition(".")[0] != "verifai_jax":
         return True
     parts = [getattr(search, f.name) for f in fields(search)] if is_dataclass(search) else []
@@ -38,7 +38,7 @@ def is_user_defined(search: Search) -> bool:
 
 
 def check_contract(search: Search, cube: Cube) -> None:
-    """Refuse a search of the user's own whose functions return other forms than they must.
+    """Refuse a user's search whose functions return values of other shapes than they must.
 
     Nothing compiles and nothing is simulated.
 

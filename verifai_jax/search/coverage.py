@@ -51,13 +51,12 @@ class CoverageState(NamedTuple):
 
 @dataclass(frozen=True)
 class Coverage(Search[CoverageState]):
-    """Mutations of points that covered what few others did; see the module's docstring.
+    """Mutations of points that covered rare items; see the module's docstring.
 
     **Arguments:**
-    - `exploration`: share of points drawn from the prior, for ever.
-    - `rarity`: exponent by which seldom coverage ids are preferred; 0 is not at all.
-    - `buckets`: coverage ids of a kind that the search distinguishes; further coverage ids share
-      these buckets.
+    - `exploration`: share of points that are always drawn from the prior.
+    - `rarity`: exponent of the preference for rare coverage ids; 0 for none.
+    - `buckets`: number of coverage ids of a kind that are distinguished; further ids share buckets.
     **Raises:** `ValueError` for values out of range.
     """
 

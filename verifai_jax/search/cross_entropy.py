@@ -54,17 +54,17 @@ class CrossEntropyState(NamedTuple):
 
 @dataclass(frozen=True)
 class CrossEntropy(Search[CrossEntropyState]):
-    """Cross-entropy over Gaussian and categorical mixtures around the best points so far.
+    """Cross-entropy with Gaussian and categorical mixtures around the best points so far.
 
     **Arguments:**
     - `elite`: size of the elite, as a share of the batch; at least `min_elite` points.
-    - `focus`: in `[0, 1]`; 0 draws from one Gaussian, 1 from the surroundings of elite points.
-    - `exploration`: share of each batch drawn from the prior, for ever.
-    - `widening`: factor on the elite's standard deviation; above 1 it reaches out of the elite.
-    - `min_std`: standard deviation, in unit coordinates, below which no coordinate narrows; in
-      more than four coordinates it is less, since a point must be near in all of them.
-    - `patience`: rounds without progress after which it starts afresh elsewhere; in more than four
-      coordinates 30 simulations more for each of the others.
+    - `focus`: in `[0, 1]`; 0 draws from one Gaussian, 1 from the neighbourhoods of elite points.
+    - `exploration`: share of each batch that is always drawn from the prior.
+    - `widening`: factor on the elite's standard deviation; above 1 it reaches beyond the elite.
+    - `min_std`: minimum standard deviation of a coordinate, in unit coordinates; less in more than
+      four coordinates, since a point must be near in all of them.
+    - `patience`: rounds without progress after which it restarts elsewhere; 30 simulations more for
+      each coordinate beyond four.
     **Raises:** `ValueError` for values out of range.
     """
 

@@ -39,7 +39,7 @@ class Curvature(NamedTuple):
 
 
 def begin(descents: int, dim: int) -> Curvature:
-    """Return the state before any descent has begun."""
+    """Return the state before the first descent."""
     pairs = jnp.zeros((descents, PAIRS, dim), jnp.float32)
     return Curvature(
         point=jnp.full((descents, dim), 0.5, jnp.float32),
@@ -59,12 +59,12 @@ def advance(
     fresh: Bool[Array, " n"],
     radius: Float[Array, " n"],
 ) -> tuple[Curvature, Float[Array, "n d"]]:
-    """Learn from one point of each descent, and return the next one.
+    """Learn from one point of each descent, and return the next point.
 
     **Arguments:**
-    - `point`, `value`, `slope`: what was proposed last, and what came of it; all finite.
-    - `fresh`: descents that begin at their point.
-    - `radius`: trust regions of these.
+    - `point`, `value`, `slope`: the last proposal and its result; all finite.
+    - `fresh`: descents that start at their point.
+    - `radius`: trust regions of these descents.
     """
     step, turn = point - state.point, slope - state.slope
     bent = jnp.sum(step * turn, axis=1)

@@ -66,17 +66,17 @@ class DescentState(NamedTuple):
 
 @dataclass(frozen=True)
 class Descent(SlopeSearch[DescentState]):
-    """L-BFGS from many starts; discrete coordinates keep their start's value.
+    """L-BFGS from many starts; discrete coordinates keep the values of their start.
 
     **Arguments:**
-    - `descents`: maximum number at once; the batch if that is smaller.
+    - `descents`: maximum number of simultaneous descents; at most the batch.
     - `rate`: size of the first step, in unit coordinates.
-    - `steps`: maximum number of gradients of a descent.
-    - `trial`: steps after which a descent is first compared with others.
-    - `kept`: share of the descents that go on, at each comparison.
+    - `steps`: maximum number of gradients in a descent.
+    - `trial`: number of steps after which a descent is first compared with others.
+    - `kept`: share of the descents that continue after each comparison.
     - `hottest`, `coldest`: temperature of the smooth robustness at the start and at the end of a
       descent, in units of the spread of the predicates.
-    - `patience`: gradients in a row without a clearly lower point after which a descent ends.
+    - `patience`: consecutive gradients without a clearly lower point after which a descent ends.
     **Raises:** `ValueError` for values out of range; `check` for a space without continuous
     features.
     """
@@ -96,7 +96,7 @@ class Descent(SlopeSearch[DescentState]):
 
     @property
     def rungs(self) -> tuple[int, ...]:
-        """Steps at which a descent is compared with others."""
+        """Steps at which descents are compared with each other."""
         found = [self.trial]
         while 2 * found[-1] < self.steps:
             found.append(2 * found[-1])
@@ -266,7 +266,7 @@ def propose(
 
 
 def plan(state: InteriorState, cube: Cube, batch: int) -> Plan:
-    """Return the simulations wanted of the last proposals, where it is the descents' turn."""
+    """Return the simulations wanted of the last proposals, if it is the descents' turn."""
     return _search(batch).plan(state.descent, cube, batch)
 
 
@@ -282,9 +282,9 @@ def learn(
 
     **Arguments:**
     - `observations`: the observations of the round, of all its points.
-    - `score`: robustness of each row, 0 for all failures, infinite for rows not to learn from.
-    - `spent`: simulations of the round, one with gradients counted as two.
-    - `best`: the best points of all so far and their scores.
+    - `score`: robustness of each row, 0 for all failures, infinite for rows to ignore.
+    - `spent`: number of simulations in the round; one with gradients counts as two.
+    - `best`: the best points so far and their scores.
     """
     turn = state.turn
     descent = _search(len(score)).tell(state.descent, cube, observations)
@@ -301,12 +301,12 @@ def learn(
 
 
 def wait(state: InteriorState, score: Float[Array, " n"], spent: Float[Array, ""]) -> InteriorState:
-    """Count a round of the others; `learn` does no more that matters while the descents wait."""
+    """Count a round in which the descents wait; this replaces `learn` then."""
     return _counted(state._replace(turn=jnp.array(False)), score, spent)
 
 
 def waits(state: InteriorState) -> bool:
-    """Return whether the next round, and what is learned from it, is none of the descents'."""
+    """Return whether the descents take no part in the next round."""
     # As numbers: each operation of JAX outside of a program would compile one.
     cost, theirs, credit = (float(each) for each in (state.cost, state.theirs, state.credit))
     tried = cost < BEGINS and bool(_tried(state))
@@ -365,7 +365,7 @@ def _offer(
 def not_taken(
     points: Float[Array, "k d"], score: Float[Array, " k"], taken: Float[Array, "taken d"]
 ) -> Bool[Array, " k"]:
-    """Return which points can be new starts: apart from those taken, and not failing."""
+    """Return which points can be new starts: not failing, and away from the starts taken."""
     distance = jnp.max(jnp.abs(points[:, None] - taken[None]), axis=2)
     return jnp.all(distance > APART, axis=1) & (score > 0) & jnp.isfinite(score)
 

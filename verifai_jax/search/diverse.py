@@ -60,7 +60,7 @@ class DiverseState(NamedTuple):
 
 
 class Points(NamedTuple):
-    """Points, and by behaviour what happened there."""
+    """Points, and the outcomes at them if `by` is behaviour."""
 
     u: Float[Array, "n d"]
     happened: Float[Array, "n outcome"] | None
@@ -68,18 +68,18 @@ class Points(NamedTuple):
 
 @dataclass(frozen=True)
 class Diverse(Wrapper[DiverseState]):
-    """Another search, kept away from earlier failures.
+    """A wrapper that keeps another search away from earlier failures.
 
     **Arguments:**
-    - `search`: the one inside.
-    - `radius`: how far distinct failures are apart at first: root mean square over the unit
+    - `search`: the wrapped search.
+    - `radius`: initial minimum distance of distinct failures: root mean square over the unit
       coordinates, in which two random points are 0.41 apart; choices differ by 0 or 1.
-    - `min_radius`: the radius shrinks no further.
-    - `shrink`: factor on the radius, and a new beginning for the search inside, after
-    - `patience` rounds that brought no new failure and came no nearer to one.
-    - `capacity`: the capacity of the archive, and so the maximum number of distinct failures.
-    - `by`: what distinct failures are far from each other in: `"inputs"`, or `"behaviour"`, for
-      which the radius is a share of what can differ (`search.behaviour.unlike`).
+    - `min_radius`: minimum radius.
+    - `shrink`: factor by which the radius shrinks, and the search restarts, after
+    - `patience` rounds without a new failure or progress towards one.
+    - `capacity`: size of the archive, the maximum number of distinct failures.
+    - `by`: the distance that separates failures: `"inputs"`, or `"behaviour"`, for which the radius
+      is a share of the possible difference (`search.behaviour.unlike`).
     **Raises:** `TypeError` for anything that is not a search; `ValueError` for values out of range.
     """
 
@@ -328,7 +328,7 @@ class Diverse(Wrapper[DiverseState]):
 
 
 def apart(cube: Cube, one: Float[Array, "n d"], other: Float[Array, "m d"]) -> Float[Array, "n m"]:
-    """Return root mean square differences over coordinates; of choices they are 0 or 1."""
+    """Return root mean square differences over coordinates; choices differ by 0 or 1."""
     if cube.dim == 0:
         return jnp.zeros((len(one), len(other)), jnp.float32)
     square = jnp.zeros((len(one), len(other)), jnp.float32)
@@ -353,14 +353,14 @@ def distinct(
 ) -> Int[np.ndarray, " k"]:
     """Choose distinct points: no two of them are within the radius.
 
-    The first is chosen, and then each that is beyond the radius of all chosen ones.
+    The first point is chosen, then each one beyond the radius of all chosen points.
 
     **Arguments:**
     - `points`: `[n, d]`, in the unit cube.
-    - `radius`: root mean square distance over the coordinates, as of `Diverse`.
-    - `cube`: the unit cube of the space; with continuous coordinates alone when left out.
-    - `order`: indices of the points, the most wanted first, such as `np.argsort(rho)`; as they come
-      when left out.
+    - `radius`: root mean square distance over the coordinates, as in `Diverse`.
+    - `cube`: the unit cube of the space; when left out, all coordinates are continuous.
+    - `order`: indices of the points by preference, such as `np.argsort(rho)`; by default their
+      order.
     **Returns:** indices `[k]` of the chosen points, in that order.
     """
     u = np.asarray(points, np.float32)

@@ -10,10 +10,9 @@ from jaxtyping import Array, Float, Key
 
 
 def draw_uniform(key: Key[Array, ""], shape: tuple[int, ...]) -> Float[Array, "*shape"]:
-    """Draw uniform numbers in `[0, 1)`: those of `jax.random.uniform`, compiled much sooner.
+    """Draw uniform numbers in `[0, 1)`, equal to those of `jax.random.uniform`; compiles faster.
 
-    XLA spends seconds on the generator in more than one dimension, and again in each of its uses
-    where it is not kept.
+    XLA takes seconds to compile the generator in more than one dimension, and again for each use.
     """
     flat = jax.random.uniform(key, (math.prod(shape),), jnp.float32)
     return jax.lax.optimization_barrier(flat).reshape(shape)
@@ -22,11 +21,11 @@ def draw_uniform(key: Key[Array, ""], shape: tuple[int, ...]) -> Float[Array, "*
 def draw_columns(
     key: Key[Array, ""], rows: int, *widths: int
 ) -> tuple[Float[Array, "rows width"], ...]:
-    """Draw blocks of uniform numbers in `[0, 1)` in one call, as each takes a while to compile."""
+    """Draw several blocks of uniform numbers in `[0, 1)` in one call, which compiles faster."""
     whole = draw_uniform(key, (rows, sum(widths)))
     return tuple(jnp.split(whole, np.cumsum(widths[:-1]), axis=1))
 
 
 def standard_normal(uniform: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
-    """Map uniform numbers in `[0, 1)` to standard normal ones, finite at 0."""
+    """Map uniform numbers in `[0, 1)` to standard normal ones; finite at 0."""
     return ndtri(jnp.maximum(uniform, np.float32(2**-25)))

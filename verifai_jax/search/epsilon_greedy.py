@@ -48,17 +48,17 @@ class EpsilonGreedyState(NamedTuple):
 
 @dataclass(frozen=True)
 class EpsilonGreedy(Search[EpsilonGreedyState]):
-    """Draws around the best points so far, and a share `epsilon` from the prior.
+    """Draws around the best points so far, with a share `epsilon` from the prior.
 
     **Arguments:**
-    - `epsilon`: share of points drawn from the prior, for ever.
-    - `best`: how many best points are kept, as a share of the batch; at least `min_best`.
-    - `reach`: largest standard deviation of the noise, in units of that of the best points.
-    - `min_std`: the same in unit coordinates, below which no coordinate narrows.
-    - `begin`: draws from the prior from which the best points are first taken.
-    - `patience`: rounds without progress after which it starts afresh; small ones count as parts
+    - `epsilon`: share of points that are always drawn from the prior.
+    - `best`: number of best points kept, as a share of the batch; at least `min_best`.
+    - `reach`: maximum standard deviation of the noise, in units of that of the best points.
+    - `min_std`: minimum standard deviation of a coordinate, in unit coordinates.
+    - `begin`: number of draws from the prior before best points are chosen.
+    - `patience`: rounds without progress after which it restarts; small rounds count as fractions
       of rounds of `begin` points.
-    - `doubt`: how many standard errors above chance greedy draws must be, or it starts afresh.
+    - `doubt`: it restarts unless greedy draws are this many standard errors above chance.
     **Raises:** `ValueError` for values out of range.
     """
 
@@ -152,7 +152,7 @@ class EpsilonGreedy(Search[EpsilonGreedyState]):
     def warm_start(
         self, state: EpsilonGreedyState, cube: Cube, observations: Observations
     ) -> EpsilonGreedyState:
-        """Take the best points; the scores of the prior have to be sampled yet."""
+        """Take the best points; scores of the prior still have to be sampled."""
         score = observations.score
         return self._with_best(state, observations.u, score)._replace(stale=state.stale)
 

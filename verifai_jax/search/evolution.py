@@ -38,11 +38,11 @@ class Evolution(NamedTuple):
         )
 
     def variance(self) -> Float[Array, " n"]:
-        """Return the variance of each coordinate, over the squared size."""
+        """Return the variance of each coordinate, divided by the squared step size."""
         return jnp.diagonal(self.covariance) if self.covariance.ndim == 2 else self.covariance
 
     def draw(self, normal: Float[Array, "m n"]) -> Float[Array, "m n"]:
-        """Draw points of the Gaussian, from standard normal numbers."""
+        """Draw points of the Gaussian from standard normal numbers."""
         if self.covariance.ndim == 1:
             return self.mean + self.size * jnp.sqrt(self.covariance) * normal
         return self.mean + self.size * normal @ jnp.linalg.cholesky(self.covariance).T
@@ -53,13 +53,13 @@ class Evolution(NamedTuple):
         weights: Float[Array, " m"],
         worse: Float[Array, " m"] | float = 0.0,
     ) -> "Evolution":
-        """Update by points; in comments the tutorial's names.
+        """Update from the points of a generation; comments give the names of the CMA-ES tutorial.
 
         **Arguments:**
         - `points`: the points of a generation.
         - `weights`: recombination weights, which sum to one.
-        - `worse`: weights of the points that the covariance is to shrink along, which sum to one
-          or are all zero.
+        - `worse`: weights of the points along which the covariance shrinks; they sum to one or are
+          all zero.
         """
         n = len(self.mean)
         if n == 0:
@@ -109,7 +109,7 @@ class Evolution(NamedTuple):
         )
 
     def widened(self, min_std: Float[np.ndarray, " n"]) -> "Evolution":
-        """Raise standard deviations to at least `min_std`, and give the covariance a factor."""
+        """Raise standard deviations to at least `min_std`, and scale the covariance by a factor."""
         if len(self.mean) == 0:
             return self
         # A direction may become narrow, but not so that 32 bits lose it.
@@ -137,12 +137,12 @@ def _mass(weights: Float[Array, " m"] | float) -> Float[Array, ""]:
 def rates(
     mass: float | Float[Array, ""], n: int, full: bool
 ) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    """Return the learning rates of the covariance: of its path, and of a generation's points.
+    """Return the learning rates of the covariance: for its path, and for a generation's points.
 
     **Arguments:**
-    - `mass`: as how many equal weights those of the better points count.
+    - `mass`: effective number of equal weights of the better points.
     - `n`: number of coordinates.
-    - `full`: whether the covariance is a whole matrix rather than a diagonal.
+    - `full`: whether the covariance is a full matrix, not a diagonal.
     """
     one = 2 / ((n + 1.3) ** 2 + mass)  # c_1
     many = 2 * (0.25 + mass - 2 + 1 / mass) / ((n + 2) ** 2 + mass)  # c_mu
@@ -153,9 +153,9 @@ def rates(
 
 
 def recombination(score: Float[Array, " m"]) -> Float[Array, " m"]:
-    """Weight points: logarithmic in the rank, zero in the worse half, equal where tied.
+    """Return weights of points: logarithmic in the rank, zero in the worse half, equal for ties.
 
-    Points of infinite score have none.
+    Points with an infinite score get weight zero.
     """
     there = jnp.isfinite(score)
     # A single point is all that there is.
@@ -164,9 +164,9 @@ def recombination(score: Float[Array, " m"]) -> Float[Array, " m"]:
 
 
 def reverse_recombination(score: Float[Array, " m"]) -> Float[Array, " m"]:
-    """Weight the points of the worse half, as `recombination` does those of the better one.
+    """Return weights for the worse half, as `recombination` does for the better half.
 
-    A point that is as good as one of the better half has none.
+    A point that ties with one of the better half gets weight zero.
     """
     there = jnp.isfinite(score)
     worse = there & (recombination(score) == 0)

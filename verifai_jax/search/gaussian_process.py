@@ -73,16 +73,16 @@ class Paths(NamedTuple):
 
 @dataclass(frozen=True)
 class GaussianProcess:
-    """Regression over points with these coordinates; the prior's mean is zero.
+    """Gaussian process regression over points with these coordinates; the prior mean is zero.
 
     **Arguments:**
-    - `unordered`: for each coordinate, whether it holds codes rather than a quantity in `[0, 1]`.
+    - `unordered`: for each coordinate, whether it holds codes, not a quantity in `[0, 1]`.
     """
 
     unordered: tuple[bool, ...]
 
     def first(self) -> Hyper:
-        """Return the start of the fit: neighbours are related over half the cube's diagonal."""
+        """Return the start of the fit, with a correlation length of half the cube's diagonal."""
         plain, codes = self._indices()
         lengths = np.zeros(len(self.unordered))
         lengths[plain] = math.log(0.5 * math.sqrt(max(len(plain), 1)))
@@ -105,7 +105,7 @@ class GaussianProcess:
         return value * jnp.exp(-differ @ inverse[codes])
 
     def evidence(self, hyper: Hyper, data: TrainingData) -> Float[Array, ""]:
-        """Return the logarithm of the marginal likelihood of the observations."""
+        """Return the log marginal likelihood of the observations."""
         return _evidence(self._noisy(hyper, data.x, data.mask), _masked(data)) - (
             0.5 * math.log(2 * math.pi) * jnp.sum(data.mask)
         )
@@ -113,9 +113,9 @@ class GaussianProcess:
     def log_prior(self, hyper: Hyper) -> Float[Array, ""]:
         """Return the log density of the hyper-parameters, up to a constant.
 
-        Length scales grow with the root of the dimension, so that the prior's complexity does not
-        (Hvarfner, Hellsten, Nardi, Vanilla Bayesian optimization performs great in high dimensions,
-        ICML 2024).
+        Length scales grow with the square root of the dimension, so that the prior's complexity
+        does not grow (Hvarfner, Hellsten, Nardi, Vanilla Bayesian optimization performs great in
+        high dimensions, ICML 2024).
         """
         plain, codes = self._indices()
         mean = math.sqrt(2) + 0.5 * math.log(max(len(plain), 1))
@@ -125,9 +125,9 @@ class GaussianProcess:
         return -0.5 * (lengths + hyper.variance**2 + (hyper.noise + 6.0) ** 2 / 2)
 
     def fit(self, hyper: Hyper, data: TrainingData, steps: int, rate: float = 0.15) -> Hyper:
-        """Find the most probable hyper-parameters, by Adam from `hyper` on.
+        """Find the most probable hyper-parameters with Adam, starting from `hyper`.
 
-        A step that is not finite is not taken.
+        Steps that are not finite are skipped.
         """
 
         def loss(hyper: Hyper) -> Float[Array, ""]:
@@ -136,7 +136,7 @@ class GaussianProcess:
         return adam(loss, hyper, steps, rate, _bounded)
 
     def condition(self, hyper: Hyper, data: TrainingData) -> Posterior:
-        """Condition the process on these observations."""
+        """Return the process conditioned on these observations."""
         y = _masked(data)
         noisy = self._noisy(hyper, data.x, data.mask)
         factor, _ = finite_factor(noisy, jnp.exp(hyper.variance))
@@ -150,7 +150,7 @@ class GaussianProcess:
         return self.predictor(posterior)(x)
 
     def predictor(self, posterior: Posterior) -> Callable[[Float[Array, "m d"]], tuple]:
-        """Return `predict` as a function of points, whose calls are products of matrices."""
+        """Return `predict` as a function of points that only needs products of matrices."""
         identity = jnp.eye(len(posterior.residual), dtype=posterior.factor.dtype)
         inverse = solve_triangular(posterior.factor, identity, lower=True)
 
@@ -163,7 +163,7 @@ class GaussianProcess:
         return predict
 
     def paths(self, posterior: Posterior, key: Key[Array, ""], count: int, waves: int) -> Paths:
-        """Draw `count` functions from the posterior; the prior's part has `waves` random waves."""
+        """Draw `count` functions from the posterior; the prior part has `waves` random waves."""
         hyper, n = posterior.hyper, len(posterior.residual)
         plain, codes = self._indices()
         c, k = len(plain), len(codes)
@@ -197,7 +197,7 @@ class GaussianProcess:
     def basis(
         self, posterior: Posterior, paths: Paths, x: Float[Array, "m d"]
     ) -> Float[Array, "m terms"]:
-        """Return basis functions at these points; times the paths' weights the paths' values."""
+        """Return basis functions at these points; times the paths' weights they give values."""
         waves = self._waves(posterior.hyper, paths, x)
         return jnp.concatenate([waves, self.cross(posterior, x)], axis=1)
 
@@ -239,10 +239,9 @@ def adam(
     rate: float,
     bounded: Callable[[Fitted], Fitted],
 ) -> Fitted:
-    """Minimise a loss by Adam (Kingma, Ba, Adam: a method for stochastic optimization, ICLR 2015).
+    """Minimise a loss with Adam (Kingma, Ba, A method for stochastic optimization, ICLR 2015).
 
-    A step that is not finite is not taken, and `bounded` returns what a step leads to within its
-    range.
+    Steps that are not finite are skipped; `bounded` maps the result of a step into its range.
     """
 
     def step(carry: tuple[Fitted, Fitted, Fitted], count: Array) -> tuple:
@@ -269,7 +268,7 @@ def adam(
 def finite_factor(
     covariance: Float[Array, "n n"], variance: Float[Array, ""]
 ) -> tuple[Float[Array, "n n"], Float[Array, "n n"]]:
-    """Return the Cholesky factor of a covariance with as much noise as makes it finite, and that.
+    """Return the Cholesky factor of a covariance with enough noise to be finite, and that noise.
 
     - `variance`: the variance of a value; the noise is zero at first, then a millionth of this
       variance, and ten times more in each further attempt.

@@ -89,18 +89,19 @@ class GradientState(NamedTuple):
 
 @dataclass(frozen=True)
 class Gradient(SlopeSearch[GradientState]):
-    """Sequential linear programming on the clauses; discrete coordinates keep their start's value.
+    """Sequential linear programming on the clauses; discrete coordinates keep their start's values.
 
     **Arguments:**
-    - `descents`: maximum number at once; a quarter of the batch if that is smaller.
-    - `shrinks`: factor on the size of the box when nothing in it was better.
-    - `min_radius`: size of the box below which a descent ends, once it has made a step.
-    - `flips`: coordinates of a corner tried the other way before a descent ends.
-    - `patience`: steps in a row that are little better after which a descent ends.
+    - `descents`: maximum number of simultaneous descents; at most a quarter of the batch.
+    - `shrinks`: factor on the size of the box when no point in it was better.
+    - `min_radius`: size of the box below which a descent ends, after its first step.
+    - `flips`: number of coordinates of a corner that are tried the other way before a descent ends.
+    - `patience`: consecutive steps with little progress after which a descent ends.
     - `temperatures`: the temperatures of the smooth robustness, in units of the spread of the
-      predicates: of the first descent, which halves it with every step, then of the others in turn,
-      where it falls more slowly. A single one is that of all.
-    - `coldest`: temperature below which it does not fall.
+      predicates. The first one is for the first descent, which halves it with every step; the
+      others are for the other descents in turn, in which they fall more slowly. A single one is for
+      all.
+    - `coldest`: minimum temperature.
     **Raises:** `ValueError` for values out of range; `check` for a space without continuous
     features.
     """
@@ -125,7 +126,7 @@ class Gradient(SlopeSearch[GradientState]):
             check_positive("temperatures", temperature, finite=True)
 
     def at_once(self, batch: int) -> int:
-        """Return the number of descents in batches of this size."""
+        """Return the number of simultaneous descents for batches of this size."""
         return max(1, min(self.descents, batch // 4))
 
     def init(self, key: Key[Array, ""], cube: Cube, batch: int) -> GradientState:
@@ -297,10 +298,10 @@ class Gradient(SlopeSearch[GradientState]):
     def start_from(
         self, state: GradientState, cube: Cube, observations: Observations
     ) -> GradientState:
-        """Give up descents for new ones from these points, which are differentiated next.
+        """Replace some descents by new ones from these points, which are differentiated next.
 
-        More than half of the descents, several from one point where points are fewer, so that
-        rounds of gradients do not go on until the others have found some too.
+        More than half of the descents are replaced; with few points several start from the same
+        one, so that other members of a portfolio soon get their turn.
         """
         none = jnp.full_like(state.near, jnp.inf)
         warmed = self.warm_start(state._replace(near=none), cube, observations)

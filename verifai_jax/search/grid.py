@@ -37,15 +37,15 @@ class GridState(NamedTuple):
 class Grid(PointSequence[GridState]):
     """A grid with both ends of each continuous coordinate and the middle of each cell.
 
-    Its points come once each, in a random order that the seed decides. So a budget below the size
-    of the grid simulates a sample of the whole of it, and the run's notes say which share that is.
-    Batches beyond the end repeat the last point.
+    Each point comes once, in a random order determined by the seed. So a budget below the size of
+    the grid simulates a random sample of it, and the run's notes say which share. Batches beyond
+    the end repeat the last point.
 
     **Arguments:**
-    - `points`: number of values of each continuous coordinate, or a tuple with one number each; 1
-      is the middle.
-    **Raises:** `ValueError` for numbers below 1. `check` raises it for a tuple that does not go
-    with the space, and for more than `2^31 - 1` points in all.
+    - `points`: number of values of each continuous coordinate, or a tuple with one number for each;
+      1 means the middle.
+    **Raises:** `ValueError` for numbers below 1. `check` raises it for a tuple that does not fit
+    the space, and for more than `2^31 - 1` points in all.
     """
 
     points: int | tuple[int, ...] = 21
@@ -59,7 +59,7 @@ class Grid(PointSequence[GridState]):
             check_count("points", self.points)
 
     def check(self, cube: Cube) -> None:
-        """Raise `ValueError` where `points` does not go with the space, or for too many points."""
+        """Raise `ValueError` if `points` does not fit the space, or for too many points."""
         if isinstance(self.points, tuple) and len(self.points) != len(cube.continuous):
             raise ValueError(
                 f"points must have {len(cube.continuous)} entries, one for each continuous unit "
@@ -93,8 +93,8 @@ class Grid(PointSequence[GridState]):
     def points_at(self, rest: UInt32[Array, " n"], cube: Cube) -> Float[Array, "n d"]:
         """Return the points of the grid with these numbers, in the order of its rows.
 
-        Discrete coordinates change fastest, and among the discrete and among the continuous ones
-        the first does.
+        Discrete coordinates change faster than continuous ones; among each kind the first is
+        fastest.
         """
         figures, batch = [], len(rest)
         for size in self._sizes(cube):
@@ -119,7 +119,7 @@ class Grid(PointSequence[GridState]):
 def permuted(
     number: UInt32[Array, " n"], total: int, keys: UInt32[Array, " steps"]
 ) -> UInt32[Array, " n"]:
-    """Return where a random permutation of the numbers below `total` takes these.
+    """Return the images of these numbers under a random permutation of the numbers below `total`.
 
     **Arguments:**
     - `number`: numbers below `total`.

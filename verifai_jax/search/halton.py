@@ -39,18 +39,18 @@ class HaltonState(NamedTuple):
 
 @dataclass(frozen=True)
 class Halton(PointSequence[HaltonState]):
-    """Halton points, the first one with index 1; the same for any batch size, up to rounding.
+    """The Halton sequence from index 1; the same for any batch size, up to rounding.
 
     **Arguments:**
-    - `scramble`: permute digits at random (from the key). `False` is the plain sequence, which
-      does not depend on the key. By default plain where all bases are among the first 8 primes
-      (up to 8 coordinates), and scrambled otherwise.
-    - `skip_points`: number of points left out at the beginning of the sequence; the first one has
+    - `scramble`: whether to permute digits at random (from the key). `False` gives the plain
+      sequence, which does not depend on the key. By default it is plain if all bases are among the
+      first 8 primes (up to 8 coordinates), and scrambled otherwise.
+    - `skip_points`: number of points left out at the start of the sequence; the first one then has
       index `1 + skip_points`. VerifAI calls it `sample_index`.
-    - `skip_bases`: number of primes left out; the first coordinate has base 3 after one. VerifAI
+    - `skip_bases`: number of primes left out; with one, the first coordinate has base 3. VerifAI
       calls it `bases_skipped`.
-    **Raises:** `ValueError` for a `scramble` other than True, False and None, or numbers to skip
-    that are no integers, negative or too large.
+    **Raises:** `ValueError` for a `scramble` other than True, False and None, or for numbers to
+    skip that are not integers, negative or too large.
     """
 
     scramble: bool | None = None
@@ -80,12 +80,12 @@ class Halton(PointSequence[HaltonState]):
 def halton_points(
     index: UInt32[Array, " n"], dim: int, key: Key[Array, ""] | None = None, skip_bases: int = 0
 ) -> Float[Array, "n dim"]:
-    """Compute points number `index` of the Halton sequence, in `[0, 1)`.
+    """Compute points of the Halton sequence by their `index`, in `[0, 1)`.
 
     **Arguments:**
-    - `index`: of the points, from 1 on (point 0 is the corner at the origin).
+    - `index`: indices of the points, from 1 on (point 0 is the corner at the origin).
     - `dim`: number of coordinates.
-    - `key`: the key of the random permutations of digits; the sequence is plain without.
+    - `key`: the key of the random permutations of digits; without it the sequence is plain.
     - `skip_bases`: number of primes left out before the base of the first coordinate.
     """
     bases = np.array(primes(skip_bases + dim)[skip_bases:], np.uint32)

@@ -33,10 +33,11 @@ def improving(
     shared: Float[Array, "m d"],
     batch: int,
 ) -> Float[Array, "batch d"]:
-    """Return points with the largest expected improvement, each away from those before it.
+    """Return points with the largest expected improvement, each away from the earlier ones.
 
-    - `box`: its lowest corner and its sides; the process and the candidates have coordinates in it.
-    - `doubt`: factor on the standard deviations, which a search for more than improvement needs.
+    - `box`: its lowest corner and its side lengths; the process and the candidates use its
+      coordinates.
+    - `doubt`: factor on the standard deviations, which increases exploration.
     """
     process, discrete = process_of(cube), np.array(cube.levels) > 0
     predict = process.predictor(posterior)

@@ -17,12 +17,12 @@ from verifai_jax.search.wrapper import Wrapper
 
 @dataclass(frozen=True)
 class Likeliest(Wrapper[PyTree]):
-    """Another search, which learns of likely failures that they are the best.
+    """A wrapper that makes another search look for likely failures.
 
     **Arguments:**
-    - `search`: the one inside; it must learn.
+    - `search`: the wrapped search, which must learn.
     **Raises:** `TypeError` for anything that is not a search; `ValueError` for one that does not
-    learn, or of whose failures the objective says nothing.
+    learn, or that cannot use this objective.
     """
 
     search: Search

@@ -23,10 +23,10 @@ def minimax_direction(
     free: Bool[np.ndarray, " d"],
     halvings: Int[Array, ""],
 ) -> Float[Array, " d"]:
-    """Minimise the greatest of linear clauses over a box.
+    """Minimise the maximum of linear clauses over a box.
 
-    Exact for two clauses; for more the best of all points where one is least or two meet, or part
-    of the way there where they lie higher than the point itself.
+    The result is exact for two clauses. For more it is the best of all points that minimise one
+    clause or lie where two are equal, or a point on the way there if they are worse than the start.
     """
     low, high = jnp.maximum(point - radius, 0.0), jnp.minimum(point + radius, 1.0)
 
@@ -77,7 +77,7 @@ def flip_weakest(
     number: Int[Array, ""],
     free: Bool[np.ndarray, " d"],
 ) -> Float[Array, " d"]:
-    """Move the `number`-th weakest coordinate to the other end of its range."""
+    """Move the coordinate with the `number`-th weakest effect to the other end of its range."""
     steep = jnp.abs(gradients[jnp.argmax(clauses)])
     # Coordinates without a derivative come last: they seem to have no effect.
     order = jnp.argsort(jnp.where((steep > 0) & free, steep, jnp.inf))

@@ -12,12 +12,12 @@ Chosen by hand; no comparison with other values is recorded."""
 
 
 def has_fine_cells(cube: Cube) -> Bool[np.ndarray, " discrete"]:
-    """Return which discrete coordinates have so many ordered cells that noise moves them."""
+    """Return which discrete coordinates have enough ordered cells to be moved by noise."""
     return np.array([cube.ordered[i] and cube.levels[i] > MAX_CELLS for i in cube.discrete], bool)
 
 
 def all_or_some(coin: Float[Array, "n 1"], mask: Float[Array, "n d"]) -> Bool[Array, "n d"]:
-    """Return which coordinates move: in every second row all, else a third, or one on average.
+    """Return which coordinates move: all in every second row, else a third, or one on average.
 
     **Arguments:**
     - `coin`, `mask`: uniform random numbers.

@@ -59,15 +59,15 @@ class MutationState(NamedTuple):
 
 @dataclass(frozen=True)
 class Mutation(Search[MutationState]):
-    """Mutations of the best points so far, by steps of all sizes, and exploration.
+    """Mutations of the best points so far, with steps of all sizes, and exploration.
 
     **Arguments:**
-    - `kept`: number of best points that are kept.
-    - `first`: simulations that explore before anything is mutated.
-    - `exploration`: share of proposals that explore.
-    - `idle`: simulations without progress after which nearly all do.
-    - `difference`: share of mutations by the difference of two good points.
-    - `patience`: simulations without progress after which it begins afresh.
+    - `kept`: number of best points kept.
+    - `first`: number of simulations for exploration before the first mutation.
+    - `exploration`: share of proposals for exploration.
+    - `idle`: simulations without progress after which nearly all proposals explore.
+    - `difference`: share of mutations that add the difference of two good points.
+    - `patience`: simulations without progress after which it restarts.
     **Raises:** `ValueError` for values out of range.
     """
 

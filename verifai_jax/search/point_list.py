@@ -18,12 +18,12 @@ class PointListState(NamedTuple):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class PointList(PointSequence[PointListState]):
-    """Given points of the unit cube, one after the other; it ends with the last one.
+    """Given points of the unit cube in their order; the search ends with the last one.
 
     **Arguments:**
     - `points`: `[n, d]`, in `[0, 1]`.
-    **Raises:** `ValueError` for no points, or points outside the unit cube; `check` for points of
-    another dimension than the cube's.
+    **Raises:** `ValueError` for no points, or points outside the unit cube; `check` for points of a
+    dimension other than the cube's.
     """
 
     points: Float[Array | np.ndarray, "n d"] | Sequence[Sequence[float]]

@@ -101,12 +101,12 @@ class PortfolioState(NamedTuple):
 
 @dataclass(frozen=True)
 class Portfolio(Search[PortfolioState]):
-    """Gradient, mutations and cross-entropy together, with the budget by evidence; no tuning.
+    """Gradient, mutations and cross-entropy together, sharing the budget by success; no tuning.
 
     **Arguments:**
-    - `gradients`: whether to use gradients of the robustness. They are left out automatically where
-      there are none: for black boxes, where all features are discrete, where the robustness is
-      constant almost everywhere, as over signals that are whole numbers.
+    - `gradients`: whether to use gradients of the robustness. They are left out automatically if
+      there are none: for black boxes, if all features are discrete, or if the robustness is
+      piecewise constant, for example over whole numbers.
     """
 
     gradients: bool = True
@@ -164,8 +164,8 @@ class Portfolio(Search[PortfolioState]):
     def stage(self, state: PortfolioState | None, cube: Cube, batch: int) -> Search[PortfolioState]:
         """Return the members that take part in the next round.
 
-        Gradients take seconds to compile, and a simulation of many at once next to none. So rounds
-        of many begin without them, and go on so while failures come.
+        Gradients take seconds to compile, while many simulations at once take almost no time. So
+        large rounds begin without gradients, and continue without them as long as failures come.
         """
         if not self._differentiates(cube):
             return self
@@ -393,11 +393,11 @@ class Portfolio(Search[PortfolioState]):
 
 @dataclass(frozen=True)
 class PortfolioStage(Wrapper[PortfolioState]):
-    """Some members of a portfolio, with the states of all.
+    """Some members of a portfolio, with the state of the whole portfolio.
 
     **Arguments:**
     - `search`: the whole portfolio.
-    - `descends`: whether short descents take part, or neither these nor those into the interior.
+    - `descends`: whether short descents, and those into the interior, take part.
     """
 
     search: Search[PortfolioState]
@@ -428,10 +428,10 @@ class PortfolioStage(Wrapper[PortfolioState]):
         return self.search.start_from(state, cube, observations)
 
     def inner_state(self, state: PortfolioState) -> PortfolioState:
-        """Return the state without the members that do not take part."""
+        """Return the state of the members that take part."""
         return state._replace(interior=None, gradient=state.gradient if self.descends else None)
 
     def with_inner_state(self, state: PortfolioState, inner: PortfolioState) -> PortfolioState:
-        """Return the state after a round, with the other members as they were before."""
+        """Return the state after a round; members that took no part are unchanged."""
         gradient = inner.gradient if self.descends else state.gradient
         return inner._replace(interior=state.interior, gradient=gradient)

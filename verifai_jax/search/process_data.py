@@ -28,7 +28,7 @@ FIT_POINTS = 192
 
 
 def scores(observations: Observations) -> Float[Array, " n"]:
-    """Return the robustness, 0 for all failures, `NO_VERDICT` for NaN; infinite in other rows."""
+    """Return the robustness, 0 for all failures, `NO_VERDICT` for NaN; infinite if unusable."""
     rho = observations.rho
     score = jnp.where(jnp.isnan(rho), NO_VERDICT, jnp.clip(rho, 0.0, LARGEST))
     return jnp.where(observations.valid & ~(rho == jnp.inf), score, jnp.inf)
@@ -52,7 +52,7 @@ def snap(u: Float[Array, "n d"], cube: Cube) -> Float[Array, "n d"]:
 
 
 def encode(u: Float[Array, "n d"], cube: Cube) -> Float[Array, "n d"]:
-    """Encode points for the process: middles of ordered cells, numbers of unordered ones."""
+    """Encode points for the process: ordered cells as middles, unordered ones as numbers."""
     if len(cube.discrete) == 0:
         return u
     cells = cube.cells(u)
@@ -77,14 +77,14 @@ def training_data(u: Float[Array, "n d"], score: Float[Array, " n"], cube: Cube)
 def rows_to_keep(
     score: Float[Array, " n"], luck: Float[Array, " n"], count: int
 ) -> Int[Array, " count"]:
-    """Choose rows to keep: the best half and the luckiest others; present rows come first."""
+    """Choose the rows to keep: the best half and random others; empty rows come last."""
     rank = jnp.argsort(jnp.lexsort((luck, score)))
     best = (rank < count // 2) & jnp.isfinite(score)
     return jnp.argsort(jnp.where(best, -1.0, jnp.where(jnp.isfinite(score), luck, 2.0)))[:count]
 
 
 class ProcessMemory(NamedTuple):
-    """The points that a process knows, and its hyper-parameters."""
+    """The points in a process, and its hyper-parameters."""
 
     results: UInt32[Array, ""]  # rows, in all
     u: Float[Array, "capacity d"]
@@ -108,20 +108,20 @@ class ProcessMemory(NamedTuple):
         )
 
     def emptied(self, cube: Cube) -> "ProcessMemory":
-        """Return the memory without its points; their rows are counted on."""
+        """Return the memory without its points; rows are still counted on."""
         return ProcessMemory.nothing(len(self.score), cube)._replace(
             results=self.results, u=self.u, luck=self.luck
         )
 
     def says_something(self, initial: int) -> Bool[Array, ""]:
-        """Return whether there are so many verdicts, and a difference to learn from."""
+        """Return whether there are enough verdicts, which differ, to learn from."""
         present = self.score <= LARGEST
         lowest = jnp.min(self.score, where=present, initial=jnp.inf)
         spread = jnp.max(self.score, where=present, initial=0.0) > lowest
         return spread & (self.verdicts >= initial)
 
     def with_rows(self, u: Float[Array, "n d"], score: Float[Array, " n"]) -> "ProcessMemory":
-        """Return the memory with the rows of a round, and without as many if it is full."""
+        """Return the memory with the rows of a round, dropping as many if it is full."""
         usable = jnp.isfinite(score)
         number = self.results + jnp.arange(len(score), dtype=jnp.uint32)
         # A Weyl sequence (in steps of the golden ratio): as good as random for choosing.
@@ -140,7 +140,7 @@ class ProcessMemory(NamedTuple):
         )
 
     def refitted(self, cube: Cube, initial: int, steps: int) -> "ProcessMemory":
-        """Fit the hyper-parameters again, from the last ones on, when a quarter more is known."""
+        """Refit the hyper-parameters from the last ones, if there are a quarter more rows."""
 
         def fit() -> Hyper:
             some = rows_to_keep(self.score, self.luck, min(FIT_POINTS, len(self.score)))

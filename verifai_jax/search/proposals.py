@@ -41,7 +41,7 @@ FILLERS = {
 
 
 class ConstraintError(ValueError):
-    """The search does not get past the constraint of the space."""
+    """An error for a search whose proposals the constraint of the space keeps refusing."""
 
 
 class Proposals:
@@ -49,10 +49,10 @@ class Proposals:
 
     - `proposed`: number of points that the search proposed.
     - `accepted`: number of these that the constraint accepted.
-    - `stage`: the search, or its parts that take part in the next round.
-    - `cut`: whether the last `next` left out points that a search that learns had proposed.
+    - `stage`: the search, or the members that take part in the next round.
+    - `cut`: whether the last `next` left out points proposed by a search that learns.
 
-    `improve` may replace points of a round by others, of which the search learns instead.
+    `improve` may replace points of a round; the search then learns from the new ones.
     """
 
     def __init__(
@@ -95,7 +95,7 @@ class Proposals:
 
     @property
     def distinct(self) -> int | None:
-        """Number of failures far from each other; None for a search that does not count them."""
+        """Number of failures far from each other; None if the search does not count them."""
         count = self.search.distinct(self._state)
         return None if count is None else int(count)
 
@@ -108,7 +108,8 @@ class Proposals:
     def temperature(self) -> Float[Array, ""] | Float[np.ndarray, " m"] | float:
         """Temperature of the smooth robustness; only for searches with gradients.
 
-        One for the next points, or, for a search that wants clauses, one for each of the last.
+        It is one number for the next points, or one for each of the last points if the search wants
+        clauses.
         """
         if self._plan is None:
             return self._program.temperature(self._state)
@@ -120,7 +121,7 @@ class Proposals:
         **Arguments:**
         - `max_points`: maximum number of points.
         **Returns:** points of the unit cube, `[m, d]`.
-        **Raises:** `ConstraintError` when the constraint has refused everything for long.
+        **Raises:** `ConstraintError` if the constraint has refused all proposals for long.
         """
         self.begin_stage()
         points = (
@@ -141,14 +142,14 @@ class Proposals:
         coverage_ids: Int[np.ndarray, "m ids"] | None = None,
         outcomes: Float[np.ndarray, "m outcome"] | None = None,
     ) -> None:
-        """Let the search learn from the simulations of the points that `next` gave last.
+        """Let the search learn from the simulations of the points last returned by `next`.
 
         **Arguments:**
         - `rho`: robustness of each point.
         - `valid`: False for simulations without a verdict.
         - `gradient`: the gradient of the smooth robustness, for a search that wants it.
-        - `clauses`, `clause_gradients`: for a search that wants clauses; see `Observations`.
-        - `coverage_ids`: for a search that wants them, as many as the constructor was given.
+        - `clauses`, `clause_gradients`: those of a search that wants clauses; see `Observations`.
+        - `coverage_ids`: for a search that wants them, in the number given to the constructor.
         - `outcomes`: for a search that wants them.
         """
         if not self.search.learns:
@@ -170,7 +171,7 @@ class Proposals:
         self._state = self._program.tell(self._state, observations)
 
     def tell_refused(self) -> None:
-        """Let the search know that no row of the last round could be simulated."""
+        """Tell the search that no row of the last round could be simulated."""
         self.tell(np.zeros(0, np.float32), np.zeros(0, bool), None)
 
     def warm_start(
@@ -188,11 +189,11 @@ class Proposals:
         rho: Float[np.ndarray, " n"],
         outcomes: Float[np.ndarray, "n outcome"] | None = None,
     ) -> None:
-        """Let the search start from points that somebody suggested, between two rounds."""
+        """Let the search start from points that a user suggested, between two rounds."""
         self._learn_from(u, rho, outcomes, "start_from")
 
     def remember(self, u: Float[np.ndarray, "n d"]) -> None:
-        """Propose no more points that the run has simulated, but not as proposals: given ones."""
+        """Never propose these given points, which the run has already simulated."""
         if self._repetition is not None:
             self._repetition.add(u)
 
@@ -243,11 +244,11 @@ class Proposals:
         )
 
     def begin_stage(self) -> bool:
-        """Compile the parts of the search that take part in the next round, in the background.
+        """Start compiling the members that take part in the next round, in the background.
 
-        `next` does it by itself.
+        `next` does this by itself.
 
-        **Returns:** whether these are others than in the last round.
+        **Returns:** whether they differ from those of the last round.
         """
         stage = self.search.stage(self._state, self.cube, self.batch)
         if stage == self.stage:
@@ -259,13 +260,13 @@ class Proposals:
         return True
 
     def wait(self) -> None:
-        """Wait until what `begin_stage` began is compiled."""
+        """Wait until the compilation started by `begin_stage` has finished."""
         for program in (self._program.ask, self._program.plan, self._program.tell):
             if isinstance(program, Compilation):
                 program.result()
 
     def checkpoint(self) -> dict[str, np.ndarray | Array]:
-        """Return the state that decides the next points; its values are arrays and never change."""
+        """Return the state that determines the next points; its arrays never change."""
         leaves = jax.tree.leaves(self._state)
         return {
             **{f"search.{i}": leaf for i, leaf in enumerate(leaves)},

@@ -21,7 +21,7 @@ TRIES = 16
 
 
 class Repetition:
-    """The points that were simulated so far, each as a number that tells it apart."""
+    """The points simulated so far, each as a number that identifies it."""
 
     def __init__(self, cube: Cube, key: Key[Array, ""]) -> None:
         self._cube, self._levels = cube, np.array(cube.levels)
@@ -32,17 +32,17 @@ class Repetition:
 
     @property
     def codes(self) -> UInt64[np.ndarray, " n"]:
-        """The numbers, in the order of the simulations; what is in this array never changes."""
+        """The numbers, in the order of the simulations; this array is never modified."""
         return self._codes[: self._count]
 
     def restore(self, codes: UInt64[np.ndarray, " n"]) -> None:
-        """Go on with the codes of an earlier process."""
+        """Continue with the codes of an earlier process."""
         # There is room at the end, so that a round does not copy those before it.
         self._codes, self._count = np.resize(codes, 2 * len(codes) + 1024), len(codes)
         self._known = set(codes.tolist())
 
     def add(self, points: Float[np.ndarray, "n d"]) -> None:
-        """Remember points that are simulated."""
+        """Record points that are simulated."""
         if self._count >= MEMORY or not len(points):
             return
         new = self._code(points)[: MEMORY - self._count]
@@ -60,16 +60,16 @@ class Repetition:
         anywhere: bool,
         number: int,
     ) -> tuple[Float[np.ndarray, "n d"], Float[np.ndarray, "n d"]]:
-        """Replace points that were simulated before, or that stand there twice.
+        """Replace points that were simulated before, or that occur twice.
 
         **Arguments:**
         - `points`: proposals, in the unit cube.
-        - `wanted`: which of them will be simulated.
-        - `anywhere`: whether any point of the cube may take a turn; otherwise one next to it, but
-          for a cube without continuous coordinates, in which nothing is next to a point.
-        - `number`: proposals up to these, from which the random numbers follow.
-        **Returns:** the points to simulate, and those that the search learns of: the same, but the
-        proposals themselves where what is simulated lies next to them.
+        - `wanted`: which of the points will be simulated.
+        - `anywhere`: whether any point of the cube may replace one; otherwise one next to it. In a
+          cube without continuous coordinates any point may.
+        - `number`: number of proposals so far, from which the random numbers are derived.
+        **Returns:** the points to simulate, and those that the search observes: the same points, or
+        the original proposals if the simulated points lie next to them.
         """
         repeated = wanted & self._repeated(points)
         if not repeated.any():

@@ -20,12 +20,12 @@ its programs are large, and then run nearly as fast."""
 
 
 def optimization_of(search: Search, batch: int) -> XlaOptimization:
-    """Return how much is done to make the programs of a search fast."""
+    """Return how strongly the compiler optimises the programs of a search."""
     return "least" if search.wants.clauses and batch <= SMALL else "little"
 
 
 class SearchProgram(NamedTuple):
-    """Compiled functions of a search; `init` is None if they begin with the state of another."""
+    """Compiled functions of a search; `init` is None if they start from another search's state."""
 
     init: Callable[..., PyTree] | None
     ask: Callable[..., tuple[Array, PyTree]]
@@ -39,9 +39,9 @@ class SearchProgram(NamedTuple):
 def compiled_search(
     search: Search, cube: Cube, batch: int, coverage_ids: int, begins: bool = True
 ) -> SearchProgram:
-    """Compile `init / ask / tell` of one search on one cube, in the background, side by side.
+    """Compile `init / ask / tell` of a search on a cube, concurrently in the background.
 
-    - `begins`: whether `init` is wanted.
+    - `begins`: whether `init` is needed.
     """
     key = jax.eval_shape(lambda: jax.random.key(0, impl="threefry2x32"))
     begun = jax.jit(lambda key: search.init(key, cube, batch)).trace(key)

@@ -36,17 +36,17 @@ class SobolState(NamedTuple):
 
 @dataclass(frozen=True)
 class Sobol(PointSequence[SobolState]):
-    """Sobol' points, the first one with index 0; the same for any batch size.
+    """The Sobol' sequence from index 0; the same for any batch size.
 
-    The first `2^k` points, and each `2^k` after them, are the most even. Unscrambled, the first
-    point is the corner at the origin: leaving it out would spoil that (Owen, On dropping the first
-    Sobol' point, 2022).
+    The first `2^k` points, and every further `2^k`, are evenly distributed. Without scrambling the
+    first point is the corner at the origin; leaving it out would destroy the evenness (Owen, On
+    dropping the first Sobol' point, 2022).
 
     **Arguments:**
-    - `scramble`: scramble at random (from the key). `False` is the plain sequence, which does not
-      depend on the key.
+    - `scramble`: whether to scramble at random (from the key). `False` gives the plain sequence,
+      which does not depend on the key.
     **Raises:** `ValueError` for a `scramble` that is neither True nor False. `check` raises it for
-    more coordinates than there are direction numbers for.
+    more coordinates than there are direction numbers.
     """
 
     scramble: bool = True
@@ -86,7 +86,7 @@ class Sobol(PointSequence[SobolState]):
 
 @lru_cache(maxsize=8)
 def direction_numbers(dim: int) -> UInt32[np.ndarray, "bits dim"]:
-    """Compute direction numbers of `dim` coordinates, binary point before the first bit."""
+    """Compute direction numbers of `dim` coordinates; the binary point is before the first bit."""
     polynomials, initial = _joe_kuo()
     numbers = np.zeros((BITS, dim), np.uint32)
     for j in range(dim):

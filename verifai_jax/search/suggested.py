@@ -29,22 +29,23 @@ Suggest: TypeAlias = Callable[[dict[str, Any]], Iterable[Mapping[str, Any]]]
 
 @dataclass(frozen=True)
 class Suggested(Wrapper[PyTree]):
-    """Another search, to which a function gives points on the way.
+    """A wrapper around another search, for which a function suggests points during the run.
 
     **Arguments:**
-    - `suggest`: called with a question, returns a list of suggestions: features by name, as a
-      person writes them, or by the columns of the table. An empty list is no suggestion.
-    - `search`: the one that goes on from them; it must learn.
-    - `times`: maximum number of questions of a run, the first of them before any simulation.
-    - `every`: minimum number of simulations from one question to the next.
-    - `points`: suggestions that are wanted of a question.
-    - `rows`: maximum number of rows of the table that a question holds, the last ones.
-    - `worst`: rows with the lowest robustness that a question holds with their traces. Each is
-      simulated once more for it.
-    - `units`: the units of features, by name, such as `{"mass": "kg"}`; for the question alone.
-    - `context`: whatever else the function should know; for the question alone.
-    - `strict`: end the run at a suggestion that cannot be simulated. Otherwise it is left out, the
-      notes of the run say so, and so does the next question.
+    - `suggest`: a function called with a question. It returns a list of suggestions: features by
+      name, as a user writes them, or by the columns of the table. An empty list means no
+      suggestion.
+    - `search`: the wrapped search, which continues from the suggestions; it must learn.
+    - `times`: maximum number of questions in a run; the first is asked before any simulation.
+    - `every`: minimum number of simulations between two questions.
+    - `points`: number of suggestions wanted for a question.
+    - `rows`: maximum number of the table's latest rows in a question.
+    - `worst`: number of rows with the lowest robustness that a question contains with their traces;
+      each is simulated once more.
+    - `units`: the units of features, by name, such as `{"mass": "kg"}`; only used in the question.
+    - `context`: further information for the function; only used in the question.
+    - `strict`: whether a suggestion that cannot be simulated ends the run. Otherwise it is left
+      out, which the notes of the run and the next question mention.
     **Raises:** `TypeError` for anything that is neither a function nor a search; `ValueError` for a
     search that does not learn, or numbers out of range.
     """
@@ -87,7 +88,7 @@ class Suggested(Wrapper[PyTree]):
         return f"{getattr(self.suggest, '__module__', None) or '__main__'}:{name}"
 
     def check(self, cube: Cube) -> None:
-        """Raise `ValueError`: suggestions are asked for between the rounds of `falsify` alone."""
+        """Raise `ValueError`, since only the rounds of `falsify` can ask for suggestions."""
         raise ValueError(
             "suggestions are asked for between the rounds of vj.falsify and vj.resume, so "
             f"Suggested must be their search itself, and no part of another one; got it with "
@@ -100,7 +101,7 @@ class Suggested(Wrapper[PyTree]):
 
 @dataclass(frozen=True)
 class Absent:
-    """The function of a run that was loaded, of which the record has only the name."""
+    """The function of a loaded run, of which the record only has the name."""
 
     source: str
 
@@ -113,7 +114,7 @@ class Absent:
 
 
 def without_suggestions(search: Any) -> tuple[Suggested | None, Any]:
-    """Return a search that asks for suggestions, None if this one does not, and the one inside."""
+    """Return the asking search, None if there is none, and the wrapped search."""
     if isinstance(search, Suggested):
         return search, search.search
     return None, search

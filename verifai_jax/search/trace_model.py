@@ -40,7 +40,7 @@ MIN_NOISE = -10.0  # minimum of it, which keeps 32-bit factors finite
 
 
 class TraceHyper(NamedTuple):
-    """Natural logarithms of the hyper-parameters; variances are in those of a component."""
+    """Natural logarithms of the hyper-parameters; variances are relative to a component's."""
 
     lengths: Float[Array, " x"]
     parts: Float[Array, " 4"]
@@ -55,10 +55,10 @@ def first_hyper(width: int) -> TraceHyper:
 
 
 class TraceModel(NamedTuple):
-    """A model of traces `[samples]` over points `[x]`; rows that are absent change nothing.
+    """A model of traces `[samples]` over points `[x]`; absent rows have no effect.
 
     - `hyper`: hyper-parameters.
-    - `x`: points of the rows, about zero.
+    - `x`: points of the rows, centred at zero.
     - `mask`: which rows are present.
     - `coefficients`: the coefficients of the components, by row.
     - `factor`: Cholesky factor of the covariance of the rows.
@@ -94,10 +94,10 @@ def fit(
     mask: Bool[Array, " n"],
     coefficients: Float[Array, "n c"],
 ) -> TraceHyper:
-    """Find the most probable hyper-parameters, by Adam from `hyper` on.
+    """Find the most probable hyper-parameters with Adam, starting from `hyper`.
 
-    The variance of each component is the most probable one given the others, in closed form;
-    components count by their share of the variance.
+    The variance of each component is the most probable one given the other parameters, in closed
+    form; components are weighted by their share of the variance.
     """
     variance = jnp.sum(coefficients**2, axis=0)
     share = variance / jnp.maximum(jnp.sum(variance), 1e-30)
@@ -121,7 +121,7 @@ def condition(
     mean: Float[Array, " samples"],
     components: Float[Array, "c samples"],
 ) -> TraceModel:
-    """Return the model of these rows."""
+    """Return the model conditioned on these rows."""
     noisy = _noisy(hyper, x, mask)
     factor, _ = finite_factor(noisy, jnp.trace(noisy) / len(noisy))
     half = jax.scipy.linalg.solve_triangular(factor, coefficients, lower=True)
@@ -140,10 +140,10 @@ def draw(
 
     **Arguments:**
     - `count`: the number of simulators.
-    - `guess`: whether the first one is the posterior's mean.
-    - `spread`: factor on the posterior's standard deviations; more than 1 where the model has been
-      too sure of itself. The mean, and the rows that it goes through, stay.
-    **Returns:** what `basis` needs, and the weights of its terms for each of them.
+    - `guess`: whether the first one is the posterior mean.
+    - `spread`: factor on the posterior's standard deviations; above 1 if the model has been
+      overconfident. The mean and the observed rows are unaffected.
+    **Returns:** the input of `basis`, and the weights of its terms for each simulator.
     """
     n, width = model.x.shape
     components = model.coefficients.shape[1]
@@ -173,7 +173,7 @@ def draw(
 
 
 def basis(model: TraceModel, waves: Waves, x: Float[Array, "m x"]) -> Float[Array, "m terms"]:
-    """Return the terms of drawn simulators; times their weights the coefficients of traces."""
+    """Return the terms of drawn simulators; multiplied by their weights they give coefficients."""
     cross = jnp.where(model.mask, _covariance(model.hyper, x, model.x), 0.0)
     return jnp.concatenate([_prior_basis(model, waves, x), cross], axis=1)
 
@@ -181,7 +181,7 @@ def basis(model: TraceModel, waves: Waves, x: Float[Array, "m x"]) -> Float[Arra
 def principal_components(
     traces: Float[np.ndarray, "n samples"],
 ) -> tuple[Float[np.ndarray, " samples"], Float[np.ndarray, "c samples"]]:
-    """Return the mean trace and the principal components, `COMPONENTS` of them, some zero."""
+    """Return the mean trace and `COMPONENTS` principal components, padded with zeros."""
     mean = traces.mean(axis=0)
     _, size, rows = np.linalg.svd((traces - mean).astype(np.float64), full_matrices=False)
     kept = (size**2 > NEGLIGIBLE * np.sum(size**2))[:COMPONENTS]

@@ -20,20 +20,20 @@ MAX_BATCH = 8
 
 @dataclass(frozen=True)
 class TraceSurrogate(TraceOptions, Wrapper[TuRBOState]):
-    """Model of the traces, monitored and descended on; the real system decides.
+    """A model of the traces on which searches descend; real simulations decide.
 
     **Arguments:**
-    - `initial`: points of the prior before the model has a say.
-    - `share`: the share of the points that the model proposes; the others are those of `TuRBO`.
-    - `capacity`: maximum number of rows that the model knows, the best half and the last ones.
-    - `starts`: descents for each proposal, the best one of which is simulated.
-    - `steps`: steps of a descent.
+    - `initial`: number of points of the prior before the model proposes any.
+    - `share`: share of the points that the model proposes; `TuRBO` proposes the others.
+    - `capacity`: maximum number of rows in the model: the best half and the latest ones.
+    - `starts`: number of descents for each proposal; the best one is simulated.
+    - `steps`: number of steps of a descent.
     **Raises:** `ValueError` for values out of range.
     """
 
     @property
     def search(self) -> TuRBO:
-        """The search that it is without traces."""
+        """The search that is used without traces."""
         return TuRBO(initial=self.initial, capacity=self.capacity)
 
     @property

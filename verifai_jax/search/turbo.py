@@ -63,13 +63,13 @@ class TuRBO(Search[TuRBOState]):
     """Bayesian optimization in a trust region; for 20 coordinates and more.
 
     **Arguments:**
-    - `capacity`: maximum number of points that the process knows, since the last restart. Of more
+    - `capacity`: maximum number of points in the process since the last restart. If there are more,
       it keeps the best half and a random choice of the others.
-    - `candidates`: points of the box among which each drawn function is minimized.
-    - `initial`: points of the prior at every start.
-    - `successes`: rounds with progress in a row, after which the box doubles.
-    - `patience`: points without progress after which it halves, in dimensions of the space; never
-      less than four points.
+    - `candidates`: number of points of the box among which each drawn function is minimised.
+    - `initial`: number of points of the prior at each start.
+    - `successes`: consecutive rounds with progress after which the box doubles.
+    - `patience`: points without progress after which the box halves, as a multiple of the
+      dimension; never less than four points.
     **Raises:** `ValueError` for values out of range.
     """
 
@@ -182,8 +182,8 @@ def trust_box(
 ) -> tuple[Float[Array, " d"], Float[Array, " d"]]:
     """Return the lowest and the highest corner of the trust region.
 
-    Sides are in proportion to the length scales, with the volume of a cube. A discrete coordinate
-    can always reach the cells next to its own, and one without an order all of its cells.
+    Sides are proportional to the length scales, and the volume is that of a cube. A discrete
+    coordinate can always reach the neighbouring cells, and one without an order all of its cells.
     """
     lengths = state.memory.hyper.lengths
     width = state.side * jnp.exp(lengths - jnp.mean(lengths))

@@ -18,7 +18,7 @@ class UniformState(NamedTuple):
 
 @dataclass(frozen=True)
 class Uniform(PointSequence[UniformState]):
-    """Independent uniform points; point `i` depends on the key and `i` alone, not on the batch."""
+    """Independent uniform points; point `i` depends only on the key and `i`, not on the batch."""
 
     samples_prior: ClassVar[bool] = True
 
@@ -33,6 +33,6 @@ class Uniform(PointSequence[UniformState]):
 def uniform_points(
     key: Key[Array, ""], index: UInt32[Array, " n"], dim: int
 ) -> Float[Array, "n dim"]:
-    """Compute points number `index` of the random sequence that `key` starts."""
+    """Compute points of the random sequence of `key` by their `index`."""
     keys = jax.vmap(jax.random.fold_in, (None, 0))(key, index)
     return jax.vmap(lambda key: jax.random.uniform(key, (dim,), jnp.float32))(keys)

@@ -27,9 +27,9 @@ Learn: TypeAlias = Callable[[PyTree, Cube, Observations], PyTree]
 class Wrapper(Search[State]):
     """A search around another one; a subclass is a frozen dataclass with a field `search`.
 
-    One that moves the points of a search that samples the prior defines `samples_prior` as False.
-    A subclass whose state holds more than that of the search inside defines `inner_state` and
-    `with_inner_state`, and one that changes what the search inside learns defines `learn`.
+    A wrapper that moves the points of a search that samples the prior defines `samples_prior` as
+    False. A subclass whose state holds more than that of the wrapped search defines `inner_state`
+    and `with_inner_state`; one that changes what the wrapped search learns defines `learn`.
 
     **Raises:** `TypeError` for anything that is not a search.
     """
@@ -43,15 +43,15 @@ class Wrapper(Search[State]):
             raise TypeError(f"{name} needs a search like CrossEntropy(); got {self.search!r}")
 
     def inner_state(self, state: State) -> PyTree:
-        """Return the state of the search inside."""
+        """Return the state of the wrapped search."""
         return state
 
     def with_inner_state(self, state: State, inner: PyTree) -> State:
-        """Return the state with another one of the search inside."""
+        """Return the state with a new state of the wrapped search."""
         return cast(State, inner)
 
     def learn(self, learn: Learn, state: State, cube: Cube, observations: Observations) -> State:
-        """Learn from observations, by one of the three ways in which the search inside learns."""
+        """Learn from observations, in one of the three ways in which the wrapped search learns."""
         inner = learn(self.inner_state(state), cube, observations)
         return self.with_inner_state(state, inner)
 

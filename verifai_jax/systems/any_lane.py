@@ -10,9 +10,9 @@ from jaxtyping import Array, Bool, PyTree
 
 @jax.custom_batching.custom_vmap
 def in_any_lane(condition: Any) -> Any:
-    """Return the condition, and in a batch whether it holds in any lane.
+    """Return the condition; in a batch, whether it holds in any lane.
 
-    All lanes share the result, so a branch on it stays a branch under `jax.vmap`.
+    All lanes share the result, so that a branch on it remains a branch under `jax.vmap`.
     """
     return condition
 
@@ -26,10 +26,10 @@ def _(_: int, batched: Any, conditions: Any) -> tuple[Any, bool]:
 def changed_if_needed(
     change: Callable[..., Any], needed: Bool[Array, ""], value: PyTree, *others: PyTree
 ) -> Any:
-    """Return `change(value, *others)`, or `value` unchanged where no lane of a batch needs it.
+    """Return `change(value, *others)`, or `value` unchanged if no lane of a batch needs a change.
 
     In a lane that needs no change, `change` must return `value`. Derivatives are those of `change`,
-    also in such a lane.
+    even in such a lane.
     """
     if jax.default_backend() != "cpu":
         # On an accelerator the host would wait at each step for the condition.

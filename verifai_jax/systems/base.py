@@ -33,7 +33,7 @@ Carry = TypeVar("Carry")
 
 
 class Outcome(NamedTuple):
-    """The end of one simulation: a trace, or a status other than OK and a message."""
+    """The result of one simulation: a trace, or a status other than OK with a message."""
 
     trace: Trace | None
     status: Status = Status.OK
@@ -41,13 +41,13 @@ class Outcome(NamedTuple):
 
 
 def outcome_of(simulate: Callable[[], Any]) -> Outcome:
-    """Simulate once in this process, and return what came of it.
+    """Simulate once in this process, and return the outcome.
 
-    Whatever a simulator raises is the end of its own row, as it is in a worker: `sys.exit()` and
-    exceptions that are no `Exception` too. Only Ctrl-C ends the run.
+    Whatever a simulator raises ends only its own row, as in a worker process: this includes
+    `sys.exit()` and exceptions that are not an `Exception`. Only Ctrl-C ends the run.
 
     **Arguments:**
-    - `simulate`: calls the system.
+    - `simulate`: a function that calls the system.
     """
     try:
         with returning_once():
@@ -59,26 +59,26 @@ def outcome_of(simulate: Callable[[], Any]) -> Outcome:
 
 
 class System(ForUsers):
-    """A system under test: a callable `(features, key) -> Trace`, and what else it may offer.
+    """A system under test: a callable `(features, key) -> Trace`, with optional capabilities.
 
     - `black_box`: True for a system that runs on the host; JAX must be able to trace any other.
-    - `lanes`: simulations that a device works on together.
-    - `effort`: how much XLA does to make programs that simulate it fast; one for all numbers of
-      rows, since a row's last digits may depend on it.
-    - `forward_up_to`: features up to which forward mode is no slower than reverse mode.
-    - `notes`: sentences for the notes of a run, on what the system changed in what it was given.
-    - `reverse_hint`: a sentence for users, on what makes reverse mode work where it does not.
-    - `dt`: the sampling period in seconds of what `fold` simulates.
-    - `workers`: simulations of a black box that run side by side.
-    - `exact_step`: True where the step is part of what the system is, as in an environment that its
-      authors define by a difference equation: no finer step simulates the same system.
-    - `traced_factor`: True where JAX may trace the factor that `refined` takes.
-    - `backends`: names of the engines that can simulate this system, for one with several.
+    - `lanes`: number of simulations that a device processes together.
+    - `effort`: how strongly XLA optimises programs that simulate it. It is the same for all numbers
+      of rows, since a row's last digits may depend on it.
+    - `forward_up_to`: number of features up to which forward mode is no slower than reverse mode.
+    - `notes`: sentences for the notes of a run, on changes that the system made to its inputs.
+    - `reverse_hint`: a sentence for users on how to make reverse mode work if it does not.
+    - `dt`: the sampling period of `fold` in seconds.
+    - `workers`: number of simulations of a black box that run in parallel.
+    - `exact_step`: True if the step is part of the system, as in an environment that is defined by
+      a difference equation: no finer step simulates the same system.
+    - `traced_factor`: True if JAX may trace the factor of `refined`.
+    - `backends`: names of the engines that can simulate this system, if there are several.
     - `backend`: the engine in use, or `"auto"` until a run decides; None without `backends`.
-    - `likely`: the engine that is likely the fastest on a CPU.
-    - `derived`: how a verb made this system of the one that it was given, as plain data for the
-      record of a run; None for a system of a person's own.
-    - `constants`: numbers and texts of the model by name, by which two models can be compared.
+    - `likely`: the engine that is probably the fastest on a CPU.
+    - `derived`: how a verb derived this system from the given one, as plain data for the record of
+      a run; None for a user's own system.
+    - `constants`: numbers and texts of the model by name, with which two models can be compared.
     """
 
     _internal = frozenset((
@@ -110,17 +110,17 @@ class System(ForUsers):
         raise NotImplementedError(f"{type(self).__name__} has no __call__(features, key)")
 
     def check(self, features: Features) -> None:
-        """Refuse features that the system does not fit, before anything compiles.
+        """Refuse features that do not fit the system, before anything compiles.
 
         **Arguments:**
         - `features`: `jax.ShapeDtypeStruct`s.
-        **Raises:** `ValueError` that says what does not fit.
+        **Raises:** `ValueError` that names what does not fit.
         """
 
     def abstract(self, features: Features) -> Trace | None:
-        """Return the form of the trace, its signals as `jax.ShapeDtypeStruct`s.
+        """Return the shapes of the trace, its signals as `jax.ShapeDtypeStruct`s.
 
-        None if nothing but a simulation can tell.
+        None if only a simulation can show them.
 
         **Arguments:**
         - `features`: `jax.ShapeDtypeStruct`s.
@@ -131,15 +131,15 @@ class System(ForUsers):
 
     @property
     def known_signals(self) -> KnownSignals:
-        """Signals of a trace, of a system without `abstract`: names, with components where known.
+        """The signals of a system without `abstract`: names, with components if known.
 
-        None if nothing but a simulation can tell.
+        None if only a simulation can show them.
         """
         return None
 
     @property
     def can_fold(self) -> bool:
-        """True for a system that can simulate without storing its samples."""
+        """True if the system can simulate without storing its samples."""
         return type(self).fold is not System.fold
 
     def fold(
@@ -149,7 +149,7 @@ class System(ForUsers):
         carry: Carry,
         update: Callable[[Carry, dict[str, Array]], Carry],
     ) -> tuple[Carry, Int[Array, ""]]:
-        """Simulate, and let `carry = update(carry, sample)` take in each sample; none is stored.
+        """Simulate with `carry = update(carry, sample)` for each sample, without storing samples.
 
         After an early end the last valid sample repeats until the last step.
 
@@ -159,22 +159,22 @@ class System(ForUsers):
 
     @property
     def can_refine(self) -> bool:
-        """True for a system that has finer steps; never where `exact_step`."""
+        """True if the system has finer steps; never with `exact_step`."""
         return type(self).refined is not System.refined and not self.exact_step
 
     def refined(self, factor: int | Int[Array, ""]) -> "System":
-        """Return the same system, sampled and decided as before, at a smaller step.
+        """Return the same system with a smaller step; samples and decisions keep their times.
 
         **Arguments:**
-        - `factor`: the step is divided by it; a traced integer where `traced_factor` allows it.
+        - `factor`: the divisor of the step; a traced integer if `traced_factor` allows it.
         **Raises:** `ValueError` for a factor that is not a positive integer.
         """
         raise NotImplementedError(f"{self!r} has no refined(factor)")
 
     def renewed(self) -> "System":
-        """Return the same system without the state that its simulations left in it.
+        """Return the same system without any state left over from its simulations.
 
-        That is the system itself where it has nothing that could be made anew.
+        Returns the system itself if it has no such state.
         """
         return self
 
@@ -186,31 +186,31 @@ class System(ForUsers):
         raise ValueError(f"{self!r} has no backends to choose from; got backend {name!r}")
 
     def why_not(self, backend: str) -> str | None:
-        """Return the reason why an engine cannot simulate this system, None if it can."""
+        """Return the reason why an engine cannot simulate this system; None if it can."""
         return None if backend in self.backends else "the system has no such backend"
 
     def why_slow_to_compile(self, gradient: bool) -> str:
-        """Say why compiling this system takes minutes, and what is cheaper; empty if it is quick.
+        """Explain why compiling this system takes minutes, with a remedy; empty if it is quick.
 
         **Arguments:**
-        - `gradient`: whether derivatives are compiled too.
+        - `gradient`: whether derivatives are compiled as well.
         """
         return ""
 
     def why_error(self, features: Features) -> str | None:
-        """Return the reason why a traced simulation ended with the status `ERROR`, None if unknown.
+        """Return the reason why a traced simulation ended with status `ERROR`; None if unknown.
 
         **Arguments:**
-        - `features`: numbers by the names of the table's columns.
+        - `features`: numbers by column name of the table.
         """
         return None
 
     def passing(self, features: Features) -> Passing:
-        """Return what passes between the system and its policy, where faults can be.
+        """Return the values that pass between the system and its policy, where faults can act.
 
         **Arguments:**
         - `features`: `jax.ShapeDtypeStruct`s.
-        **Raises:** `ValueError` for a system that has no policy or controller that is known here.
+        **Raises:** `ValueError` for a system without a known policy or controller.
         """
         raise ValueError(
             f"{self!r} has no loop of which observations and actions are known, so that no fault "
@@ -226,7 +226,7 @@ class System(ForUsers):
     def may_draw(self, features: Features) -> bool:
         """Return whether a simulation of a host system may depend on its random key.
 
-        JAX tells of any other system. What nobody knows may.
+        For any other system JAX finds out. If nothing is known, the answer is True.
 
         **Arguments:**
         - `features`: `jax.ShapeDtypeStruct`s.
@@ -235,7 +235,7 @@ class System(ForUsers):
 
     @property
     def can_simulate_batch(self) -> bool:
-        """True for a host system that simulates many rows in lock-step."""
+        """True if a host system simulates many rows in lock-step."""
         return type(self).simulate_batch is not System.simulate_batch
 
     def simulate_batch(self, features: Features, keys: Key[Array, " n"]) -> Trace:
@@ -249,13 +249,13 @@ class System(ForUsers):
 
     @property
     def can_simulate_each(self) -> bool:
-        """True for a host system that simulates rows on their own, in any order."""
+        """True if a host system simulates rows separately, in any order."""
         return type(self).simulate_each is not System.simulate_each
 
     def simulate_each(
         self, features: Sequence[Features], seeds: Sequence[int]
     ) -> Iterator[tuple[int, Outcome]]:
-        """Simulate rows on the host, each on its own: in processes, or on other machines.
+        """Simulate rows on the host separately: in processes, or on other machines.
 
         **Returns:** the index and the outcome of each row exactly once, in any order, as soon as
         its simulation has ended.
@@ -272,8 +272,8 @@ _VALUES = (
 class FunctionSystem(System):
     """A function `(features, key) -> Trace` as a system; made by `as_system`.
 
-    An object that can be called, and that has some attributes and methods of a `System`, offers
-    them here. Two of one function are equal, so that JAX does not trace it twice.
+    If the callable object has attributes and methods of a `System`, they are available here. Two
+    systems of one function are equal, so that JAX does not trace it twice.
     """
 
     def __init__(self, function: Callable[..., Any]) -> None:
@@ -373,11 +373,11 @@ class FunctionSystem(System):
 
 
 def as_system(thing: object) -> System:
-    """Return a system as it is, and anything else that can be called as a system.
+    """Return a system unchanged, and any other callable as a system.
 
-    This is the only place that asks an object what it offers.
+    Only this function examines which capabilities an object has.
 
-    **Raises:** `ValueError` for what cannot be called.
+    **Raises:** `ValueError` for an object that cannot be called.
     """
     if isinstance(thing, System):
         return thing

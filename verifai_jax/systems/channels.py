@@ -25,12 +25,12 @@ States: TypeAlias = tuple[PyTree, ...]
 
 
 class Instant(NamedTuple):
-    """The instant at which something passes.
+    """The instant at which a value passes through a link.
 
-    - `time`: in seconds; `period`: between two of them.
+    - `time`: time in seconds; `period`: seconds between two instants.
     - `features`: the features of the simulation.
     - `xp`: `jax.numpy`, or `numpy` on the host.
-    - `ended`: whether the simulation has ended, so that nothing new is remembered.
+    - `ended`: whether the simulation has ended, so that memory no longer changes.
     """
 
     time: Any
@@ -41,23 +41,23 @@ class Instant(NamedTuple):
 
     @property
     def step(self) -> Any:
-        """The number of instants before this one."""
+        """Number of earlier instants."""
         return self.xp.round(self.xp.asarray(self.time) / self.period).astype(np.int32)
 
     def kept(self, before: PyTree, after: PyTree) -> Any:
-        """Return what is remembered from here on: `after`, or `before` if it has ended."""
+        """Return the new memory: `after`, or `before` if the simulation has ended."""
         if self.ended is False:
             return after
         return jax.tree.map(lambda old, new: self.xp.where(self.ended, old, new), before, after)
 
 
 class Link:
-    """Something that observations, or actions, pass through.
+    """A link in the path of observations or actions, such as a delay or a fault.
 
-    - `side`: which of the two.
+    - `side`: whether it is in the path of observations or of actions.
     - `features`: names of the features that it reads.
-    - `draws`: whether it draws random numbers.
-    - `arrays`: names of the parts of an observation that it reads for others, see `Entries`.
+    - `draws`: whether it uses random numbers.
+    - `arrays`: names of the parts of an observation that it reads in addition; see `Entries`.
     """
 
     side: Side = "observation"
@@ -72,19 +72,19 @@ class Link:
         return ()
 
     def begin(self, value: PyTree, now: Instant, key: Key[Array, ""] | int | None) -> PyTree:
-        """Return what it remembers at first, of values of this form."""
+        """Return its initial memory, for values of this form."""
         return ()
 
     def through(self, state: PyTree, value: PyTree, now: Instant) -> tuple[PyTree, PyTree]:
-        """Return what comes out at this instant, and what it remembers then, as `now.kept`."""
+        """Return the output at this instant, and the new memory, from `now.kept`."""
         raise NotImplementedError
 
     def valid(self, features: PyTree) -> Any:
-        """Return whether its numbers are what they may be."""
+        """Return whether its numbers are valid."""
         return True
 
     def refusal(self, features: PyTree, owner: str) -> str | None:
-        """Return what is wrong with its numbers; None if nothing is."""
+        """Return the problem with its numbers; None if they are valid."""
         return None
 
     def check(self, features: PyTree) -> None:
@@ -95,7 +95,7 @@ class Link:
 
 
 class Channels(NamedTuple):
-    """The links of one simulation, in their order."""
+    """The links of one simulation, in order."""
 
     links: tuple[Link, ...]
     period: float
@@ -105,9 +105,9 @@ class Channels(NamedTuple):
     def begin(
         self, observation: PyTree, action: PyTree, key: Key[Array, ""] | int | None
     ) -> States:
-        """Return what the links remember at first, given values of the right forms.
+        """Return the initial memory of the links, for values of these forms.
 
-        An action is the one that stands for none.
+        The given action is the default before any decision.
         """
         first = {"observation": observation, "action": action}
         now = Instant(0.0, self.period, self.features, self.xp)
@@ -116,20 +116,20 @@ class Channels(NamedTuple):
     def observation(
         self, states: States, value: PyTree, time: Any, ended: Bool[Array, ""] | bool = False
     ) -> tuple[Any, States]:
-        """Return what the policy sees at `time` seconds, and what the links remember then.
+        """Return the observation that the policy receives at `time` s, and the links' new memory.
 
-        Where the simulation has ended, they remember what they did before.
+        If the simulation has ended, their memory stays unchanged.
         """
         return self._through("observation", states, value, time, ended)
 
     def action(
         self, states: States, value: PyTree, time: Any, ended: Bool[Array, ""] | bool = False
     ) -> tuple[Any, States]:
-        """Return the action that takes effect at `time`, and what the links remember then."""
+        """Return the action that takes effect at `time`, and the links' new memory."""
         return self._through("action", states, value, time, ended)
 
     def valid(self) -> Any:
-        """Return whether all numbers of the links are what they may be."""
+        """Return whether all numbers of the links are valid."""
         valid: Any = True
         for link in self.links:
             valid = valid & link.valid(self.features)
@@ -150,7 +150,7 @@ NOTHING_PASSED = Channels((), 1.0, {})
 
 
 def first_refusal(links: Iterable[Link], features: PyTree, owner: str) -> str | None:
-    """Return what is wrong with the numbers of the first link that `owner` cannot have; or None.
+    """Return the problem with the first link's invalid numbers, for `owner`; None if all are valid.
 
     **Arguments:**
     - `features`: numbers by name.
@@ -159,9 +159,9 @@ def first_refusal(links: Iterable[Link], features: PyTree, owner: str) -> str | 
 
 
 class NamedNumbers(NamedTuple):
-    """Numbers that have a name of their own: those at `index` of a part of one side; all if None.
+    """Named numbers: those at `index` of a part of observation or action; all if None.
 
-    `part` is the name of a leaf, as in `sensordata`; empty where the whole is one array.
+    `part` is the name of a leaf, such as `sensordata`; empty if there is a single array.
     """
 
     side: Side
@@ -170,12 +170,12 @@ class NamedNumbers(NamedTuple):
 
 
 class Passing(NamedTuple):
-    """The things that pass between a system and its policy, for a fault to be put in.
+    """The values that pass between a system and its policy, on which faults can act.
 
-    - `observation`, `action`: forms, as `jax.ShapeDtypeStruct`s.
-    - `period`: seconds between two decisions; `duration`: of a simulation.
-    - `names`: the names of single numbers, in addition to the names of the parts.
-    - `hidden`: parts of an observation that the whole of it does not include, such as the time.
+    - `observation`, `action`: their forms, as `jax.ShapeDtypeStruct`s.
+    - `period`: seconds between two decisions; `duration`: that of a simulation.
+    - `names`: names of single numbers, in addition to the names of the parts.
+    - `hidden`: parts of an observation that do not belong to the whole, such as the time.
     """
 
     observation: PyTree
@@ -186,12 +186,12 @@ class Passing(NamedTuple):
     hidden: tuple[str, ...] = ()
 
     def entries(self, channel: str) -> "Entries":
-        """Return the numbers that a channel names.
+        """Return the numbers selected by a channel.
 
         **Arguments:**
         - `channel`: `"observation"`, `"action"`, a name, or either with an index: `"action[0]"`.
         **Raises:** `UnknownNameError` with the nearest channel; `ValueError` for an index that does
-        not exist, and a channel without numbers.
+        not exist, and for a channel without numbers.
         """
         matched = re.fullmatch(r"(.+?)(?:\[(-?\d+)\])?", channel.strip())
         name, number = (channel, None) if matched is None else matched.groups()
@@ -240,10 +240,10 @@ class Passing(NamedTuple):
 
 
 class Entries(NamedTuple):
-    """Numbers within an observation or an action: of some leaves, the entries at flat indices.
+    """Selected numbers of an observation or an action: leaves, with flat indices into them.
 
-    - `whole`: whether they are whole numbers, such as choices.
-    - `names`: the names of the leaves, where single ones were named.
+    - `whole`: whether they are integers, such as choices.
+    - `names`: the names of the leaves, if single leaves were selected.
     """
 
     side: Side
@@ -253,11 +253,11 @@ class Entries(NamedTuple):
 
     @property
     def count(self) -> int:
-        """The number of them."""
+        """Number of selected entries."""
         return sum(len(index) for _, index in self.parts)
 
     def take(self, value: PyTree, xp: Any) -> Float[Any, " count"]:
-        """Return the numbers as a vector."""
+        """Return the selected numbers as a vector."""
         leaves = jax.tree.leaves(value)
         taken = [xp.ravel(xp.asarray(leaves[i])) for i, _ in self.parts]
         for at, (_, index) in enumerate(self.parts):
@@ -266,7 +266,7 @@ class Entries(NamedTuple):
         return taken[0] if len(taken) == 1 else xp.concatenate(taken)
 
     def put(self, value: PyTree, numbers: Float[Any, " count"], xp: Any) -> Any:
-        """Return the value with these numbers in it."""
+        """Return a copy of the value in which the selected numbers are replaced by these."""
         leaves, form = jax.tree.flatten(value)
         start = 0
         for i, index in self.parts:

@@ -22,9 +22,9 @@ MAX_PLAIN_STEPS = 512
 def checkpointed_scan(
     step: Callable[[Any, Any], tuple[Any, Any]], carry: PyTree, length: int, *, unroll: int = 1
 ) -> tuple[Any, Any]:
-    """Scan `step(carry, k)` over `k = 0 ... length - 1`, in segments where it is long.
+    """Scan `step(carry, k)` over `k = 0 ... length - 1`, in segments if it is long.
 
-    Forward results are those of one scan.
+    The results of the forward pass are those of one scan; segments save memory in reverse mode.
     """
     if length <= MAX_PLAIN_STEPS:
         return jax.lax.scan(step, carry, jnp.arange(length), unroll=unroll)

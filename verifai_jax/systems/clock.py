@@ -8,10 +8,10 @@ import math
 
 
 def count_periods(seconds: float, period: float, name: str, of: str = "dt") -> int:
-    """Return the number of periods in a time.
+    """Return the number of periods in a duration.
 
     **Arguments:**
-    - `seconds`, `period`: in seconds.
+    - `seconds`, `period`: both in seconds.
     - `name`, `of`: their names in the error.
     **Raises:** `ValueError` unless it is a whole number of at least 1.
     """

@@ -30,7 +30,7 @@ FEW = 16
 
 @dataclass(frozen=True)
 class Delay(Link):
-    """A delay: of `max_steps` steps, or of as many as `feature` says, `max_steps` at most."""
+    """A delay of `max_steps` steps, or of as many as a `feature` says, at most `max_steps`."""
 
     max_steps: int = 0
     feature: str | None = None
@@ -42,11 +42,11 @@ class Delay(Link):
         return () if self.feature is None else (self.feature,)
 
     def steps(self, features: Features) -> Any:
-        """Return the number of steps in one simulation; traced where the feature is."""
+        """Return the number of steps in one simulation; traced if the feature is."""
         return self.max_steps if self.feature is None else features[self.feature]
 
     def valid(self, features: Features) -> Any:
-        """Return whether the feature's value is a whole number from 0 to the greatest."""
+        """Return whether the feature's value is an integer from 0 to the maximum."""
         steps = self.steps(features)
         return (steps >= 0) & (steps <= self.max_steps) & (steps % 1 == 0)
 
@@ -68,7 +68,7 @@ class Delay(Link):
         return late, now.kept(state, lines)
 
     def refusal(self, features: Features, owner: str) -> str | None:
-        """Return what is wrong with the feature's value; None for a delay that `owner` can have."""
+        """Return the problem with the feature's value, for `owner`; None if it is valid."""
         steps = np.asarray(self.steps(features))
         if steps.shape == () and bool(self.valid(features)):
             return None
@@ -80,7 +80,7 @@ class Delay(Link):
     def check(self, features: Features) -> None:
         """Refuse a feature that draws real numbers, before anything compiles.
 
-        - `features`: `jax.ShapeDtypeStruct`s; of a feature that has a value, `valid` decides.
+        - `features`: `jax.ShapeDtypeStruct`s; concrete values are checked by `valid`.
 
         **Raises:** `ValueError`.
         """
@@ -99,9 +99,9 @@ NO_DELAY = Delay()
 
 
 def as_delay(option: DelayOption, name: str) -> Delay:
-    """Read the option `name`.
+    """Return the delay given by the option `name`.
 
-    **Raises:** `ValueError` for anything but a number of steps or `{feature: greatest number}`.
+    **Raises:** `ValueError` for anything but a number of steps or `{feature: maximum}`.
     """
     side: Side = "action" if name == "action_delay" else "observation"
     delay = Delay(option, side=side) if isinstance(option, int) else None
@@ -127,16 +127,16 @@ def as_delay(option: DelayOption, name: str) -> Delay:
 
 
 def line_of(first: Value, count: int) -> Any:
-    """Return a line: the last `count` values of an array, the newest first, all of them `first`.
+    """Return a delay line: the last `count` values, newest first, initially all `first`.
 
-    A few are arrays of their own: they move up without a copy, where an array of them all is
-    written anew at each step.
+    A short line consists of separate arrays, which are shifted without a copy; a single array would
+    be rewritten at each step.
     """
     return (first,) * count if count <= FEW else first[None].repeat(count, axis=0)
 
 
 def moved_up(line: Any, new: Value, xp: ModuleType = jnp) -> Any:
-    """Return a line with a new value at its beginning, without the oldest one."""
+    """Return a line with a new value at the front, without the oldest one."""
     new = xp.asarray(new, line[0].dtype)
     if isinstance(line, tuple):
         return (new, *line[:-1])
@@ -154,15 +154,15 @@ def entry(line: Any, index: Any, xp: ModuleType = jnp) -> Any:
 
 
 def links_of(*delays: Delay) -> tuple[Delay, ...]:
-    """Return the delays that delay something."""
+    """Return the delays that are not zero."""
     return tuple(delay for delay in delays if delay.max_steps or delay.feature is not None)
 
 
 def joined(links: tuple[Link, ...], faults: tuple[Link, ...]) -> tuple[Link, ...]:
-    """Return links with faults among them.
+    """Return links with faults inserted.
 
-    A sensor's fault comes before the delay of the observation, an actuator's after that of the
-    action; one fault comes after those before it.
+    Faults of sensors come before the delay of the observation, faults of actuators after the delay
+    of the action; faults keep their order.
     """
     delays = [link for link in links if isinstance(link, Delay)]
     others = [link for link in (*links, *faults) if not isinstance(link, Delay)]

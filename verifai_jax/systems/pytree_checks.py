@@ -12,7 +12,7 @@ from jaxtyping import Array, PyTree
 
 
 def as_floating(tree: PyTree, origin: str) -> Any:
-    """Return the same pytree with every leaf an array of one common floating-point dtype.
+    """Return the same pytree with all leaves as arrays of one floating-point dtype.
 
     **Raises:** `ValueError`, naming `origin`, for a tree without leaves or a leaf that is not a
     real number.
@@ -28,9 +28,9 @@ def as_floating(tree: PyTree, origin: str) -> Any:
 
 
 def in_working_precision(tree: PyTree) -> Any:
-    """Return a pytree as arrays, its real numbers in the precision that JAX computes in now.
+    """Return a pytree as arrays, with real numbers in JAX's present precision.
 
-    What was made outside of a system has the precision that JAX had then.
+    Values made outside a system have the precision that JAX had at that time.
     """
     real = jnp.result_type(float)
 
@@ -43,7 +43,7 @@ def in_working_precision(tree: PyTree) -> Any:
 
 
 def as_precise_as(tree: PyTree, like: PyTree) -> Any:
-    """Return a pytree with its real numbers in the precision of those of another like it."""
+    """Return a pytree with real numbers in the precision of those in a similar one."""
 
     def leaf(value: Any, other: Any) -> Any:
         have, want = getattr(value, "dtype", None), getattr(other, "dtype", None)
@@ -69,12 +69,13 @@ def check_like(
 ) -> None:
     """Refuse a pytree of shapes that differs from the `wanted` one in structure, shape or dtype.
 
-    A weakly typed number (a Python literal) may stand for any dtype that it can turn into.
+    A weakly typed number (a Python literal) matches any dtype to which it can be converted.
 
     **Arguments:**
-    - `same_precision`: whether real numbers must have the same number of bits; where not, whoever
-      asks converts them (`as_precise_as`).
-    **Raises:** `ValueError`: `origin` must return `role`, and the first difference.
+    - `same_precision`: whether real numbers must have the same number of bits; if not, the caller
+      converts them (`as_precise_as`).
+    **Raises:** `ValueError` that says what `origin` must return as `role`, and the first
+    difference.
     """
     must = f"{origin} must return {role}"
     if jax.tree.structure(got) != jax.tree.structure(wanted):
@@ -99,12 +100,13 @@ def check_like(
 
 
 def default_signals(state: PyTree, control: PyTree) -> dict[str, Array]:
-    """Return signals named after the state's own names, and the control's.
+    """Return signals named after the parts of the state and of the control.
 
-    A state without names (an array, a plain tuple) has no default. `(positions, velocities)` of
-    two dictionaries has the names of both. A control without names is called `control`.
+    A state without names (an array, a plain tuple) has no default. For a pair `(positions,
+    velocities)` of dictionaries, the names of both are used. A control without names is called
+    `control`.
 
-    **Raises:** `ValueError` where there are no names, or one is used twice.
+    **Raises:** `ValueError` if there are no names, or one is used twice.
     """
     parts = [_named(state)]
     if parts[0] is None and isinstance(state, tuple | list):
@@ -130,7 +132,7 @@ def default_signals(state: PyTree, control: PyTree) -> dict[str, Array]:
 
 
 def check_signals(signals: object) -> None:
-    """Refuse samples that no `Trace` can hold.
+    """Refuse samples that a `Trace` cannot hold.
 
     **Raises:** `ValueError` for anything but a dictionary of scalars and vectors.
     """
@@ -166,7 +168,7 @@ def _name(path: jax.tree_util.KeyPath) -> str:
 
 
 def outline(tree: PyTree) -> str:
-    """Write a tree in one line, arrays by dtype and shape: `{'x': float32[]}`."""
+    """Describe a tree in one line, arrays by dtype and shape: `{'x': float32[]}`."""
 
     def leaf(value: Any) -> str:
         if not hasattr(value, "shape"):

@@ -54,9 +54,9 @@ _STARTS = 8
 class Clusters(Drawn, InNotebook):
     """A partition of `samples`.
 
-    **Fields:** `assigned` `[n]`: cluster of each row looked at, 0 the largest, -1 noise; `method`;
-    `silhouette`: from -1 to 1, how much nearer rows are to their own cluster than to the next, on
-    at most 2000 rows; NaN for less than two clusters; `radius` of DBSCAN, else None.
+    **Fields:** `assigned` `[n]`: the cluster of each analysed row, 0 the largest, -1 noise;
+    `method`; `silhouette`: from -1 to 1, how much nearer rows are to their own cluster than to the
+    next, on at most 2000 rows; NaN for fewer than two clusters; `radius` of DBSCAN, else None.
     """
 
     _picture = "clusters", "plot_clusters"
@@ -71,12 +71,12 @@ class Clusters(Drawn, InNotebook):
 
     @property
     def count(self) -> int:
-        """Number of clusters, noise not counted."""
+        """Number of clusters, without noise."""
         return int(self.assigned.max(initial=-1)) + 1
 
     @property
     def labels(self) -> pd.Series:
-        """Cluster of each row number of the table; -1 is noise."""
+        """The cluster of each row number of the table; -1 is noise."""
         return pd.Series(self.assigned, index=self.samples.frame.index, name="cluster")
 
     def rows(self, cluster: int) -> Int[np.ndarray, " size"]:
@@ -90,7 +90,7 @@ class Clusters(Drawn, InNotebook):
 
     @cached_property
     def centres(self) -> pd.DataFrame:
-        """Mean of each ordered column, most frequent choice of each unordered one, by cluster."""
+        """Mean of each ordered column and most frequent choice of each other one, by cluster."""
         kinds = np.unique(self.assigned)
         frame = self.samples.frame
         columns: dict[str, Any] = {}
@@ -111,9 +111,9 @@ class Clusters(Drawn, InNotebook):
     def table(self) -> pd.DataFrame:
         """One row per cluster, the largest first, noise (-1) last.
 
-        Its centre in the features; `size` and `share` of the rows; `representative`: the row
-        nearest to the centre; `worst`: the row of least robustness, and `worst_rho`. A name that a
-        feature has gets `_` added.
+        It has the centre in the features; `size` and `share` of the rows; `representative`: the row
+        nearest to the centre; `worst`: the row of least robustness, and `worst_rho`. If a feature
+        has one of these names, `_` is appended.
         """
         placed = _embed(self.samples, self.scale, self.weight)
         centred = _embed(self.samples, self.scale, self.weight, self.centres)
@@ -155,7 +155,7 @@ class Clusters(Drawn, InNotebook):
         return "\n".join(lines)
 
     def entry(self, cluster: int, name: str) -> Any:
-        """Return what `table` says of a cluster, also where a feature has taken the name."""
+        """Return an entry of `table` for a cluster, even if a feature has the same name."""
         return self.table.at[cluster, f"{name}_" if f"{name}_" in self.table else name]
 
 
@@ -179,21 +179,21 @@ def clusters(
     **Arguments:**
     - `source`: a run, its table, a DataFrame with feature columns, or `Samples`.
     - `columns`, `which`, `space`: as in `Samples.of`.
-    - `method`: `"kmeans"` looks at ordered columns only, `"kmodes"` at unordered ones only,
-      `"kprototypes"` at both; `"auto"` takes the one that fits the columns. `"dbscan"` looks at
-      both, and finds the number of clusters and the noise itself.
-    - `count`: number of clusters; by default that from 2 to `max_clusters` with the greatest
+    - `method`: `"kmeans"` uses ordered columns only, `"kmodes"` unordered ones only,
+      `"kprototypes"` both; `"auto"` takes the one that fits the columns. `"dbscan"` uses both, and
+      finds the number of clusters and the noise itself.
+    - `count`: number of clusters; by default the one between 2 and `max_clusters` with the greatest
       silhouette (Rousseeuw, Journal of Computational and Applied Mathematics 20, 1987), or 1 if
-      none is above 0.25, or there are less than three rows. It is chosen on at most 5000 rows.
+      none is above 0.25, or if there are fewer than three rows. It is chosen on at most 5000 rows.
     - `radius`: the radius of DBSCAN, by default the knee of the distances to the k-th neighbour,
-      where k is twice the number of columns, and 4 at least.
+      where k is twice the number of columns, but at least 4.
     - `seed`: an integer, a NumPy generator or a `jax.random` key.
     - `scale`: as in `Samples.scaling`.
-    - `max_clusters`: clusters at most, where `count` is left out.
+    - `max_clusters`: maximum number of clusters if `count` is left out.
     **Returns:** `Clusters`; the same seed gives the same ones.
-    **Raises:** `ValueError` for an unknown method; a method
-    without a column that it can use; a `count` above the number of different rows, or for DBSCAN; a
-    radius that is not positive, or for another method.
+    **Raises:** `ValueError` for an unknown method; a method without a column that it can use; a
+    `count` that exceeds the number of different rows, or is given for DBSCAN; a radius that is not
+    positive, or is given for another method.
     """
     if method not in METHODS:
         raise ValueError(f"method must be one of {', '.join(map(repr, METHODS))}; got {method!r}")
@@ -324,9 +324,9 @@ MAX_ROWS = 20_000
 def dbscan(
     points: Float[np.ndarray, "n d"], needed: int, radius: float | None, rng: np.random.Generator
 ) -> tuple[Int[np.ndarray, " n"], float]:
-    """Clusters from 0, -1 for noise, and the radius.
+    """Return clusters from 0, with -1 for noise, and the radius.
 
-    A row is dense if `needed` rows, itself included, are within the radius.
+    A row is dense if at least `needed` rows, including itself, lie within the radius.
     """
     from scipy.spatial import KDTree
     from sklearn.cluster import DBSCAN
@@ -350,7 +350,7 @@ def dbscan(
 
 
 def knee(points: Float[np.ndarray, "n d"], k: int) -> float:
-    """Return the distance to the `k`-th nearest row, itself included, that makes a row lonely."""
+    """Return the knee of the distances to the `k`-th nearest row; beyond it rows are isolated."""
     from scipy.spatial import KDTree
 
     tree: Any = KDTree(points)

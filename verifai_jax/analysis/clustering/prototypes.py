@@ -19,10 +19,10 @@ def prototypes(
     count: int,
     rng: np.random.Generator,
 ) -> Int[np.ndarray, " n"]:
-    """Clusters of the rows, from 0; the best of 8 starts.
+    """Return the cluster of each row, from 0; the best of 8 starts.
 
-    The cost is the sum over rows of the squared distance of the coordinates from the cluster's mean
-    plus the number of codes that are not the cluster's most frequent one.
+    The cost is a sum over rows: the squared distance of the coordinates from the cluster's mean,
+    plus the number of codes that differ from the cluster's most frequent ones.
     """
     runs = [_run(coordinates, codes, count, rng) for _ in range(RESTARTS)]
     return min(runs, key=lambda run: run[1])[0]

@@ -54,22 +54,24 @@ def confirm(
     max_rows: int | None = None,
     progress: bool | None = None,
 ) -> Confirmation | Confirmations:
-    """Replay counterexamples more finely than they were found, and decide which are real.
+    """Replay counterexamples more precisely than they were found, and decide which are real.
 
     **Arguments:**
     - `run`: a run of a problem.
     - `row`: a row number, a row of the table, or a mapping with its feature columns; all
       counterexamples of the table when left out.
-    - `engines`: that have to agree: names of other backends, such as `"mjx"` or `"native"`, `"all"`
-      for those that are installed, another system for the same features and signals, a problem with
-      one, or several of these by name. What is confirmed in each of them is `transferable`.
-    - `max_rows`: how many rows are replayed at least, by default 256, and more where a row takes
-      few replays; of more, the worst and those nearest to zero, until the rest
-      is far from it (see `evaluation.confirmer.Confirmer`).
+    - `engines`: engines that have to agree: names of other backends, such as `"mjx"` or `"native"`,
+      `"all"` for those that are installed, another system for the same features and signals, a
+      problem with one, or several of these by name. A failure that is confirmed in each of them is
+      `transferable`.
+    - `max_rows`: minimum number of rows to replay, by default 256; more if a row takes few replays.
+      If there are more counterexamples, the worst and those nearest to zero are replayed, until the
+      rest is far from zero (see `evaluation.confirmer.Confirmer`).
     - `progress`: whether to show one line of progress; see `core.display.progress` for the default.
-    **Returns:** a `Confirmation` for a row, `Confirmations` for all; after Ctrl-C what is finished.
-    **Raises:** `ValueError` for a run without its problem, a row that is not a counterexample, an
-    engine that does not fit; `IndexError` for a row that is not in the table.
+    **Returns:** a `Confirmation` for a row, `Confirmations` for all; after Ctrl-C those that are
+    finished.
+    **Raises:** `ValueError` for a run without its problem, a row that is not a counterexample, or
+    an engine that does not fit; `IndexError` for a row that is not in the table.
     """
     if not isinstance(run, Run):
         raise TypeError(f"confirm needs a Run; got {type(run).__name__}")

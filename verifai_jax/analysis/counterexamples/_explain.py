@@ -42,9 +42,9 @@ MATTERS = 0.05
 class Explained(Drawn, InNotebook):
     """Reasons of a failure; `str()` is a paragraph, `plot` a picture.
 
-    **Fields:** `row`; `formula`: the name of the one that is broken most; `rho` of the row; `why`:
-    the predicate, the instant and the path (`mtl.Explanation`); `influences`: the features, the one
-    that matters most first; `simulations` spent; `replay`: the trace; `notes`.
+    **Fields:** `row`; `formula`: the name of the formula that is broken most; `rho` of the row;
+    `why`: the predicate, the instant and the path (`mtl.Explanation`); `influences`: the features
+    by decreasing influence; `simulations` spent; `replay`: the trace; `notes`.
     """
 
     _picture = "counterexamples", "plot_explanation"
@@ -59,12 +59,12 @@ class Explained(Drawn, InNotebook):
     notes: tuple[str, ...] = ()
 
     def effect(self, influence: Influence) -> float:
-        """Return the change of the robustness by a feature: back at nominal, or by its gradient."""
+        """Return how a feature changes the robustness: when reset to nominal, or by its slope."""
         return influence.effect(self.rho)
 
     @property
     def matter(self) -> tuple[Influence, ...]:
-        """The features whose influence is 5 % or more of the greatest, the greatest first."""
+        """The features with at least 5 % of the greatest influence, by decreasing influence."""
         maximum = max((abs(self.effect(i)) for i in self.influences), default=0.0)
         return tuple(
             i
@@ -91,20 +91,20 @@ def explain(
     nominal: Mapping[str, Any] | None = None,
     progress: bool | None = None,
 ) -> Explained:
-    """Explain a counterexample: the predicate that decides, when, and the features that matter.
+    """Explain a counterexample: the deciding predicate, its time, and the features that matter.
 
     **Arguments:**
     - `run`: a run of a problem, with a counterexample.
-    - `row`: the number of one, or a row of the table; the worst when left out.
-    - `nominal`: features that are ordinary, where the problem does not say or others are meant.
+    - `row`: the number of a counterexample, or its row of the table; the worst when left out.
+    - `nominal`: nominal features, if the problem has none or others are meant.
     - `progress`: whether to show one line of progress; see `core.display.progress` for the default.
 
-    Takes one simulation for each feature and each unit coordinate, and one gradient. Without
-    nominal features only the gradient tells what matters.
+    This takes one simulation for each feature and each unit coordinate, and one gradient. Without
+    nominal features only the gradient shows which features matter.
 
     **Returns:** an `Explained`.
-    **Raises:** `ValueError` for a run without its problem or without a counterexample, a row that
-    is none, or has no verdict when simulated again.
+    **Raises:** `ValueError` for a run without its problem or without a counterexample, and for a
+    row that is not a counterexample, or has no verdict when simulated again.
     """
     problem = problem_of(run)
     number, entry = select_row(run, row)
@@ -194,17 +194,18 @@ def slopes_of(
     gradient: Float[np.ndarray, " d"],
     precision: str,
 ) -> tuple[Float[np.ndarray, " d"], Float[np.ndarray, " d"]]:
-    """Return derivatives by the real numbers of the features, and the ranges of these.
+    """Return derivatives with respect to the features' real numbers, and the ranges of these.
 
-    A gradient by coordinates is one by probabilities, of which a hundredth is much in the tail of a
-    distribution and little in its middle.
+    Unit coordinates are probabilities, of which a hundredth changes a feature much in the tail of
+    its distribution and little in the middle, so their gradient is converted.
 
     **Arguments:**
     - `u`: the point at which the gradient was taken.
-    - `gradient`: by the coordinates.
-    - `precision`: in which it was taken.
-    **Returns:** the derivative for each coordinate, in the unit of its number, NaN for choices,
-    integers and lengths; and twice the width of the middle half, which is the whole of a Box.
+    - `gradient`: the gradient with respect to the unit coordinates.
+    - `precision`: the precision in which it was computed.
+    **Returns:** for each coordinate, the derivative with respect to its number in its unit, NaN for
+    choices, integers and lengths; and twice the interquartile range, which is the whole range of a
+    Box.
     """
 
     def numbers(point: Array) -> Array:
@@ -227,7 +228,7 @@ def slopes_of(
 
 
 def values_of(space: FeatureSpace, name: str, u: Float[np.ndarray, " d"]) -> tuple[Any, ...]:
-    """Return the entries of the table's columns of one feature at a point."""
+    """Return the entries of a feature's table columns at a point."""
     features = jax.tree.map(np.asarray, space.features_at(u[None]))
     columns = space.domains[name].to_columns(features[name], name)
     return tuple(c[0].item() if isinstance(c[0], np.generic) else c[0] for c in columns.values())

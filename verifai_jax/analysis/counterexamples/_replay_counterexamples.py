@@ -47,10 +47,10 @@ class ReplayedCounterexample:
     - `path`: the path of the file.
     - `state`: `"failing"`, `"fixed"`, `"without a verdict"`, `"no longer valid"` or `"of another
       problem"`.
-    - `robustness`: the least now; NaN without one.
-    - `before`: the least when it was saved.
-    - `note`: what has changed, or what is wrong, as text.
-    - `changed`: whether the model is another one than that which it was saved with.
+    - `robustness`: the least robustness now; NaN without a verdict.
+    - `before`: the least robustness when the file was saved.
+    - `note`: a text on what has changed or is wrong.
+    - `changed`: whether the model has changed since the file was saved.
     """
 
     path: Path
@@ -63,9 +63,9 @@ class ReplayedCounterexample:
 
 @dataclass(frozen=True, eq=False)
 class CorpusReplay(InNotebook):
-    """The files of a corpus, replayed against a problem, as `replay_counterexamples` returns them.
+    """The result of replaying a corpus against a problem, as `replay_counterexamples` returns it.
 
-    - `problem`: its name.
+    - `problem`: the name of the problem.
     - `folder`: the folder or file.
     - `replayed`: a `ReplayedCounterexample` for each file.
     """
@@ -75,7 +75,7 @@ class CorpusReplay(InNotebook):
     replayed: tuple[ReplayedCounterexample, ...]
 
     def of(self, state: str) -> tuple[ReplayedCounterexample, ...]:
-        """Return the files of this state."""
+        """Return the files in this state."""
         return tuple(one for one in self.replayed if one.state == state)
 
     @property
@@ -85,17 +85,17 @@ class CorpusReplay(InNotebook):
 
     @property
     def fixed(self) -> tuple[ReplayedCounterexample, ...]:
-        """Files whose simulation keeps all formulas now."""
+        """Files whose simulation now keeps all formulas."""
         return self.of(FIXED)
 
     @property
     def invalid(self) -> tuple[ReplayedCounterexample, ...]:
-        """Files that the problem has no place for any more, or that cannot be read."""
+        """Files whose features do not fit the problem any more, or that cannot be read."""
         return self.of(INVALID)
 
     @property
     def passed(self) -> bool:
-        """True where every file of this problem was simulated and is fixed."""
+        """True if every file of this problem was simulated and is fixed."""
         return all(one.state in (FIXED, OTHER) for one in self.replayed)
 
     @property
@@ -141,17 +141,17 @@ def replay_counterexamples(
 ) -> CorpusReplay:
     """Simulate the counterexamples of a corpus again, all in one batch.
 
-    Each is simulated with its features and its random key. A file whose features the space has no
-    place for is said to be no longer valid, with the reason; one whose formulas have changed is
-    judged by those of today, and says so. Files of problems of other names are counted.
+    Each is simulated with its features and its random key. A file whose features no longer fit the
+    space is reported as no longer valid, with the reason. If its formulas have changed it is judged
+    by the present ones, with a note. Files of problems with other names are only counted.
 
     **Arguments:**
-    - `problem`: as it is now.
-    - `folder`: that `run.save_counterexamples` wrote into, or one file of it.
-    - `rename`: new names of features by their old ones.
+    - `problem`: the present problem.
+    - `folder`: the folder that `run.save_counterexamples` wrote into, or one file of it.
+    - `rename`: a dictionary from old names of features to new ones.
     - `progress`: whether to show one line of progress; see `core.display.progress` for the default.
-    **Raises:** `FileNotFoundError` for a place that does not exist; `TypeError` for something that
-    is no `Problem`.
+    **Raises:** `FileNotFoundError` for a path that does not exist; `TypeError` for anything that is
+    not a `Problem`.
     """
     if not isinstance(problem, Problem):
         raise TypeError(f"replay_counterexamples needs a Problem; got {type(problem).__name__}")

@@ -60,38 +60,38 @@ def shrink(
     stay: bool = False,
     progress: bool | None = None,
 ) -> Shrunk:
-    """Search the least departure from the nominal features that still fails.
+    """Find the smallest departure from the nominal features that still fails.
 
     **Arguments:**
     - `run`: a run of a problem, with a counterexample.
-    - `row`: the number of one, or a row of the table; the worst when left out, by likelihood the
-      likeliest.
-    - `nominal`: features that are ordinary, where the problem does not say or others are meant.
-    - `by`: `"count"`: first as many events, and other items of arrays of variable length, as
-      nominal has, or the least difference from that; then the fewest coordinates that are not
-      exactly nominal, those of items that nominal does not have among them, then, with so many, the
-      least distance; nothing that departs in more coordinates than the row does;
-      `"distance"`: the least distance, whatever their number. It is Euclidean in unit coordinates,
-      of which each is 1 over its whole range (by probability, for a distribution), between two
-      choices 1, and by indices in integers. Every control point of a signal and every component of
-      a vector is a coordinate of its own;
-      `"likelihood"`: the greatest density of the prior, or probability of choices. The likeliest
-      features take the place of nominal ones, and the distance is the number of standard deviations
-      at which a normal distribution is as improbable.
-    - `budget`: simulations at most; a gradient counts as one.
+    - `row`: the number of a counterexample, or its row of the table; by default the worst, or the
+      likeliest with `by="likelihood"`.
+    - `nominal`: nominal features, if the problem has none or others are meant.
+    - `by`: the measure to minimise. `"count"`: first the difference in the number of items of
+      arrays of variable length, such as events; then the number of coordinates that are not exactly
+      nominal, among them those of items that nominal does not have; then the distance. The result
+      never departs in more coordinates than the row. `"distance"`: the distance alone. It is
+      Euclidean in unit coordinates: each is 1 over its whole range (by probability, for a
+      distribution), 1 between two choices, and measured by indices for integers. Every control
+      point of a signal and every component of a vector is a coordinate. `"likelihood"`: it
+      maximises the density of the prior, or the probability of choices. The likeliest features then
+      replace the nominal ones, and the distance is the number of standard deviations at which a
+      normal distribution is as improbable.
+    - `budget`: maximum number of simulations; a gradient counts as one.
     - `seed`: the seed of the random candidates.
-    - `others`: whether other counterexamples of the run are looked at too.
-    - `stay`: whether every real feature stays on the side of nominal on which the row has it, so
-      that failures of several kinds are shrunk each by itself.
+    - `others`: whether to start from other counterexamples of the run as well.
+    - `stay`: whether every real feature stays on the row's side of nominal, so that failures of
+      different kinds are shrunk separately.
     - `progress`: whether to show one line of progress; see `core.display.progress` for the default.
 
-    All simulations have the random key of the row. The result was simulated alone and failed, in
-    the precision of the run, and in float64 too unless the system draws random numbers or is a
-    black box. It is 0.2 % farther than the nearest failing point, for rounding's sake. Ctrl-C ends
-    the search and returns the least so far.
+    All simulations use the random key of the row. The result was simulated alone and failed in the
+    precision of the run, and also in float64 unless the system draws random numbers or is a black
+    box. It is 0.2 % farther away than the nearest failing point, as a margin for rounding. Ctrl-C
+    ends the search and returns the best result so far.
 
     **Raises:** `ValueError` for a run without its problem or without a counterexample, a row that
-    is none or does not fail when simulated again, a feature without a nominal value.
+    is not a counterexample or does not fail when simulated again, and a feature without a nominal
+    value.
     """
     problem = selection.problem_of(run)
     if by not in ORDERS:
@@ -322,7 +322,7 @@ class _Search:
 def search_alongside(
     candidates: Candidates, u: Float[np.ndarray, " d"], rng: np.random.Generator
 ) -> None:
-    """Search failures on the same coordinates, a little farther away in other directions."""
+    """Search for failures in the same coordinates, slightly farther away in other directions."""
     nominal = candidates.nominal
     v = nominal.departure(u[None])[0]
     v[np.array(nominal.cube.levels) > 0] = 0
@@ -336,12 +336,12 @@ def search_alongside(
 def search_elsewhere(
     candidates: Candidates, u: Float[np.ndarray, " d"], keep_count: bool, rng: np.random.Generator
 ) -> None:
-    """Search a failure nearer than `u` in other directions.
+    """Search for a failure nearer than `u` in other directions.
 
-    With `keep_count` it has no more departures than `u`.
+    With `keep_count` it departs in no more coordinates than `u`.
 
-    Descents of the robustness from random points that are nearer, each for itself, so that the
-    known failure does not draw them all.
+    It descends on the robustness from random nearer points, each on its own, so that they are not
+    all drawn to the known failure.
     """
     nominal = candidates.nominal
     free = np.flatnonzero(np.array(nominal.cube.levels) == 0)

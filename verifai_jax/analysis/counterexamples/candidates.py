@@ -29,22 +29,21 @@ class Tangent(NamedTuple):
 
 
 class Candidates:
-    """Simulations of candidate points, each made once, `budget` of them at most.
+    """Simulations of candidate points, at most `budget` of them, each made once.
 
     A gradient counts as one simulation.
 
     **Arguments:**
-    - `problem`: whose system is simulated.
+    - `problem`: the problem whose system is simulated.
     - `nominal`: the point from which candidates depart.
-    - `budget`: simulations at most.
+    - `budget`: maximum number of simulations.
     - `precision`: the precision of the simulations, `"float32"` or `"float64"`.
 
-    **Attributes:** `points` `[n, d]`, `rho` `[n]` and `failing` `[n]` of all that were simulated;
-    `limit`: simulations after which no more are made for now; `max_items`: points with more items
-    (such as events) are not simulated; `temperature` of the smooth
-    robustness that is differentiated; `differentiable`: whether gradients can be had; `note`: why
-    not, as text; `without_verdict`: simulations that had none, and `trouble`, what the first of
-    them raised.
+    **Attributes:** `points` `[n, d]`, `rho` `[n]` and `failing` `[n]` of all simulations; `limit`:
+    the current maximum number of simulations; `max_items`: points with more items (such as events)
+    are not simulated; `temperature` of the smooth robustness that is differentiated;
+    `differentiable`: whether gradients are available; `note`: why not, as text; `without_verdict`:
+    number of simulations without a verdict; `trouble`: the error of the first of these.
     """
 
     def __init__(
@@ -67,7 +66,7 @@ class Candidates:
 
     @property
     def notes(self) -> list[str]:
-        """Sentences for people: on gradients that are missing, on simulations without a verdict."""
+        """Sentences on missing gradients, and on simulations without a verdict."""
         notes = [self.note] if self.note else []
         if self.without_verdict:
             why = f", the first because of {one_line(self.trouble, 200)}" if self.trouble else ""

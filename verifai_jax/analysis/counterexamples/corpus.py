@@ -43,17 +43,17 @@ class CorpusError(ValueError):
 class SavedCounterexample:
     """One counterexample of a corpus, as plain data.
 
-    - `problem`, `target`: names of the problem, in itself and on the command line.
+    - `problem`, `target`: the name of the problem, and its name on the command line.
     - `formulas`: their texts by name.
     - `features`: the columns of the feature space.
     - `robustness`: the robustness of each formula, as simulated.
-    - `seed`, `row`: of the run and in its table: they decide the random key of the simulation.
-    - `precision`, `backend`: that it was simulated with.
-    - `verdict`: the verdict of closer replays of the row that it came from; empty if there were
-      none.
-    - `changed`: what departs from nominal, `[nominal, value]` by coordinate, where it was shrunk.
+    - `seed`, `row`: the run's seed and the row in its table, which determine the random key of the
+      simulation.
+    - `precision`, `backend`: those of the simulation.
+    - `verdict`: the verdict of closer replays of its row; empty if there were none.
+    - `changed`: the departures from nominal, `[nominal, value]` by coordinate, if it was shrunk.
     - `found`: the search, its budget, the number of simulations, the version, and the `sources`:
-      what the model was made of, as a run records it.
+      the files of the model, as a run records them.
     """
 
     problem: str
@@ -71,7 +71,7 @@ class SavedCounterexample:
 
     @property
     def name(self) -> str:
-        """Name of its file: the problem's, and a digest of what decides the simulation."""
+        """Name of its file: the problem's name, and a digest of what determines the simulation."""
         deciding = [self.problem, self.formulas, self.features, self.seed, self.row]
         text = json.dumps(deciding, sort_keys=True)
         stem = re.sub(r"\W+", "-", self.problem).strip("-")[:60] or "counterexample"
@@ -80,7 +80,7 @@ class SavedCounterexample:
     def write(self, folder: Path) -> Path:
         """Write the file into a folder; return its path.
 
-        **Raises:** `OSError` that names the file, for whatever the file system refuses.
+        **Raises:** `OSError` that names the file, if the file system refuses.
         """
         path = folder / self.name
         content: dict[str, Any] = {"format": FORMAT, **asdict(self)}
@@ -93,7 +93,7 @@ class SavedCounterexample:
 
     @classmethod
     def read(cls, path: Path) -> "SavedCounterexample":
-        """Read a file that `write` wrote, edited by a person or not.
+        """Read a file written by `write`, whether or not a person edited it.
 
         **Raises:** `CorpusError` for anything else.
         """
@@ -177,18 +177,18 @@ def save_counterexamples(
 ) -> list[Path]:
     """Write counterexamples of a run into a folder, one small file each.
 
-    Only rows that the run claims are written: where it confirms, those that closer replays
-    confirmed. The worst comes first, then each time the one farthest from those before, so that a
-    few of them stand for all.
+    Only claimed rows are written: if the run confirms, those that closer replays confirmed. The
+    worst comes first, then each time the one farthest from those before, so that a few of them
+    represent all.
 
     **Arguments:**
-    - `run`: with its problem.
-    - `folder`: made if missing; existing files stay.
-    - `max_count`: counterexamples at most.
-    - `shrink`: whether each is first shrunk towards the nominal features, where these are known.
-    - `budget`: simulations to shrink one with, at most.
+    - `run`: a run with its problem.
+    - `folder`: the folder, made if missing; existing files stay.
+    - `max_count`: maximum number of counterexamples.
+    - `shrink`: whether to shrink each towards the nominal features first, if these are known.
+    - `budget`: maximum number of simulations to shrink one.
     - `progress`: whether to show one line of progress; see `core.display.progress` for the default.
-    **Returns:** the paths of the files, none twice.
+    **Returns:** the paths of the files, without duplicates.
     **Raises:** `ValueError` for a run without its problem or without a counterexample.
     """
     problem = problem_of(run)
@@ -264,12 +264,12 @@ def _sources(run: Run, row: int) -> dict[str, Any]:
 
 
 def read_corpus(folder: str | Path) -> tuple[dict[Path, SavedCounterexample], dict[Path, str]]:
-    """Read the files of a corpus: a folder with those below it, or one file.
+    """Read the files of a corpus: a folder with its subfolders, or one file.
 
-    Every file whose name ends in `.json`, in whatever case, belongs to it; what is hidden does not.
+    All files that end in `.json`, in upper or lower case, belong to it; hidden files do not.
 
-    **Returns:** the counterexamples by path, and what is wrong with the other files.
-    **Raises:** `FileNotFoundError` where there is no such place.
+    **Returns:** the counterexamples by path, and an error text for each other file.
+    **Raises:** `FileNotFoundError` if the path does not exist.
     """
     location = Path(folder)
     if not location.exists():
@@ -289,7 +289,7 @@ def read_corpus(folder: str | Path) -> tuple[dict[Path, SavedCounterexample], di
 
 
 def renamed(features: Mapping[str, Any], names: Mapping[str, str]) -> dict[str, Any]:
-    """Return columns under new names; that of a feature renames all columns of it."""
+    """Return columns under new names; the new name of a feature applies to all of its columns."""
     result = {}
     for column, value in features.items():
         stem = re.split(r"[.\[]", column, maxsplit=1)[0]

@@ -21,14 +21,14 @@ MUST = {
 
 
 def format_number(value: object, digits: int = 4) -> str:
-    """Write a value as a person does: `120.4`, `on`."""
+    """Write a value for people: `120.4`, `on`."""
     if isinstance(value, (float, np.floating)):
         return f"{value:z.{digits}g}" if abs(value) < 1e5 else f"{value:z.3e}"
     return str(value)
 
 
 def format_apart(value: float, bound: float) -> tuple[str, str]:
-    """Write two numbers with so many digits that they differ."""
+    """Write two numbers with enough digits to tell them apart."""
     for digits in range(4, 10):
         one, other = format_number(value, digits), format_number(bound, digits)
         if one != other:
@@ -50,11 +50,11 @@ def describe(
     **Arguments:**
     - `name`: the name of the problem.
     - `row`: its number in the table.
-    - `why`: the predicate that decides, when, and through which sub-formulas.
+    - `why`: the deciding predicate, its time, and the sub-formulas on the way to it.
     - `rho`: robustness of the row.
-    - `influences`: the features.
-    - `matter`: those of them that matter, the greatest first.
-    - `notes`: on how the explanation came about.
+    - `influences`: the influences of the features.
+    - `matter`: those that matter, by decreasing influence.
+    - `notes`: notes on how the explanation was made.
     """
     sentences = [describe_verdict(name, row, why)]
     if any(np.isfinite(i.reverted) for i in influences):
@@ -109,7 +109,7 @@ def value_at(expression: Term, why: Explanation) -> float:
 
 
 def describe_reversals(matter: Sequence[Influence], rho: float) -> list[str]:
-    """Write what becomes of the failure with each feature back at nominal."""
+    """Write what happens to the failure when each feature is reset to nominal."""
     cures = [i for i in matter if i.gone]
     others = [i for i in matter if not i.gone and i.departs]
     sentences = []

@@ -20,9 +20,9 @@ from verifai_jax.systems.base import Carry, Features, Outcome, Seed, System
 
 
 class FixedKey(System):
-    """A system that uses one random key, whatever key it is given.
+    """A system that always uses one random key, whatever key it receives.
 
-    It offers what the system offers: `fold`, `simulate_batch`, `simulate_each`, ...
+    It has the same methods as the system: `fold`, `simulate_batch`, `simulate_each`, ...
     """
 
     def __init__(self, system: System, key: Key[Array, ""]) -> None:
@@ -79,12 +79,12 @@ def key_of(run: Run, row: int | None) -> Key[Array, ""]:
 
 
 def hold_key(problem: Problem, key: Key[Array, ""]) -> Problem:
-    """Return the problem with every simulation on one random key."""
+    """Return the problem in which every simulation uses this random key."""
     return replace(problem, system=FixedKey(problem.system, key))
 
 
 def note_on_key(problem: Problem, row: int) -> list[str]:
-    """Return what there is to say of the random key that a study of a row holds."""
+    """Return a note on the fixed random key with which a row was studied."""
     if not depends_on_key(problem):
         return []
     return [
@@ -94,10 +94,10 @@ def note_on_key(problem: Problem, row: int) -> list[str]:
 
 
 def fix_key(problem: Problem, run: Run, row: int | None) -> Problem:
-    """Return the problem with every simulation on the random key of one row.
+    """Return the problem in which every simulation uses the random key of one row.
 
-    That is the problem itself where the system draws no random numbers, so that its compiled
-    programs are used again.
+    It is the same problem if the system draws no random numbers, so that compiled programs are
+    reused.
     """
     if not problem.black_box and not problem.draws():
         return problem

@@ -17,9 +17,10 @@ class Span(NamedTuple):
 
 
 def spans_of(domain: Domain, duration: float) -> tuple[Span, ...] | None:
-    """Return when each coordinate of a signal acts; None for other domains.
+    """Return the span in which each coordinate of a signal acts; None for other domains.
 
-    A point between two lines acts from the point before to the one after; see `Signal.spans`.
+    With linear interpolation a control point acts from the one before it to the one after it; see
+    `Signal.spans`.
     """
     spans = domain.spans(duration)
     if spans is None:
@@ -30,16 +31,16 @@ def spans_of(domain: Domain, duration: float) -> tuple[Span, ...] | None:
 
 @dataclass(frozen=True)
 class Influence:
-    """The part of one feature in a failure.
+    """The influence of one feature on a failure.
 
-    **Fields:** `name`; `value` and `nominal`, as a table has them, one for each column; `spans`:
-    when each coordinate acts, for the control points of a signal, else None; `reverted`: the
-    robustness with the whole feature back at nominal; `each` `[k]`: with one of its coordinates
-    back; `slopes` `[k]`: derivative of the smooth robustness by each of its real numbers, in their
+    **Fields:** `name`; `value` and `nominal` in the columns of a table; `spans`: when each
+    coordinate acts, for the control points of a signal, else None; `reverted`: the robustness with
+    the whole feature reset to nominal; `each` `[k]`: with one of its coordinates reset; `slopes`
+    `[k]`: derivative of the smooth robustness with respect to each of its real numbers, in their
     own unit, at the row; `gradient` `[k]`: the same over the whole range of each (for a
-    distribution, twice the range of its middle half). Unknown numbers are NaN. `gone`: whether the
-    failure vanishes with the whole feature back; `departs`: whether the feature is not nominal;
-    `each_gone`: whether the failure vanishes with one coordinate back.
+    distribution, twice its interquartile range). Unknown numbers are NaN. `gone`: whether the
+    failure vanishes when the whole feature is reset; `departs`: whether the feature is not nominal;
+    `each_gone`: whether the failure vanishes when one coordinate is reset.
     """
 
     name: str
@@ -56,9 +57,10 @@ class Influence:
     slopes: Float[np.ndarray, " k"]
 
     def effect(self, rho: float) -> float:
-        """Return by how much the feature moves the robustness `rho` of the row.
+        """Return how much the feature changes the robustness `rho` of the row.
 
-        That of the whole feature back at nominal, or where it is not known its steepest gradient.
+        The change is that of resetting the whole feature to nominal, or its steepest gradient if
+        that is unknown.
         """
         if np.isfinite(self.reverted):
             return self.reverted - rho

@@ -36,10 +36,10 @@ CLOSER = 1e-9
 
 
 def draw_around_elite(candidates: Candidates, rng: np.random.Generator) -> None:
-    """Sample around the likeliest failures, fit to the likeliest of all, and so on.
+    """Sample repeatedly around the likeliest failures, refitting to the likeliest found so far.
 
     **Arguments:**
-    - `candidates`: simulates, and remembers what failed, within its limit.
+    - `candidates`: simulates points within its limit, and remembers which failed.
     """
     nominal, fruitless = candidates.nominal, 0
     free = nominal.cube.continuous
@@ -68,9 +68,9 @@ def draw_around_elite(candidates: Candidates, rng: np.random.Generator) -> None:
 
 
 def shift_in_time(candidates: Candidates, u: Point) -> None:
-    """Try a failure earlier and later: signals and arrays moved by some of their items.
+    """Try a failure earlier and later: shift signals and arrays by some of their items.
 
-    What breaks at another instant is another piece of the boundary, to which no slope leads.
+    A failure at another time lies on another part of the boundary, to which no gradient leads.
     """
     nominal = candidates.nominal
     series = []
@@ -93,11 +93,11 @@ def shift_in_time(candidates: Candidates, u: Point) -> None:
 
 
 def exchange_cells(candidates: Candidates, rng: np.random.Generator) -> None:
-    """Change cells of the likeliest failures until no change of two makes any likelier.
+    """Change cells of the likeliest failures until no change of two cells makes one likelier.
 
     **Arguments:**
-    - `candidates`: simulates, and remembers what failed, within its limit.
-    - `rng`: the rng of the order of changes that are predicted alike.
+    - `candidates`: simulates points within its limit, and remembers which failed.
+    - `rng`: orders changes with equal predictions.
     """
     done: set[bytes] = set()
     while candidates.left > 0:

@@ -26,10 +26,10 @@ BEAM = 6
 
 
 def revert_features(candidates: Candidates, u: Point) -> Point:
-    """Move features of a failing point back to nominal until every further one ends the failure.
+    """Reset features of a failing point to nominal until every further reset ends the failure.
 
-    `u` fails. Each round: all single reversals and all features' at once, then all of the single
-    ones' that keep it failing, one after the other.
+    `u` must fail. Each round tries all single resets and all features' resets at once; then it
+    combines those single resets that keep the failure, one after the other.
     """
     nominal = candidates.nominal
     while candidates.left > 0:
@@ -64,7 +64,7 @@ def revert_features(candidates: Candidates, u: Point) -> Point:
 
 
 def revert(candidates: Candidates, u: Point, sets: list[np.ndarray]) -> Points:
-    """Return the point with each of these sets of coordinates back at nominal."""
+    """Return the point with each of these sets of coordinates reset to nominal."""
     points = np.repeat(u[None], len(sets), axis=0)
     for point, coordinates in zip(points, sets, strict=True):
         point[coordinates] = candidates.nominal.u[coordinates]
@@ -72,13 +72,13 @@ def revert(candidates: Candidates, u: Point, sets: list[np.ndarray]) -> Points:
 
 
 def smallest_departure(candidates: Candidates, points: Points) -> Point:
-    """Return the point with the fewest departures, and of those the nearest."""
+    """Return the point with the fewest departures; of several, the nearest."""
     order = np.lexsort((candidates.nominal.distance(points), candidates.nominal.count(points)))
     return points[order[0]]
 
 
 def trial_values(candidates: Candidates, i: int) -> list[float]:
-    """Return values of one coordinate to try: over its range, or its cells, without nominal."""
+    """Return values to try for one coordinate: over its range, or its cells, without nominal."""
     cube = candidates.nominal.cube
     if cube.levels[i] == 0:
         values = np.linspace(0, 1, LEVELS)
@@ -92,7 +92,7 @@ def trial_values(candidates: Candidates, i: int) -> list[float]:
 
 
 def grow(candidates: Candidates, starts: Points, maximum: int) -> Results:
-    """Search failing points with `maximum` departures at most, from nominal on; perhaps none."""
+    """Search from nominal for failing points with at most `maximum` departures; may find none."""
     nominal = candidates.nominal
     d = nominal.space.dim
     pairs = [(i, value) for i in range(d) for value in trial_values(candidates, i)]
@@ -154,10 +154,10 @@ def distinct_sets(candidates: Candidates, points: Points) -> Results:
 
 
 def exchange(candidates: Candidates, u: Point, rng: np.random.Generator) -> Point | None:
-    """Search a failing point with one departure less than `u`; None if none is found.
+    """Search for a failing point with one departure fewer than `u`; None if none is found.
 
-    The other coordinates are pushed away from nominal, along the gradient of the robustness, and at
-    random, three rounds, with more for the sets that came nearest to a failure.
+    In three rounds the other coordinates are pushed away from nominal, along the gradient of the
+    robustness and at random; sets that came nearest to a failure get more points.
     """
     nominal = candidates.nominal
     support = np.flatnonzero(nominal.moved(u[None])[0])
@@ -198,7 +198,7 @@ def push(
     width: float,
     rng: np.random.Generator,
 ) -> Results:
-    """Draw points that differ from `centre` in these coordinates only."""
+    """Draw points that differ from `centre` only in these coordinates."""
     cube, u0 = candidates.nominal.cube, candidates.nominal.u
     free = np.array([i for i in coordinates if cube.levels[i] == 0], int)
     points = np.repeat(centre[None].astype(np.float64), count, axis=0)
@@ -226,13 +226,13 @@ def push(
 
 
 def minimize_count(candidates: Candidates, starts: Points, rng: np.random.Generator) -> Results:
-    """Minimise the number of coordinates that depart from nominal, among failing points.
+    """Minimise, among failing points, the number of coordinates that depart from nominal.
 
     **Arguments:**
-    - `candidates`: simulates, and remembers what failed.
-    - `starts` `[m, d]`: failing points to begin with.
-    - `rng`: for random candidates.
-    **Returns:** failing points `[n, d]`, the fewest departures first, then the nearest.
+    - `candidates`: simulates points, and remembers which failed.
+    - `starts` `[m, d]`: failing points to start from.
+    - `rng`: draws random candidates.
+    **Returns:** failing points `[n, d]`, ordered by their number of departures, then by distance.
     """
     nominal = candidates.nominal
     enough = candidates.left // 3

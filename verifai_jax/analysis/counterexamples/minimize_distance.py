@@ -45,12 +45,12 @@ ENOUGH = 5e-4
 
 @dataclass
 class Track:
-    """A failing point that comes nearer to nominal, round by round.
+    """A failing point that moves nearer to nominal, round by round.
 
-    `free`: which coordinates may depart; `gap`: the share of the way to nominal on which the last
-    failure lies, as far as is known; `sigma`: size of random steps, relative to the distance;
-    `stalled`: rounds without progress; `tangents` of the boundary so far, the latest last;
-    `target`: the nearest point of the last linearised boundary.
+    `free`: which coordinates may depart; `gap`: the known share of the way to nominal on which the
+    last failure lies; `sigma`: size of random steps, relative to the distance; `stalled`: rounds
+    without progress; `tangents` of the boundary so far, the latest last; `target`: the nearest
+    point of the latest linearised boundary.
     """
 
     u: Point
@@ -70,15 +70,15 @@ def minimize_distance(
     keep_nominal: bool,
     rounds: int = 60,
 ) -> Points:
-    """Follow failing points along the boundary until none comes nearer to nominal.
+    """Follow failing points along the boundary until none gets nearer to nominal.
 
     **Arguments:**
-    - `candidates`: simulates, and remembers what failed.
+    - `candidates`: simulates points, and remembers which failed.
     - `starts` `[n, d]`: failing points.
-    - `rng`: for random candidates.
-    - `keep_nominal`: whether coordinates that are nominal stay so.
-    - `rounds`: batches at most.
-    **Returns:** the points reached `[n, d]`, one for each start.
+    - `rng`: draws random candidates.
+    - `keep_nominal`: whether nominal coordinates stay nominal.
+    - `rounds`: maximum number of batches.
+    **Returns:** the final points `[n, d]`, one for each start.
     """
     nominal = candidates.nominal
     d = nominal.space.dim
@@ -137,7 +137,7 @@ def propose(candidates: Candidates, track: Track, count: int, rng: np.random.Gen
 
 
 def segment_shares(track: Track) -> Float[np.ndarray, " n"]:
-    """Return shares of the way from nominal to the point where the boundary may be."""
+    """Return shares of the way from nominal to the point at which the boundary may lie."""
     if track.gap >= 1:
         return np.linspace(0, 1, 14)[1:-1]
     return 1 - track.gap * np.linspace(0.2, 1, 5) if track.gap > 2e-4 else np.zeros(0)
@@ -150,10 +150,10 @@ def boundary_steps(
     v: Departure,
     costs: float = 0.0,
 ) -> Departures:
-    """Return departures at, and on the way to, the nearest points of the linearised boundary.
+    """Return departures at the nearest points of the linearised boundary, and on the way there.
 
-    - `costs`: the costs of a coordinate that departs by next to nothing anywhere, over its whole
-      range; 0 for no more than that. Without it a linear model goes on to an end of the range.
+    - `costs`: the cost of a minimal departure of a coordinate, over its whole range; 0 for none.
+      Without it a linear model extends to an end of the range.
     """
     nominal = candidates.nominal
     ends = np.zeros((2, len(track.u)))
@@ -199,7 +199,7 @@ def boundary_steps(
 def fit_tangent(
     candidates: Candidates, track: Track, coordinates: Int[np.ndarray, " k"]
 ) -> list[Tangent]:
-    """Fit a tangent to the points that were simulated nearby; empty if they are too few."""
+    """Fit a tangent to points simulated nearby; empty if there are too few."""
     others = np.ones(len(track.u), bool)
     others[coordinates] = False
     alike = np.isfinite(candidates.rho) & np.all(
@@ -228,7 +228,7 @@ def fit_tangent(
 def single_coordinates(
     track: Track, v: Departure, count: int, rng: np.random.Generator
 ) -> Departures:
-    """Draw departures with one coordinate nearer to nominal, the others as they are."""
+    """Draw departures that have one coordinate nearer to nominal, and the others unchanged."""
     chosen = np.flatnonzero(v)
     if not len(chosen) or count < 1:
         return np.zeros((0, len(v)))
@@ -242,7 +242,7 @@ def single_coordinates(
 def random_directions(
     track: Track, v: Departure, count: int, rng: np.random.Generator, scale: Departure
 ) -> Departures:
-    """Draw departures in random directions near that of `v`, a little shorter."""
+    """Draw departures in random directions close to that of `v`, slightly shorter."""
     length = np.linalg.norm(v)
     k = len(v)
     noise = rng.standard_normal((count, k)) * scale
@@ -259,7 +259,7 @@ def random_directions(
 
 
 def discrete_steps(candidates: Candidates, track: Track) -> Points:
-    """Return points with one discrete coordinate at nominal, or nearer where cells are ordered."""
+    """Return points with one discrete coordinate at nominal, or nearer to it if ordered."""
     nominal = candidates.nominal
     cube = nominal.cube
     tried = []
@@ -281,7 +281,7 @@ def discrete_steps(candidates: Candidates, track: Track) -> Points:
 
 
 def advance(candidates: Candidates, track: Track, points: Points, failing: np.ndarray) -> None:
-    """Take the nearest failing candidate, and learn where on the segment there was none."""
+    """Move to the nearest failing candidate, and record where on the segment none failed."""
     nominal = candidates.nominal
     before = float(nominal.distance(track.u[None])[0])
     lengths = np.where(failing, nominal.distance(points), np.inf)
@@ -303,14 +303,14 @@ def advance(candidates: Candidates, track: Track, points: Points, failing: np.nd
 
 
 def share_of_segment(candidates: Candidates, u: Point, other: Point) -> float | None:
-    """Return where `other` lies between nominal (0) and `u` (1); None if it lies elsewhere."""
+    """Return the position of `other` between nominal (0) and `u` (1); None if it lies elsewhere."""
     v, w = candidates.nominal.departure(np.stack([u, other]))
     share = float(w @ v / max(v @ v, 1e-30))
     return share if np.linalg.norm(w - share * v) < 1e-5 * np.linalg.norm(v) + 1e-7 else None
 
 
 def update_tangents(candidates: Candidates, tracks: list[Track]) -> None:
-    """Take tangents where the tracks are, and at the targets of those that make no progress."""
+    """Compute tangents at the tracks' points, and at the targets of those without progress."""
     if not candidates.differentiable:
         return
     wanted = [(track, track.u) for track in tracks]

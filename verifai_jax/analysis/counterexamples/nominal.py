@@ -32,7 +32,7 @@ class Nominal:
     **Fields:**
     - `space`: the space of the features.
     - `u` `[d]`: the point.
-    - `low` and `high` `[d]`: ends of the coordinates within which points may depart.
+    - `low` and `high` `[d]`: the range in which points may depart.
     """
 
     space: FeatureSpace
@@ -45,9 +45,9 @@ class Nominal:
         """Return the nominal point of a problem.
 
         **Arguments:**
-        - `problem`: says what is nominal.
+        - `problem`: the problem with its nominal features.
         - `nominal`: nominal values that override those of the problem.
-        **Raises:** `ValueError` where neither names all features, or one is outside the space.
+        **Raises:** `ValueError` if a feature has no nominal value, or one outside the space.
         """
         space = problem.space
         check_names("feature", nominal or {}, space.domains)
@@ -67,7 +67,7 @@ class Nominal:
         return cls(space, np.asarray(space.point_of(features), np.float32))
 
     def restrict_to_side(self, u: Float[np.ndarray, " d"]) -> "Nominal":
-        """Return the same point with departures allowed only to the side on which `u` is.
+        """Return the same point with departures allowed only on the side of `u`.
 
         Discrete coordinates stay free.
         """
@@ -97,9 +97,9 @@ class Nominal:
         return tuple(groups)
 
     def settle(self, points: Float[np.ndarray, "n d"]) -> Float[np.ndarray, "n d"]:
-        """Move points into the cube, and their discrete coordinates to the middles of cells.
+        """Move points into the cube, and discrete coordinates to the middles of their cells.
 
-        In the cell of the nominal point a discrete coordinate is exactly nominal.
+        In the nominal cell a discrete coordinate gets exactly the nominal value.
         """
         u = np.clip(np.asarray(points, np.float64), self.low, self.high).astype(np.float32)
         discrete = self.cube.discrete
@@ -122,7 +122,7 @@ class Nominal:
 
     @cached_property
     def lacks(self) -> Bool[np.ndarray, " d"]:
-        """The coordinates of items that nominal does not have."""
+        """Return which coordinates belong to items that nominal does not have."""
         if not self.space.items:
             return np.zeros(len(self.u), bool)
         return ~self._compiled(self.space.used, self.u[None])[0]
@@ -136,11 +136,11 @@ class Nominal:
         return np.asarray(self.cube.centres(np.asarray(cells, np.int32)))
 
     def moved(self, points: Float[np.ndarray, "n d"]) -> Bool[np.ndarray, "n d"]:
-        """Return the coordinates of settled points that can be moved back to those of nominal."""
+        """Return which coordinates of settled points differ from nominal and can be moved back."""
         return points != self.u
 
     def departs(self, points: Float[np.ndarray, "n d"]) -> Bool[np.ndarray, "n d"]:
-        """Return the coordinates of settled points that are not nominal: moved, or of new items."""
+        """Return which coordinates of settled points are not nominal: moved, or of new items."""
         moved = self.moved(points)
         if not self.lacks.any() or not len(points):
             return moved
@@ -149,7 +149,7 @@ class Nominal:
     def gaps(self, points: Float[np.ndarray, "n d"]) -> Float[np.ndarray, "n d"]:
         """Return the departure of each coordinate, from 0 to 1.
 
-        That of integers and lengths is a difference of indices, that of choices 0 or 1.
+        For integers and lengths it is a difference of indices, for choices 0 or 1.
         """
         gap = np.abs(np.asarray(points, np.float64) - self.u)
         discrete = self.cube.discrete
@@ -162,7 +162,7 @@ class Nominal:
         return gap
 
     def departure(self, points: Float[np.ndarray, "n d"]) -> Float[np.ndarray, "n d"]:
-        """Return the signed departures, whose length is the distance in continuous coordinates."""
+        """Return the signed departures; their norm is the distance in continuous coordinates."""
         return np.asarray(points, np.float64) - self.u
 
     def point_at(self, departures: Float[np.ndarray, "n d"]) -> Float[np.ndarray, "n d"]:
@@ -170,12 +170,12 @@ class Nominal:
         return self.u.astype(np.float64) + departures
 
     def slope(self, points: Float[np.ndarray, "n d"]) -> Float[np.ndarray, "n d"]:
-        """Return the derivative of the signed departures by the coordinates."""
+        """Return the derivative of the signed departures with respect to the coordinates."""
         return np.ones(np.shape(points))
 
     @cached_property
     def scale(self) -> Float[np.ndarray, " d"]:
-        """Step sizes in each coordinate, as departures, that are tried."""
+        """Step sizes to try in each coordinate, as departures."""
         return np.ones(len(self.u))
 
     def count(self, points: Float[np.ndarray, "n d"]) -> Int[np.ndarray, " n"]:
@@ -183,19 +183,19 @@ class Nominal:
         return self.departs(points).sum(axis=1)
 
     def items(self, points: Float[np.ndarray, "n d"]) -> Int[np.ndarray, " n"]:
-        """Count the items, such as events, that arrays have more or fewer of than nominal."""
+        """Count the items of arrays, such as events, added to nominal or removed from it."""
         own, home = self.lengths(points), self.lengths(self.u[None])
         return np.abs(own - home).sum(axis=1)
 
     def lengths(self, points: Float[np.ndarray, "n d"]) -> Int[np.ndarray, "n k"]:
-        """Return the number of items of each array of variable length, beyond the least."""
+        """Return the number of items of each array of variable length above its minimum."""
         lengths = list(self.cube.lengths)
         levels = np.array([self.cube.levels[i] for i in lengths], np.float32)
         numbers = np.asarray(points, np.float32)[:, lengths] * levels
         return np.clip(numbers.astype(int), 0, np.maximum(levels - 1, 0).astype(int))
 
     def restored(self, u: Float[np.ndarray, " d"]) -> Float[np.ndarray, "n d"]:
-        """Return a point with some or all of the items back that nominal has and it lacks."""
+        """Return a point with some or all of nominal's items that it lacks put back."""
         own, home = self.lengths(u[None])[0], self.lengths(self.u[None])[0]
         points = []
         for k, i in enumerate(self.cube.lengths):
@@ -211,16 +211,16 @@ class Nominal:
         return self.settle(np.array(points, np.float32).reshape(-1, len(u)))
 
     def distance(self, points: Float[np.ndarray, "n d"]) -> Float[np.ndarray, " n"]:
-        """Return the Euclidean length of the departure."""
+        """Return the Euclidean norm of the departure."""
         return np.sqrt((self.gaps(points) ** 2).sum(axis=1))
 
 
 @dataclass(frozen=True, eq=False)
 class Likeliest(Nominal):
-    """The likeliest features in the place of nominal ones: what departs from them is improbable.
+    """The likeliest features in the role of nominal ones: departures from them are improbable.
 
     The distance of a point is the number of standard deviations at which a normal distribution is
-    as improbable: half its square is lost of the logarithm of the density.
+    as improbable: half its square is the loss of log density.
     """
 
     improbability: Improbability = field(kw_only=True)

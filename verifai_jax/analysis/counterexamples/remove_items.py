@@ -22,11 +22,11 @@ EXHAUSTIVE = 8
 
 
 def remove_items(candidates: Candidates, u: Float[np.ndarray, " d"]) -> Float[np.ndarray, " d"]:
-    """Take items away from a failing point, or put nominal's back, as long as it fails.
+    """Remove items from a failing point, or put nominal's back, as long as it fails.
 
     **Arguments:**
-    - `candidates`: simulates, and remembers what failed.
-    **Returns:** the failing point with the least difference in items from nominal that was found.
+    - `candidates`: simulates points, and remembers which failed.
+    **Returns:** the failing point found whose items differ least from nominal's.
     """
     nominal = candidates.nominal
     while candidates.left > 0 and (own := nominal.items(u[None])[0]):
@@ -69,7 +69,7 @@ def _without(
 
 
 def item_sets(present: Int[np.ndarray, " k"]) -> list[list[int]]:
-    """Return sets of items to take away, all of them together among them."""
+    """Return sets of items to remove; one of them is the set of all."""
     removed = present.tolist()
     count = len(removed)
     if count <= EXHAUSTIVE:

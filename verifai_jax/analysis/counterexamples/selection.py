@@ -19,7 +19,7 @@ Row: TypeAlias = int | np.integer | pd.Series | Mapping[str, Any] | None
 def problem_of(run: Run) -> Problem:
     """Return the problem of a run, on the backend on which it ran.
 
-    **Raises:** `TypeError` for anything but a run; `ValueError` for one without its problem.
+    **Raises:** `TypeError` for anything but a run; `ValueError` for a run without its problem.
     """
     if not isinstance(run, Run):
         raise TypeError(f"a run of falsify is needed; got {type(run).__name__}")
@@ -36,10 +36,10 @@ def select_row(run: Run, row: Row) -> tuple[int, dict[str, Any]]:
 
     **Arguments:**
     - `run`: a run with a counterexample.
-    - `row`: its number, or a row of the table; the worst where it is None.
+    - `row`: its number, or a row of the table; the worst if None.
     **Returns:** its number, and the entries of its row by column.
-    **Raises:** `ValueError` for a run without a counterexample, or a row that is none; `TypeError`
-    or `IndexError` for anything that is not a row of the table.
+    **Raises:** `ValueError` for a run without a counterexample, or a row that is not one;
+    `TypeError` or `IndexError` for anything that is not a row of the table.
     """
     failing = run.table.counterexamples
     if not len(failing):
@@ -64,9 +64,9 @@ def select_row(run: Run, row: Row) -> tuple[int, dict[str, Any]]:
 def select_others(
     run: Run, nominal: Nominal, number: int, maximum: int
 ) -> Float[np.ndarray, "n d"]:
-    """Return the points of other counterexamples than row `number`, `maximum` of them at most.
+    """Return the points of at most `maximum` counterexamples other than row `number`.
 
-    Where there are more, half of them are the nearest, and the rest is spread over the others.
+    If there are more, half of them are the nearest, and the rest is spread over the others.
     """
     failing = run.table.counterexamples
     failing = failing.loc[failing.index != number]

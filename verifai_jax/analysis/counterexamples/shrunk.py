@@ -24,8 +24,8 @@ class Step(NamedTuple):
 
 
 class LogDensities(NamedTuple):
-    """Natural logarithms of the prior's density: of a failure, of the row at which its search
-    began, and of the likeliest features.
+    """Natural logarithms of the prior's density: at a failure, at the row where its search
+    started, and at the likeliest features.
     """
 
     failure: float
@@ -35,19 +35,18 @@ class LogDensities(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Shrunk(Drawn, InNotebook):
-    """The least departure from nominal found to fail.
+    """The smallest departure from nominal found to fail.
 
     **Fields:** `features` and `u` `[d]`, their point of the unit cube; `rho`: their robustness, the
-    margin by which they fail; `row`: of the run, at which it began; `changed`: what departs, by
-    name of coordinate: `(nominal, value)`, None if nominal lacks the item; `count`: how
-    many; `distance`: Euclidean, in unit coordinates; `nominal`: that point of the cube;
-    `start_count` and `start_distance` of the row;
-    `broken` and `start_broken`: names of the formulas that it breaks, and that the row broke;
-    `simulations` spent; `by`: what was made least first; `history`: a `Step` for each improvement;
-    `notes` for people; `duration` of the simulation in seconds; `model_changed` and `finding`: what
-    the replay of the row says, as in `Replay`; `stopped`: `"interrupted"` after Ctrl-C;
-    `log_densities`: of what is made likely, else None: then the likeliest features take the place
-    of nominal ones, and distances are numbers of standard deviations.
+    margin by which they fail; `row`: the row of the run at which the search started; `changed`: the
+    departures by name of coordinate: `(nominal, value)`, None if nominal lacks the item; `count`:
+    number of departures; `distance`: Euclidean, in unit coordinates; `nominal`: the nominal point
+    of the cube; `start_count` and `start_distance` of the row; `broken` and `start_broken`: names
+    of the formulas broken by the result and by the row; `simulations` spent; `by`: the measure that
+    was minimised first; `history`: a `Step` for each improvement; `notes`; `duration` of the
+    simulation in seconds; `model_changed` and `finding`: those of the row's `Replay`; `stopped`:
+    `"interrupted"` after Ctrl-C; `log_densities`: given for `by="likelihood"`, else None. Then the
+    likeliest features replace the nominal ones, and distances are numbers of standard deviations.
     """
 
     _picture = "counterexamples", "plot_shrunk"
@@ -83,12 +82,12 @@ class Shrunk(Drawn, InNotebook):
 
     @property
     def labels(self) -> tuple[str, ...]:
-        """Names for people of what departs: control points of signals by their time."""
+        """Readable names of the departures; control points of signals are named by their time."""
         labels = self.problem.space.labels(self.duration)
         return tuple(labels.get(name, name) for name in self.changed)
 
     def replay(self, precision: str | None = None) -> Replay:
-        """Simulate it again, with the random key of the row, and keep the trace."""
+        """Simulate the result again with the random key of the row, and keep the trace."""
         columns = columns_at(self.problem, self.u)
         return replay(self.problem, columns, self.key, self.row, precision or self.precision)  # pyright: ignore[reportArgumentType]
 

@@ -25,9 +25,9 @@ BLOCK = 4096
 class Cells(NamedTuple):
     """One feature cut into cells.
 
-    **Fields:** `name` of the feature; `ids` `[n]`: cell of each row, -1 where absent; `prior` of
-    the cells; `marginal` of the feature; `single_values`: whether each cell is one value; `volume`:
-    shares of the range that the cells take.
+    **Fields:** `name` of the feature; `ids` `[n]`: the cell of each row, -1 if absent; `prior`
+    probabilities of the cells; `marginal` of the feature; `single_values`: whether each cell is one
+    value; `volume`: the cells' shares of the range.
     """
 
     name: str
@@ -61,14 +61,14 @@ def cut(samples: Samples, parts: Sequence[Marginal], count: int) -> list[Cells]:
 def count_occupied(
     n: int, rows: list[Cells], allowed: list[Cells] | None = None
 ) -> tuple[pd.DataFrame, pd.DataFrame, int]:
-    """Count the cells that have rows in them.
+    """Count the occupied cells.
 
     **Arguments:**
     - `rows`: the features in cells.
-    - `allowed`: samples of the prior in the same cells, where it is not uniform on all of them:
-      cells in which none of them lies do not count.
+    - `allowed`: samples of the prior in the same cells, if it is not uniform on all of them: cells
+      without any of these samples do not count.
     **Returns:** a table with a row for each feature, a table of the values and pairs of values that
-    were never tried (1000 at most), and their number.
+    were never tried (at most 1000), and their number.
     """
     maximum = min(len(rows), MAX_FEATURES)
     counts = np.array([len(cells.prior) for cells in rows])
@@ -159,7 +159,7 @@ def _chance(prior: Float[np.ndarray, "*cells"], n: int) -> Float[np.ndarray, "*c
 def pair_counts(
     ids: Int[np.ndarray, "n d"], counts: Int[np.ndarray, " d"]
 ) -> Float[np.ndarray, "cells cells"]:
-    """Count the rows in each two cells of all features."""
+    """Count the rows in each pair of cells, for all pairs of features."""
     edges = np.concatenate([[0], np.cumsum(counts)])[:-1]
     total = int(counts.sum())
     together = np.zeros((total, total))

@@ -18,13 +18,13 @@ from verifai_jax.features.domain import as_scalar
 class Column:
     """One column that is analysed.
 
-    **Fields:** `name`; `ordered`: numbers with an order, else `choices`, in the order of the space
-    or sorted; `low` and `high`: bounds in the feature space, infinite where there are none or no
-    space is known; `near` and `far`: the finite range that is scaled to `[0, 1]`, which is the
-    bounds, or else the least and the greatest entry of the whole table; `integer`: only whole
-    numbers; `known`: whether the feature space says all this; `prior`: probabilities of the
-    `choices` where the space knows them; `uniform`: whether an ordered one has a uniform prior;
-    `length`: whether it says how many items an array has.
+    **Fields:** `name`; `ordered`: True for numbers; otherwise `choices` are the values, in the
+    order of the space or sorted; `low` and `high`: bounds in the feature space, infinite if there
+    are none or no space is known; `near` and `far`: the finite range that is scaled to `[0, 1]`:
+    the bounds, or else the minimum and maximum of the whole table; `integer`: whether all numbers
+    are whole; `known`: whether this comes from the feature space; `prior`: probabilities of the
+    `choices` if the space has them; `uniform`: whether an ordered column has a uniform prior;
+    `length`: whether it is the number of items of an array.
     """
 
     name: str
@@ -59,7 +59,7 @@ class Column:
 
 
 def feature_columns(table: pd.DataFrame, space: FeatureSpace | None) -> tuple[str, ...]:
-    """Return the feature columns: those of the space, or all but verdicts and robustness.
+    """Return the feature columns: those of the space, or all except verdicts and robustness.
 
     **Raises:** `UnknownNameError` for a feature of the space that the table does not have.
     """
@@ -73,7 +73,7 @@ def feature_columns(table: pd.DataFrame, space: FeatureSpace | None) -> tuple[st
 def describe_columns(
     table: pd.DataFrame, names: Sequence[str], space: FeatureSpace | None
 ) -> tuple[Column, ...]:
-    """Describe columns: as the space says, otherwise as their entries are.
+    """Describe columns from the space, or else from their entries.
 
     **Raises:** `UnknownNameError` for a column that the table does not have; `ValueError` for an
     ordered one with infinite entries.

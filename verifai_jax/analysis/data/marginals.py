@@ -22,8 +22,9 @@ POINTS = 12  # As a power of two.
 class Marginal:
     """Prior distribution of one column.
 
-    **Fields:** `column`; `edges`: ends `[values + 1]` of the cells of a discrete one in `[0, 1]`,
-    None for a continuous one, whose distribution function goes through `knots` at `heights`.
+    **Fields:** `column`; `edges`: for a discrete column, the ends `[values + 1]` of its cells in
+    `[0, 1]`; None for a continuous one, whose distribution function passes through `heights` at
+    `knots`.
     """
 
     column: Column
@@ -33,11 +34,11 @@ class Marginal:
 
     @property
     def count(self) -> int:
-        """Number of values; 0 where continuous."""
+        """Number of values; 0 if continuous."""
         return 0 if self.edges is None else len(self.edges) - 1
 
     def cells(self, samples: Samples) -> Int[np.ndarray, " n"]:
-        """Return the cell of each row, of a discrete column; -1 where absent."""
+        """Return the cell of each row of a discrete column; -1 if absent."""
         entries = samples.frame[self.column.name]
         if not self.column.ordered:
             return self.column.codes(entries)
@@ -48,9 +49,9 @@ class Marginal:
     def unit(
         self, samples: Samples, generator: np.random.Generator | None = None
     ) -> Float[np.ndarray, " n"]:
-        """Return coordinates of the rows: mid-cell where discrete, or drawn in it by a generator.
+        """Return the rows' coordinates; discrete ones in mid-cell, or drawn by a generator.
 
-        An absent entry is in the middle.
+        An absent entry gets the middle of the range.
         """
         if self.edges is not None:
             cells = self.cells(samples)
@@ -62,7 +63,7 @@ class Marginal:
         return np.where(np.isnan(values), 0.5, unit)
 
     def snap(self, u: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
-        """Return coordinates moved to the middle of their cells, where there are any."""
+        """Return coordinates moved to the middles of their cells, if there are cells."""
         if self.edges is None:
             return u
         cells = np.clip(np.searchsorted(self.edges, u, side="right") - 1, 0, self.count - 1)
@@ -78,7 +79,7 @@ class Marginal:
         return float(np.interp(u, self.heights, self.knots))
 
     def shown(self, cell: int) -> Any:
-        """Return the value of a discrete column as the table shows it."""
+        """Return the value of a discrete column as printed in the table."""
         if not self.column.ordered:
             return self.column.choices[cell]
         return int(self.column.near + cell)

@@ -42,15 +42,15 @@ _ABSENT = np.sqrt(3) / 2
 
 @dataclass(frozen=True, eq=False)
 class Samples:
-    """Rows of a table and the columns of them that are analysed; made by `Samples.of`.
+    """Rows of a table, and those of its columns that are analysed; made by `Samples.of`.
 
-    **Fields:** `frame`: the rows looked at, with all columns of the table and its row numbers as
-    index; `columns`: what is analysed; `which` rows these are; `name` of the run; `table`: the
-    whole table; `space` of the features, if known.
+    **Fields:** `frame`: the selected rows, with all columns of the table and the row numbers as
+    index; `columns`: the analysed columns; `which`: the kind of the rows; `name` of the run;
+    `table`: the whole table; `space` of the features, if known.
 
-    Entries that are missing (NaN, None) are absent items of arrays of variable length. `matrix`
-    takes the mean of the rows that have the item, so that an absent one adds explain_empty to a
-    covariance; `codes` says -1; in `points`, absence is a value of its own.
+    Missing entries (NaN, None) are absent items of arrays of variable length. `matrix` replaces
+    them by the mean of the rows that have the item, so they add nothing to a covariance; `codes`
+    has -1; in `points`, absence is a value of its own.
     """
 
     frame: pd.DataFrame
@@ -72,13 +72,14 @@ class Samples:
 
         **Arguments:**
         - `source`: a run, its table, a DataFrame with feature columns and row numbers as index, or
-          `Samples`, which are taken as they are, with other `columns` where they are given.
+          `Samples`, which are returned unchanged, or with other `columns` if these are given.
         - `which`: `"counterexamples"`, `"safe"`, `"failed"` (rows without a verdict), or `"all"`
-          rows with a verdict. Those of a DataFrame are recognised by its columns `violated` and
+          rows with a verdict. In a DataFrame they are recognised by the columns `violated` and
           `status`, else by `rho < 0`; without either, all rows are counterexamples.
-        - `columns`: what to analyse; by default all features. `"rho"` and `"rho.NAME"`, the
-          robustness, are columns too, but only if named here.
-        - `space`: says which columns are ordered and what their ranges are; a run knows its own.
+        - `columns`: the columns to analyse; by default all features. The robustness, `"rho"` and
+          `"rho.NAME"`, is included only if named here.
+        - `space`: the feature space, which determines the ordered columns and their ranges; a run
+          has its own.
         **Raises:** `TypeError` for another source; `ValueError` for another `which`, rows of a run
         that have changed since they were written, no rows,
         row numbers that are not unique integers, unknown columns (with the nearest names), or
@@ -152,12 +153,12 @@ class Samples:
 
     @cached_property
     def failing(self) -> Bool[np.ndarray, " n"]:
-        """Verdicts of the rows looked at: True for counterexamples."""
+        """Verdicts of the selected rows: True for counterexamples."""
         return verdicts(self.table)[0][self.table.index.get_indexer(self.frame.index)]
 
     @cached_property
     def rho(self) -> Float[np.ndarray, " n"]:
-        """Robustness of the rows; NaN where the table has none."""
+        """Robustness of the rows; NaN if the table has none."""
         if "rho" not in self.frame:
             return np.full(len(self), np.nan)
         return self.frame["rho"].to_numpy(np.float64)
@@ -168,7 +169,7 @@ class Samples:
         return int(np.argmin(np.nan_to_num(self.rho, nan=np.inf)))
 
     def others(self, which: Which) -> "Samples":
-        """Select the same columns of other rows of the same table.
+        """Select the same columns of other rows in the same table.
 
         **Raises:** `ValueError` if there are no such rows.
         """
@@ -191,7 +192,7 @@ class Samples:
 
     @property
     def kind(self) -> str:
-        """Description of the rows: `"12 counterexamples of cart-pole"`."""
+        """A description of the rows, such as `"12 counterexamples of cart-pole"`."""
         nouns = {
             "failed": ("row without a verdict", "rows without a verdict"),
             "all": ("row", "rows"),
@@ -203,18 +204,18 @@ class Samples:
         return f"{len(self):,} {words} of {self.name}"
 
     def values(self) -> Float[np.ndarray, "n k"]:
-        """Return the ordered columns as they are; NaN where absent."""
+        """Return the ordered columns unscaled; NaN if absent."""
         names = [column.name for column in self.ordered]
         return self.frame[names].to_numpy(np.float64).reshape(len(self), len(names))
 
     def scaling(
         self, scale: Scale = "range"
     ) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, " k"]]:
-        """Return offset and width of each ordered column: scaled is `(value - offset) / width`.
+        """Return offset and width of each ordered column; scaled is `(value - offset) / width`.
 
-        - `"range"`: range in the feature space, or of the whole table where that is not known;
-        - `"rows"`: least and greatest of the rows looked at (VerifAI's `build_normalized`);
-        - `"standard"`: mean and standard deviation (of the population) of the rows;
+        - `"range"`: the range in the feature space, or of the whole table if that is not known;
+        - `"rows"`: minimum and maximum of the selected rows (VerifAI's `build_normalized`);
+        - `"standard"`: mean and (population) standard deviation of the rows;
         - `"raw"`: 0 and 1.
 
         The width of a column that does not vary is 1.
@@ -252,9 +253,9 @@ class Samples:
     def points(self, scale: Scale = "range") -> Float[np.ndarray, "n d"]:
         """Return all columns such that Euclidean distances treat ordered and unordered ones alike.
 
-        The squared distance of two rows is the sum over ordered columns of squared scaled
-        differences, and 1 for each unordered column in which they differ. Where only one of two
-        has an item, its columns count 0.75 to 1 each; where neither has it, 0.
+        The squared distance of two rows is the sum of squared scaled differences of ordered
+        columns, plus 1 for each unordered column in which they differ. If only one of two rows has
+        an item, each of its columns counts 0.75 to 1; if neither has it, 0.
         """
         coordinates, codes = self.embed(scale)
         parts = [coordinates]
@@ -266,9 +267,9 @@ class Samples:
     def embed(
         self, scale: Scale = "range", frame: pd.DataFrame | None = None
     ) -> tuple[Float[np.ndarray, "n p"], Int[np.ndarray, "n m"]]:
-        """Coordinates of the ordered columns and codes of the unordered ones; see `distances`.
+        """Return coordinates of ordered columns and codes of unordered ones; see `distances`.
 
-        - `frame`: other rows, to be placed among these.
+        - `frame`: other rows, to be embedded in the same coordinates.
         """
         offset, width = self.scaling(scale)
         middles: Any = np.full(len(self.ordered), 0.5)
@@ -289,9 +290,9 @@ class Samples:
         )
 
     def need_ordered(self, purpose: str) -> None:
-        """Check that an ordered column exists, which `purpose` needs.
+        """Check that an ordered column exists; `purpose` says in the error what needs it.
 
-        **Raises:** `ValueError` where there is none.
+        **Raises:** `ValueError` if there is none.
         """
         if not self.ordered:
             raise ValueError(
@@ -300,9 +301,9 @@ class Samples:
             )
 
     def need_unordered(self, purpose: str) -> None:
-        """Check that an unordered column exists, which `purpose` needs.
+        """Check that an unordered column exists; `purpose` says in the error what needs it.
 
-        **Raises:** `ValueError` where there is none.
+        **Raises:** `ValueError` if there is none.
         """
         if not self.unordered:
             raise ValueError(
@@ -322,7 +323,7 @@ def distances(
     rows: tuple[Float[np.ndarray, "n p"], Int[np.ndarray, "n m"]],
     one: tuple[Float[np.ndarray, " p"], Int[np.ndarray, " m"]],
 ) -> Float[np.ndarray, " n"]:
-    """Distances of rows from one row, both as `Samples.embed` gives them; see `points`."""
+    """Return distances of rows from one row, both as returned by `Samples.embed`; see `points`."""
     squared = ((rows[0] - one[0]) ** 2).sum(axis=1) + (rows[1] != one[1]).sum(axis=1)
     return np.sqrt(squared)
 
@@ -332,12 +333,12 @@ Source: TypeAlias = Run | ErrorTable | pd.DataFrame | Samples
 
 
 def with_columns(frame: pd.DataFrame, own: pd.DataFrame) -> pd.DataFrame:
-    """Append the columns of `own` to those of `frame`, with `_` added to a name that is taken."""
+    """Append the columns of `own` to those of `frame`; names that are taken get `_` appended."""
     return frame.join(own.rename(columns={name: f"{name}_" for name in own if name in frame}))
 
 
 def generator(seed: Seed) -> np.random.Generator:
-    """Make a NumPy generator from a seed or a `jax.random` key; the same for the same seed.
+    """Make a NumPy generator from a seed or a `jax.random` key; equal seeds give equal ones.
 
     **Raises:** `ValueError` for anything else.
     """

@@ -10,8 +10,8 @@ from verifai_jax.evaluation.confirmations import NOT_CLAIMED
 def verdicts(table: pd.DataFrame) -> tuple[Bool[np.ndarray, " n"], Bool[np.ndarray, " n"]]:
     """Return the counterexamples and the rows that keep the property.
 
-    A row that violates it, and whose column `verdict` says that closer replays did not confirm it,
-    is neither.
+    A row that violates the property but that closer replays did not confirm (column `verdict`) is
+    in neither.
     """
     ended = np.ones(len(table), bool)
     if "status" in table:
@@ -28,7 +28,7 @@ def verdicts(table: pd.DataFrame) -> tuple[Bool[np.ndarray, " n"], Bool[np.ndarr
 
 
 def unconfirmed(table: pd.DataFrame) -> Bool[np.ndarray, " n"]:
-    """Return the rows that violate the property and are not claimed to."""
+    """Return the rows that violate the property but are not claimed as counterexamples."""
     if "verdict" not in table:
         return np.zeros(len(table), bool)
     return np.asarray(table["verdict"].isin(NOT_CLAIMED), bool)
@@ -47,7 +47,7 @@ def select_rows(table: pd.DataFrame, which: str) -> Bool[np.ndarray, " n"]:
 
 
 def explain_empty(table: pd.DataFrame, which: str) -> str:
-    """Explain in words why a selection of rows is empty."""
+    """Explain why a selection of rows is empty."""
     if not len(table):
         return "the table is empty: there are no simulations to analyse"
     violating, safe = (int(part.sum()) for part in verdicts(table))

@@ -18,23 +18,24 @@ def gradient_sensitivity(
     temperature: float | None = None,
     progress: bool | None = None,
 ) -> sensitivity.Sensitivity:
-    """Mean squared gradient of the robustness by each feature, and what it bounds.
+    """Measure the mean squared gradient of the robustness by each feature, and the bound it gives.
 
     `bound` is an upper bound on the total Sobol index: a feature whose bound is near 0 can be
-    fixed. It is no estimate of the index, and says nothing above 1, which a few huge gradients of
-    a chaotic system suffice for. `slope` is the mean gradient, whose sign tells which way is worse;
-    `typical` the median of its size. NaN for discrete coordinates, which have no gradient.
+    fixed. It is no estimate of the index, and a bound above 1, which a few huge gradients of a
+    chaotic system can cause, says nothing. `slope` is the mean gradient, whose sign tells which
+    direction is worse; `typical` is the median of its size. NaN for discrete coordinates, which
+    have no gradient.
 
     - `temperature`: the temperature of the smooth robustness that is differentiated; by default a
       hundredth of the standard deviation of the robustness. The bound holds for the smooth
-      robustness, and as far as the gradients of the system are its true ones.
+      robustness, if the gradients of the system are correct.
     - `progress`: whether to show one line of progress; see `core.display.progress` for the default.
 
     Source: Sobol and Kucherenko, Derivative based global sensitivity measures and their link with
     global sensitivity indices, Mathematics and Computers in Simulation 79 (2009).
 
     **Raises:** `ValueError` for a black box, a space with a constraint or without continuous
-    coordinates, fewer than 16 samples; where the robustness never varies.
+    coordinates, fewer than 16 samples, and a robustness that never varies.
     """
     sensitivity.check_problem(problem, "gradient sensitivity", None)
     if problem.black_box:

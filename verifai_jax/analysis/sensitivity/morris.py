@@ -32,17 +32,18 @@ def morris(
     of: str | None = None,
     progress: bool | None = None,
 ) -> Sensitivity:
-    """Elementary effects: how the robustness changes when one feature makes a large step.
+    """Measure elementary effects: how the robustness changes when one feature makes a large step.
 
-    `mu_star` is the mean size of the effect over the whole range, `sigma` its standard deviation:
-    large where the effect depends on the other features or is not linear; `mu` is the mean with
-    its sign (NaN for choices without an order).
+    `mu_star` is the mean size of the effect over the whole range. `sigma` is its standard
+    deviation, which is large if the effect is nonlinear or depends on the other features. `mu` is
+    the mean with its sign (NaN for choices without an order).
 
-    - `trajectories`: paths that change every coordinate once; `d + 1` simulations each.
+    - `trajectories`: number of paths that change every coordinate once; each takes `d + 1`
+      simulations.
     - `levels`: even number of values that a continuous coordinate takes: the middles of equally
       probable cells, so that long-tailed features stay finite. A discrete one takes all of its
       values.
-    - `of`: name of the formula; the least robustness of all when left out.
+    - `of`: name of the formula; when left out, the least robustness over all.
     - `progress`: whether to show one line of progress; see `core.display.progress` for the default.
 
     Sources: Morris, Factorial sampling plans for preliminary computational experiments,
@@ -50,7 +51,7 @@ def morris(
     design for sensitivity analysis of large models, Environmental Modelling and Software 22 (2007).
 
     **Raises:** `ValueError` for a space with a constraint, fewer than 2 trajectories, an odd number
-    of levels; where no simulation has a verdict or the robustness never varies.
+    of levels, and if no simulation has a verdict or the robustness never varies.
     """
     check_problem(problem, "elementary effects", of)
     check_count("trajectories", trajectories, 2)
@@ -104,7 +105,7 @@ def morris(
 def elementary_steps(
     counts: Int[np.ndarray, " d"], space: "Coordinates", generator: Any, n: int
 ) -> tuple[Int[np.ndarray, "n d"], Int[np.ndarray, "n d"], Float[np.ndarray, "n d"]]:
-    """First and last cell of every coordinate on every path, and the signed length of the step."""
+    """Return first and last cell of every coordinate on every path, and the signed step length."""
     start = generator.integers(counts, size=(n, len(counts)))
     half = counts // 2
     # Half the range up, or down from the upper half: every cell is visited equally often.

@@ -33,9 +33,9 @@ MAX_SHOWN = 20
 class Sensitivity(Drawn, InNotebook):
     """Result of a sensitivity analysis.
 
-    **Fields:** `method`; `problem`: its name; `table`: one row a unit coordinate, the most
-    influential first, with `low` and `high` ends of 95 % bootstrap intervals; `simulations` made;
-    `dropped`: how many of them had no verdict and were left out together with their partners;
+    **Fields:** `method`; `problem`: its name; `table`: one row for each unit coordinate, by
+    decreasing influence, with `low` and `high` ends of 95 % bootstrap intervals; `simulations`
+    made; `dropped`: how many of them had no verdict and were left out together with their partners;
     `variance` of the robustness.
     """
 
@@ -68,7 +68,7 @@ class Sensitivity(Drawn, InNotebook):
 
 
 class Simulator:
-    """Robustness of points of the cube, in batches of one shape; counts what it does."""
+    """The robustness of points of the cube, computed in batches of one shape and counted."""
 
     def __init__(
         self, problem: Problem, seed: int, batch: int, of: str | None, gradient: bool = False
@@ -96,7 +96,7 @@ class Simulator:
 
 
 class Coordinates(NamedTuple):
-    """The unit coordinates of a problem: what they are called and which values they have."""
+    """The unit coordinates of a problem, with their names and values."""
 
     names: tuple[str, ...]
     levels: tuple[int, ...]
@@ -160,7 +160,7 @@ def variance_of(rho: Float[np.ndarray, " n"], problem: Problem) -> float:
 
 
 def mean_of(values: Float[np.ndarray, "n d"]) -> Float[np.ndarray, " d"]:
-    """Mean of each column without its NaN; NaN where nothing is left."""
+    """Return the mean of each column without its NaN; NaN if nothing is left."""
     count = np.sum(np.isfinite(values), axis=0)
     return np.where(count > 0, np.nansum(values, axis=0) / np.maximum(count, 1), np.nan)
 

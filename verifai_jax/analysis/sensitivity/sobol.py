@@ -21,15 +21,15 @@ def sobol_indices(
     of: str | None = None,
     progress: bool | None = None,
 ) -> sensitivity.Sensitivity:
-    """Shares of the robustness's variance that each feature explains, alone and in all.
+    """Compute the share of the robustness's variance that each feature explains, alone and in all.
 
-    `first` is the share that goes away when the feature is known; `total` the share that stays
-    when everything else is known, interactions included. A feature with a total of 0 has no
-    influence at all.
+    `first` is the share of the variance that vanishes when the feature is known; `total` is the
+    share that remains when all other features are known, so it includes interactions. A feature
+    with a total of 0 has no influence at all.
 
-    - `samples`: base points `N`, best a power of two; `N (d + 2)` simulations for `d` coordinates,
-      and `N` more where simulations are random.
-    - `of`: name of the formula; the least robustness of all when left out.
+    - `samples`: number `N` of base points, best a power of two. It takes `N (d + 2)` simulations
+      for `d` coordinates, and `N` more if simulations are random.
+    - `of`: name of the formula; when left out, the least robustness over all.
     - `progress`: whether to show one line of progress; see `core.display.progress` for the default.
 
     Sources: first-order estimator of Saltelli et al., Variance based sensitivity analysis of model
@@ -38,7 +38,7 @@ def sobol_indices(
     Sobol sequence.
 
     **Raises:** `ValueError` for a space with a constraint, whose features are not independent; for
-    fewer than 16 samples; where no simulation has a verdict or the robustness never varies.
+    fewer than 16 samples; if no simulation has a verdict or the robustness never varies.
     """
     sensitivity.check_problem(problem, "Sobol indices", of)
     check_count("samples", samples, 16)

@@ -70,38 +70,42 @@ def certify(
     """Attack all policies, then bound the failure probability of each from fresh samples.
 
     **Arguments:**
-    - `problem_of`: a policy's `Problem`. JAX traces it with the policy's numbers as arguments, so
-      that policies of one structure share a program; where it cannot, each is compiled by itself.
+    - `problem_of`: a function from a policy to its `Problem`. JAX traces it with the policy's
+      numbers as arguments, so that policies of one structure share a program; if that fails, each
+      is compiled by itself.
     - `policies`: `rl.Policy` objects, or other pytrees of numbers.
-    - `p`: the failure probability that a safe policy stays below.
-    - `confidence`: with which all intervals hold at once.
-    - `samples`: of each policy at least, rounded up to whole blocks of 64 (of fewer for fewer than
-      64 samples). For the name of the safest alone, 32 are enough.
-    - `seed`: the seed of samples and search. The samples are the same for all policies, and from
-      another stream than a training with this seed.
-    - `budget`: samples of all policies together; four times the least number when left out. What
-      is beyond the least goes to policies whose verdict is open, and to the possibly safest.
-    - `attack`: the search that looks for failures first; the failures that it finds enter no rate.
+    - `p`: the failure probability below which a policy is called safe.
+    - `confidence`: the probability that all intervals hold at once.
+    - `samples`: minimum number of samples of each policy, rounded up to whole blocks of 64 (smaller
+      blocks for fewer than 64 samples). 32 are enough if only the safest policy is wanted.
+    - `seed`: the seed of samples and search. All policies get the same samples, which differ from
+      those of a training with this seed.
+    - `budget`: samples of all policies together; four times the minimum when left out. Samples
+      beyond the minimum go to policies whose verdict is open, and to those that may be the safest.
+    - `attack`: the search that looks for failures first; its failures enter no rate.
     - `attack_simulations`: simulations of each policy in the attack, rounded up to whole blocks; 0
       for no attack.
-    - `tie`: failure rates that differ by less count as equally safe. When left out, `p / 10` or
-      less: as fine as takes about as many samples again as all policies have at least.
-    - `remember(key, compute)`: a memo of simulated blocks; it returns the arrays that `compute`
-      gives, or gave under this key. A key holds a hash of the model's code, so that blocks of
-      another model are simulated anew; data that the model reads are not in it.
-    - `progress`: show what is going on, in one line; by default on a terminal, in a notebook, and
+    - `tie`: failure rates that differ by less than this count as equally safe. When left out, `p /
+      10` or less: so small that resolving it takes about as many samples as the minimum of all
+      policies together.
+    - `remember(key, compute)`: a memo of simulated blocks; it returns the arrays of `compute`, or
+      those stored under this key. A key holds a hash of the model's code, so that blocks of another
+      model are simulated anew; data files of the model are not part of it.
+    - `progress`: whether to show one line of progress; by default on a terminal, in a notebook, and
       once a minute elsewhere. A function `(done, total, text)` is called instead, with the
       simulations so far; `total` may not be reached.
     - `devices`: JAX devices; all of this process when left out.
-    - `executor`: whose workers simulate, as in `falsify`; the certificates are the same.
+    - `executor`: an executor whose workers simulate, as in `falsify`; the certificates are the
+      same.
 
-    Ctrl-C returns what is known. The same seed gives the same certificates, bit for bit on one
-    machine, whatever the order of the policies, the number of devices or what a memo holds.
+    Ctrl-C returns the certificates from finished samples. The same seed gives the same
+    certificates, bit for bit on one machine, whatever the order of the policies, the number of
+    devices or the content of a memo.
 
     **Raises:** before anything compiles, `ValueError` for numbers out of range, a search that
-    cannot attack, or policies with different features; `ProblemError` and what the monitor raises
-    for a problem whose parts do not fit, such as a formula over a signal that is not there; and
-    `AlwaysRaises` where the first simulations of all policies raise.
+    cannot attack, or policies with different features; `ProblemError` and the errors of the monitor
+    for a problem whose parts do not fit, such as a formula over an unknown signal; `AlwaysRaises`
+    if the first simulations of all policies raise.
     """
     started = time.perf_counter()
     policies = list(policies)
@@ -329,14 +333,15 @@ def _check(
 def repeat_failures(
     blocks: Blocks, policy: int, sampled: PolicyRecord, attacked: PolicyRecord
 ) -> Repetitions:
-    """Simulate the worst failures of a policy again, and take out what does not fail again.
+    """Simulate the worst failures of a policy again, and remove those that do not fail again.
 
-    One for 25 simulations or 32 of them, and up to 1024 where one has not come again.
+    It repeats one failure for every 25 simulations or 32 of them, and up to 1024 if one did not
+    fail again.
 
     **Arguments:**
-    - `blocks`: that simulate the policies.
+    - `blocks`: the blocks that simulate the policies.
     - `sampled`, `attacked`: its simulations, whose verdicts are replaced.
-    **Returns:** the counts, which as text say what that means of the system.
+    **Returns:** the counts; their text says what they mean for the system.
     """
     rows = [
         (float(verdicts.lowest[index]), record, block, index)

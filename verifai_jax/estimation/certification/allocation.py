@@ -42,12 +42,12 @@ GROWTH = 8
 
 
 class Leader(NamedTuple):
-    """The policy that is likeliest to be the safest.
+    """The policy that is most likely the safest.
 
     - `number`: the policy with the least posterior mean.
-    - `chance`: posterior probability that no rate is below the leader's by more than `tie`.
+    - `chance`: posterior probability that no other rate is below the leader's by more than `tie`.
     - `rivals`: for each policy, the probability that its rate is below the leader's by more than
-      that.
+      `tie`.
     """
 
     number: int
@@ -61,10 +61,10 @@ def find_leader(
     tie: float,
     margins: Float[np.ndarray, " n"] | None = None,
 ) -> Leader:
-    """Find the policy that is likeliest to be the safest.
+    """Find the policy that is most likely the safest.
 
-    Of equal means the one with more samples, then the one with the larger of the `margins`, such as
-    the least robustness in an attack, then the first.
+    Ties of the mean go to the policy with more samples, then to the one with the larger entry of
+    `margins`, such as the least robustness in an attack, then to the first.
     """
     from scipy.special import betainc, betaincinv
 
@@ -85,13 +85,15 @@ def find_leader(
 class Allocation:
     """A rule that says how many blocks of each policy to simulate next.
 
-    - `p`, `confidence`: of the verdicts. The safest is named at half the error that `confidence`
-      leaves: among near ties its posterior chance is a little too high.
-    - `samples`: of each policy at least; `block`: of one policy in one piece.
-    - `budget`: samples of all policies together, at most.
-    - `tie`: rates that differ by less count as equal. A leader without a failure is settled in
-      about `2.5 / tie` samples.
-    - `verdicts`, `safest`: what is to be decided.
+    - `p`, `confidence`: limit and confidence of the verdicts. The safest policy is named at half
+      the error that `confidence` allows, because among near ties its posterior chance is a little
+      too high.
+    - `samples`: minimum number of samples of each policy; `block`: samples of one policy in one
+      block.
+    - `budget`: maximum number of samples of all policies together.
+    - `tie`: rates that differ by less count as equal. For a leader without a failure about `2.5 /
+      tie` samples decide.
+    - `verdicts`, `safest`: whether to decide the verdicts, and the safest policy.
     """
 
     p: float = 0.01
@@ -105,7 +107,7 @@ class Allocation:
 
     @property
     def sure(self) -> float:
-        """The chance at which the safest is named."""
+        """The posterior chance required to name the safest policy."""
         return (1 + self.confidence) / 2
 
     def next(
@@ -114,9 +116,9 @@ class Allocation:
         simulations: Int[np.ndarray, " n"],
         margins: Float[np.ndarray, " n"] | None = None,
     ) -> Int[np.ndarray, " n"]:
-        """Return the blocks to simulate of each policy; all zero once nothing more can be decided.
+        """Return how many blocks to simulate for each policy; all zero if nothing is left open.
 
-        - `margins`: what decides between equals who leads; see `find_leader`.
+        - `margins`: numbers that decide between equal leaders; see `find_leader`.
         """
         k, n = np.asarray(failures), np.asarray(simulations)
         missing = np.maximum(-(-(self.samples - n) // self.block), 0)
@@ -135,7 +137,7 @@ class Allocation:
     def undecided(
         self, failures: Int[np.ndarray, " n"], simulations: Int[np.ndarray, " n"]
     ) -> Bool[np.ndarray, " n"]:
-        """Return the policies whose verdict is open, as it is of one without samples."""
+        """Return the policies whose verdict is open, including those without samples."""
         simulations = np.maximum(simulations, 1)
         limit = required_evidence(self.confidence, len(failures))
         p = np.full(len(failures), self.p)
@@ -216,7 +218,7 @@ def _within(blocks: Int[np.ndarray, " n"], left: int) -> Int[np.ndarray, " n"]:
 
 
 class RaceResult(NamedTuple):
-    """The safest arm, its chance to be the safest, and the counts of all arms."""
+    """The safest arm, its chance of being the safest, and the counts of all arms."""
 
     arm: int
     chance: float
@@ -236,9 +238,9 @@ def race(
 ) -> RaceResult:
     """Name the arm that fails least often.
 
-    - `draw(arm, n)`: how many of the next `n` samples of an arm fail.
-    - `first`: samples of each arm to begin with; then blocks of `block`.
-    - `budget`: samples at most.
+    - `draw(arm, n)`: a function that returns how many of the next `n` samples of an arm fail.
+    - `first`: samples of each arm at the start; later ones come in blocks of `block`.
+    - `budget`: maximum number of samples.
     """
     allocation = Allocation(
         p=1.0, confidence=confidence, samples=first, budget=budget, block=block, tie=tie,

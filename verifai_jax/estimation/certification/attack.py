@@ -27,7 +27,8 @@ from verifai_jax.search.proposals import Proposals
 class PolicyRecord:
     """The simulations of one policy: points, verdicts and counts.
 
-    - `points`, `verdicts`, `first`: of each block, with the number of its first simulation.
+    - `points`, `verdicts`, `first`: points and verdicts of each block, and the number of its first
+      simulation.
     - `simulations`: the simulations of all blocks.
     - `failures`: simulations that violate the property.
     - `not_finite`: simulations without a verdict.
@@ -50,7 +51,7 @@ class PolicyRecord:
         self.not_finite += int(np.sum(~verdicts.proper))
 
     def take_out(self, block: int, index: int) -> None:
-        """Leave a row out of the counterexamples and the least robustness, but in the counts."""
+        """Remove a row from the counterexamples and the least robustness, not from the counts."""
         verdicts = self.verdicts[block]
         rho, violated = verdicts.rho.copy(), verdicts.violated.copy()
         rho[index], violated[index] = np.nan, False
@@ -58,7 +59,7 @@ class PolicyRecord:
 
     @property
     def lowest(self) -> float:
-        """The least robustness; NaN where nothing had a verdict."""
+        """The least robustness; NaN if no simulation had a verdict."""
         values = [verdicts.lowest[verdicts.proper] for verdicts in self.verdicts]
         return float(min((np.min(rho) for rho in values if len(rho)), default=np.nan))
 
@@ -66,7 +67,7 @@ class PolicyRecord:
 def check_attack(problem: Problem, search: str | Search) -> Search:
     """Return the search, if it can attack many policies.
 
-    **Raises:** `ValueError` for an unknown name, one that the space does not suit, or one that
+    **Raises:** `ValueError` for an unknown name, a search that does not suit the space, or one that
     follows gradients; `TypeError` for anything that is not a search.
     """
     found = searches.named(search) if isinstance(search, str) else search
@@ -89,11 +90,11 @@ def attack_policies(
     """Attack every policy in rounds of one block each, and add the simulations to `records`.
 
     **Arguments:**
-    - `blocks`: simulates the policies.
-    - `records`: one of each policy.
+    - `blocks`: the blocks that simulate the policies.
+    - `records`: one record for each policy.
     - `search`: the search of each policy.
-    - `rounds`: blocks of each policy.
-    - `report(simulations)`: called after each block, for the progress.
+    - `rounds`: number of blocks for each policy.
+    - `report(simulations)`: called after each block, to show progress.
     """
     attackers = [
         Proposals(

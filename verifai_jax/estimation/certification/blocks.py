@@ -46,14 +46,14 @@ MAX_BARREN = 1000
 
 
 def compute_without_memo(key: str, compute: Callable[[], dict[str, np.ndarray]]) -> Arrays:
-    """Compute a block without remembering it."""
+    """Compute a block without storing it."""
     return compute()
 
 
 class Block(NamedTuple):
-    """One block: a policy by its number, points `[m, d]` with `m <= lanes`, and its name.
+    """One block: a policy's number and name, and points `[m, d]` with `m <= lanes`.
 
-    - `first`: number of its first sample, which the random keys come from.
+    - `first`: number of its first sample, from which the random keys are derived.
     """
 
     policy: int
@@ -65,17 +65,17 @@ class Block(NamedTuple):
 class Blocks:
     """Blocks of simulations of many policies; `simulated` counts those that were computed.
 
-    `sources` is the record of the model that they are simulated with.
+    `sources` is the record of the model's files.
 
     **Arguments:**
-    - `problem_of`: a policy's problem; JAX traces it where it can.
-    - `policies`: any pytrees of numbers, or other objects, which are then simulated one by one.
+    - `problem_of`: a function from a policy to its problem; JAX traces it if possible.
+    - `policies`: pytrees of numbers, or other objects, which are then simulated one by one.
     - `seed`: the seed of the samples and of the random keys of simulations.
     - `lanes`: samples in a block.
     - `devices`: JAX devices to use; all of this process when left out.
-    - `executor`: whose workers simulate; this process when left out.
-    **Raises:** `ProblemError` as `Problem.check` does, naming the policy, before anything compiles;
-    `ValueError` for policies whose problems have other features than the first.
+    - `executor`: an executor whose workers simulate; this process when left out.
+    **Raises:** before anything compiles, the `ProblemError` of `Problem.check`, naming the policy;
+    `ValueError` for policies whose problems differ from the first in their features.
     """
 
     def __init__(
@@ -159,7 +159,7 @@ class Blocks:
     def certificate(
         self, chosen: Sequence[tuple[int, int]]
     ) -> Iterator[tuple[tuple[int, int], Verdicts]]:
-        """Yield verdicts of `(policy, block)` pairs, in fresh samples of the prior."""
+        """Yield verdicts of `(policy, block)` pairs on fresh samples of the prior."""
         blocks = []
         for policy, number in chosen:
             first = number * self.lanes
@@ -172,7 +172,7 @@ class Blocks:
     def attack(
         self, chosen: Sequence[tuple[int, np.ndarray]], round_: int, search: str
     ) -> Iterator[tuple[int, Verdicts]]:
-        """Yield verdicts of points that a search chose for each policy, by indices in `chosen`."""
+        """Yield verdicts of each policy's points that a search chose; `chosen` holds indices."""
         blocks = [
             Block(
                 policy, points, round_ * self.lanes,
@@ -190,10 +190,10 @@ class Blocks:
         of_attack: bool,
         attempt: int,
     ) -> tuple[Float[np.ndarray, " n"], Bool[np.ndarray, " n"]]:
-        """Simulate rows of a policy on the host once more.
+        """Simulate rows of a policy once more on the host.
 
         **Arguments:**
-        - `numbers`: the numbers of the simulations, which their random keys come from.
+        - `numbers`: the numbers of the simulations, from which their random keys are derived.
         - `of_attack`: whether they are simulations of the attack, or samples.
         **Returns:** the least robustness of each, NaN without a verdict; and whether it fails.
         """

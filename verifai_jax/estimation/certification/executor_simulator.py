@@ -37,18 +37,18 @@ MAX_KEPT = 64
 
 
 class ExecutorSimulator:
-    """Policies of one structure, or each by itself, on workers; see the module's docstring.
+    """A simulator on workers, for one or more policies of one structure; see the module.
 
     **Arguments:**
-    - `shipment`: with `problem_of`.
-    - `policies`: as a worker simulates them, those of one structure already padded.
+    - `shipment`: the pickled code for the workers, with `problem_of`.
+    - `policies`: the policies as workers simulate them; those of one structure are padded.
     - `structure`: the structure of the policies that share a program; None for those simulated by
       themselves.
     - `lanes`: samples in a block.
     - `dim`: coordinates of a sample.
-    - `executor`: with `submit`.
+    - `executor`: an executor with `submit`.
 
-    `messages` are those of policies whose simulation raised.
+    `messages` holds the errors of policies whose simulation raised.
     """
 
     def __init__(
@@ -69,7 +69,7 @@ class ExecutorSimulator:
         self._name = uuid.uuid4().hex
 
     def blocks_per_call(self) -> int:
-        """Return the number of blocks that keep all workers busy for a while."""
+        """Return the number of blocks in a call, enough to keep all workers busy for a while."""
         return 3 * executors.count_workers(self._executor) * self._each
 
     def __call__(
@@ -126,8 +126,9 @@ def simulate_blocks(
 ) -> dict[str, Any]:
     """Simulate blocks of policies; called by a worker.
 
-    **Arguments:** as of `ExecutorSimulator`, with the `policies` of these blocks by their numbers,
-    and a `name` that sets policies by themselves apart from those of other simulators.
+    **Arguments:** those of `ExecutorSimulator`, with the `policies` of these blocks by their
+    numbers,
+    and a `name` that distinguishes policies simulated by themselves from those of other simulators.
     **Returns:** `rho`, `status` and `violated` of each block; `messages` by policy; `seconds`.
     """
     indices = {number: index for index, (number, _) in enumerate(policies)}

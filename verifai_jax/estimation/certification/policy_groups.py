@@ -28,10 +28,10 @@ MIN_WIDTH = 64
 class PolicyGroup:
     """Policies that one program can simulate.
 
-    - `numbers`: their indices in the list that was given.
+    - `numbers`: their indices in the given list.
     - `weights`: the padded policies, with NumPy leaves, in that order.
-    - `structure`: what they have in common, as text.
-    - `traced`: False for a policy that is not a pytree of numbers and has to stay as it is.
+    - `structure`: their common structure, as text.
+    - `traced`: False for a policy that is not a pytree of numbers and stays as it is.
     """
 
     numbers: tuple[int, ...]
@@ -57,14 +57,14 @@ def group_policies(policies: Sequence[Any]) -> list[PolicyGroup]:
 
 
 def is_numeric(policy: Any) -> bool:
-    """Check that a policy is made of numbers alone, which JAX can take as arguments."""
+    """Check that a policy consists only of numbers, which JAX can take as arguments."""
     leaves = jax.tree.leaves(policy)
     plain = (np.ndarray, np.generic, jax.Array, int, float)
     return bool(leaves) and all(isinstance(leaf, plain) for leaf in leaves)
 
 
 def padded(policy: Any) -> Any:
-    """Return a policy with NumPy leaves, hidden layers of a `Policy` at the shared width."""
+    """Return a policy with NumPy leaves and hidden layers padded to the shared width."""
     policy = jax.tree.map(_on_host, policy)
     if not isinstance(policy, Policy):
         return policy
@@ -86,7 +86,7 @@ def shared_width(width: int) -> int:
 
 
 def structure_of(policy: Any) -> str:
-    """Return text that is equal for policies which one program can simulate."""
+    """Return a text that is equal for policies that one program can simulate."""
     leaves, form = jax.tree.flatten(policy)
     shapes = [f"{np.dtype(leaf.dtype).str}{list(np.shape(leaf))}" for leaf in leaves]
     return f"{form} {' '.join(shapes)}"

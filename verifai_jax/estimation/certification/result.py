@@ -19,17 +19,17 @@ if TYPE_CHECKING:
 class Certificate(InNotebook):
     """The certificate of one policy.
 
-    - `simulations`: independent samples of the prior; `failures` and `not_finite` among them.
-      Samples without a verdict (`not_finite`) count as failures in the `rate`.
-    - `rate`: with an interval that holds together with those of all other policies, whatever
-      decided the number of samples; None before the first sample.
+    - `simulations`: number of independent samples of the prior; `failures` and `not_finite` are
+      counts among them. Samples without a verdict (`not_finite`) count as failures in the `rate`.
+    - `rate`: the failure rate with an interval. The intervals of all policies hold together,
+      however the number of samples was decided; None before the first sample.
     - `verdict`: `"safe@p"` if the interval is below p, `"unsafe"` if above, or `"undecided"`.
     - `attacks`: simulations of the attack, `attack_failures` among them; they are in no rate.
-    - `worst_robustness`: the least over everything simulated but `fragile` rows, NaN if nothing
-      had a verdict; `worst_features`: the table columns at which it was met.
+    - `worst_robustness`: the least robustness of all simulations except `fragile` rows, NaN without
+      a verdict; `worst_features`: the table columns of that simulation.
     - `counterexamples`: columns of features and `rho`, worst first.
-    - `fragile`: failures that did not fail again with the same features and random key. They are
-      in the `rate`, and in neither of the two above.
+    - `fragile`: failures that did not fail again with the same features and random key. They count
+      in the `rate`, but not in `worst_robustness` and `counterexamples`.
     """
 
     number: int
@@ -47,7 +47,7 @@ class Certificate(InNotebook):
 
     @property
     def cost(self) -> int:
-        """Simulations of both stages."""
+        """Number of simulations of attack and certification."""
         return self.simulations + self.attacks
 
     def __str__(self) -> str:
@@ -74,13 +74,13 @@ class Certificate(InNotebook):
 class Certificates(InNotebook):
     """The certificates of all policies; `certificates[i]` is the `Certificate` of policy i.
 
-    **Fields:** `p` and `confidence` of the verdicts: with this probability no interval of any
-    policy, and so no verdict, is wrong; `safest`: number of the policy that fails least often, None
-    before all have been sampled; `chance`: its posterior probability to be the safest up to `tie`
-    (an estimate, no bound); `samples` of each policy at least and `budget` of all;
-    `stopped`: `"decided"`, `"budget"` (a verdict or the safest is open, and the budget or what is
-    left of it too small) or `"interrupted"`; `notes`; `seconds`; `seed`; `problem`: its name;
-    `sources`: what the model was made of, as a run records it.
+    **Fields:** `p` and `confidence` of the verdicts: with this probability all intervals, and so
+    all verdicts, are right; `safest`: number of the policy that fails least often, None before all
+    have been sampled; `chance`: its posterior probability of being the safest up to `tie` (an
+    estimate, no bound); `samples`: minimum for each policy; `budget`: for all policies; `stopped`:
+    `"decided"`, `"budget"` (a verdict or the safest is open, and what is left of the budget is too
+    small) or `"interrupted"`; `notes`; `seconds`; `seed`; `problem`: its name; `sources`: the files
+    of the model, as a run records them.
     """
 
     rows: tuple[Certificate, ...] = field(repr=False)
@@ -116,17 +116,17 @@ class Certificates(InNotebook):
 
     @property
     def simulations(self) -> int:
-        """Samples of the certificates, all policies together; without the attack."""
+        """Number of samples of the certificates, all policies together; without the attack."""
         return sum(row.simulations for row in self.rows)
 
     @property
     def attacks(self) -> int:
-        """Simulations of the attack, all policies together."""
+        """Number of simulations of the attack, all policies together."""
         return sum(row.attacks for row in self.rows)
 
     @property
     def uniform(self) -> int:
-        """Samples if every policy had had as many as the one that needed most."""
+        """Number of samples needed if every policy had as many as the one with the maximum."""
         return len(self.rows) * max((row.simulations for row in self.rows), default=0)
 
     @property

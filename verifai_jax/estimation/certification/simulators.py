@@ -57,12 +57,12 @@ class Simulator(Protocol):
         ...
 
     def blocks_per_call(self) -> int:
-        """Return the number of blocks of one call, so that it does not last too long."""
+        """Return the number of blocks in one call, chosen so that a call does not take too long."""
         ...
 
 
 def problem_with(problem_of: Callable[[Any], Problem], policy: PyTree) -> Problem:
-    """Return the problem of one policy, whose weights JAX may be tracing."""
+    """Return the problem of one policy; JAX may be tracing its weights."""
     # What does not depend on the weights is computed now, so that checks of it can be made.
     with jax.ensure_compile_time_eval():
         problem = problem_of(policy)
@@ -126,7 +126,7 @@ def shared_simulator(
     dim: int,
     devices: Sequence[Device] | None = None,
 ) -> SharedSimulator:
-    """Return the simulator of a group; programs are kept as long as `problem_of` is in use."""
+    """Return the simulator of a group; its programs live as long as `problem_of`."""
     where = tuple(jax.local_devices() if devices is None else devices)
     try:
         program = _known_program(problem_of, group.structure, lanes, dim, where)
@@ -259,7 +259,7 @@ def _spread(
 
 
 class SeparateSimulators:
-    """Simulators of each policy by itself, for host systems and code that needs the numbers."""
+    """A simulator for each policy, for host systems and code that needs concrete numbers."""
 
     def __init__(self, problems: Sequence[Problem] | Mapping[int, Problem], lanes: int) -> None:
         self.lanes = lanes

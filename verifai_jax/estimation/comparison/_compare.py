@@ -60,27 +60,27 @@ def compare(
     """Compare failure rates of problems on common random samples, and stop when it is decided.
 
     Each pair of simulations has the same features and the same random key. A candidate is *worse*
-    where its failure rate is above that of the baseline by more than `margin`, *better* where it is
-    below it, *the same* where the two differ by `margin` at most; all of that with `confidence`,
-    whenever sampling stops, and for several candidates together.
+    if its failure rate exceeds that of the baseline by more than `margin`, *better* if it is lower
+    by more than `margin`, and *the same* if the two differ by at most `margin`. These verdicts hold
+    with `confidence`, whenever sampling stops, for all candidates together.
 
     **Arguments:**
     - `baseline`: the problem to compare with: itself, `FILE.py:NAME`, or `FILE.py:NAME@REVISION`
       for the problem as it was at a revision of git.
-    - `candidates`: another one that varies the same features, or several by name. What is held,
-      such as the parameters of a `repair`, may be held at other values, or be missing.
-    - `margin`: difference of failure probabilities that does not matter, from 0 on.
-    - `confidence`: probability with which all verdicts hold.
-    - `budget`: simulations at most, of all problems together.
+    - `candidates`: another problem with the same varying features, or several by name. Features
+      with fixed values, such as the parameters of a `repair`, may have other values or be missing.
+    - `margin`: the largest difference of failure probabilities that does not matter, at least 0.
+    - `confidence`: the probability that all verdicts hold.
+    - `budget`: maximum number of simulations of all problems together.
     - `seed`: the seed of the samples; the same seed gives the same pairs.
-    - `max_seconds`: wall-clock seconds after which finished pairs give the verdict.
+    - `max_seconds`: wall-clock seconds after which the verdict is made from finished pairs.
     - `precision`: as in `falsify`.
     - `progress`: whether to show one line of progress; see `core.display.progress` for the default.
-    - `executor`: whose workers simulate, as in `falsify`; the comparison is the same.
+    - `executor`: an executor whose workers simulate, as in `falsify`; the comparison is the same.
     **Returns:** the comparison; after Ctrl-C that of the finished pairs.
     **Raises:** before anything is simulated, `TypeError` for anything but a `Problem`;
-    `ProblemError` for other features that vary; `ValueError` for numbers out of range, and for
-    targets that cannot be loaded.
+    `ProblemError` if other features vary; `ValueError` for numbers out of range, and for targets
+    that cannot be loaded.
     """
     with ExitStack() as loaded:
 

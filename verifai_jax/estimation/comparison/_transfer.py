@@ -66,20 +66,19 @@ def transfer(
 ) -> Transfer:
     """Simulate the same policy in two engines, and find where they differ.
 
-    Traces are compared in the signals that the formulas of both read, each in units of its range.
-    A gap counts where it exceeds what rounding can do: `tolerance`, and several times the gap that
-    a move of the features by one rounding of single precision makes in the same engine.
+    Traces are compared in the signals that the formulas of both problems read, each in units of its
+    range. A gap counts if it exceeds `tolerance` and several times the effect of rounding: the gap
+    in one engine when the features move by one rounding error of single precision.
 
     **Arguments:**
-    - `policy`: given to both problems; None if they have it already.
+    - `policy`: the policy passed to both problems; None if they contain it already.
     - `problem_a`, `problem_b`: a function from the policy to a `Problem`, or a `Problem`. Features
-      that both have, with the same domains, are varied; all others are held at their nominal
-      values.
-    - `samples`: pairs that are sampled; rates and the influence of features are of these alone.
-    - `simulations`: pairs in addition, in which a search looks for the greatest difference.
-    - `search`: the search that does, without gradients.
-    - `tolerance`: gap that does not count, in units of a signal's range; above the tolerance of the
-      engines' solvers.
+      that both have, with the same domains, vary; all others keep their nominal values.
+    - `samples`: number of sampled pairs; rates and the influence of features come from these alone.
+    - `simulations`: number of further pairs, in which a search looks for the greatest difference.
+    - `search`: that search, which must not need gradients.
+    - `tolerance`: the largest gap that does not count, in units of a signal's range; choose it
+      above the tolerance of the engines' solvers.
     - `seed`: the seed of samples, search and random keys.
     - `batch`: pairs at once.
     - `precision`: the precision of the simulations.

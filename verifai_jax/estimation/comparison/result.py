@@ -29,11 +29,11 @@ class Compared:
     - `name`: the name of the candidate.
     - `rates`: the difference of their failure rates, candidate minus baseline.
     - `both`: pairs in which both fail.
-    - `margin`: difference that does not matter.
+    - `margin`: the largest difference that does not matter.
     - `discordant`: the pairs in which only one fails, a row each with the features; `worse` is true
-      where it is the candidate. Its index is the number of the pair, of which
-      `Comparison.random_key` is the key.
-    - `pairs`: features of all pairs, and `worse` and `better`; None if they were not kept.
+      if the candidate fails. Its index is the number of the pair; `Comparison.random_key` gives the
+      key.
+    - `pairs`: features of all pairs, with `worse` and `better`; None if they were not kept.
     """
 
     name: str
@@ -50,9 +50,9 @@ class Compared:
         return judge(self.rates, self.margin)
 
     def rules(self, **options: Any) -> Any:
-        """Describe by a few boxes where only the candidate fails; see `analysis.rules`.
+        """Describe with a few boxes where only the candidate fails; see `analysis.rules`.
 
-        **Raises:** `ValueError` where there is no such pair.
+        **Raises:** `ValueError` if there is no such pair.
         """
         rows = self.pairs.assign(violated=self.pairs["worse"]).drop(columns=["worse", "better"])
         return _rules(rows, self.space, options)
@@ -81,13 +81,13 @@ class Compared:
 class Comparison(Reported, InNotebook):
     """Candidates against a baseline on common samples, as `compare` returns them.
 
-    - `baseline`: its name.
+    - `baseline`: the name of the baseline.
     - `candidates`: a `Compared` for each.
-    - `simulations`: made in all.
+    - `simulations`: number of all simulations.
     - `stopped`: `"decided"`, `"budget"`, `"max_seconds"` or `"interrupted"`.
-    - `seconds`, `seed`: of the comparison.
-    - `notes`: differences of the two sides other than the system.
-    - `sources`: what each side was made of, by its name, as a run records it; that of the baseline
+    - `seconds`, `seed`: time and seed of the comparison.
+    - `notes`: differences of the two sides, apart from the system.
+    - `sources`: the files of each side's model, by its name, as a run records them; the baseline
       has the name `"baseline"`.
     """
 
@@ -107,19 +107,19 @@ class Comparison(Reported, InNotebook):
     def random_key(self, pair: int) -> Key[Array, ""]:
         """Return the random key of both sides of a pair, by its index in `discordant`.
 
-        Where a system draws, its failure comes again under this key.
+        If a system draws random numbers, its failure occurs again under this key.
         """
         return simulation_key(run_keys(self.seed)[1], pair)
 
     @property
     def verdict(self) -> str:
-        """The verdict on the only candidate, or the gravest of several."""
+        """The verdict on the only candidate, or the worst of several."""
         verdicts = [candidate.verdict for candidate in self.candidates]
         return min(verdicts, key=(WORSE, UNDECIDED, SAME, BETTER).index)
 
     @property
     def regression(self) -> bool:
-        """True where a candidate is worse by more than the margin."""
+        """True if a candidate is worse by more than the margin."""
         return any(candidate.verdict == WORSE for candidate in self.candidates)
 
     def __str__(self) -> str:
@@ -149,7 +149,7 @@ def _rules(rows: "pd.DataFrame", space: FeatureSpace, options: Mapping[str, Any]
 
 
 def judge(rates: PairedRates, margin: float) -> str:
-    """Decide from an interval: worse by more than the margin, better, the same within it, open."""
+    """Decide from an interval: worse or better by more than the margin, the same, or undecided."""
     if rates.low > margin:
         return WORSE
     if margin and rates.low >= -margin and rates.high <= margin:
@@ -164,17 +164,18 @@ class Transfer(Drawn, Reported, InNotebook):
     - `names`: the names of the two problems.
     - `table`: a row for each pair: its features; `robustness_a`, `violated_a` and those of b; the
       greatest `gap` of the traces in units of the range of a `signal`; `rounding`, the gap that
-      rounding can make; `parted`, the seconds at which they part beyond it; `differs`, whether they
-      do; `searched`, whether the search chose it; `proper`, whether both ended.
+      rounding can make; `parted`, the time in seconds at which the traces first differ by more;
+      `differs`, whether they do; `searched`, whether the search chose the pair; `proper`, whether
+      both simulations ended.
     - `space`: the space of the common features.
     - `influence`: each coordinate's share of the gap's variance among samples,
       from 0 to 1.
-    - `worst`: the row that parts most, with its traces in a and in b; None if none parts.
-    - `tolerance`, `seed`: as given.
+    - `worst`: the row with the largest gap, with both traces; None if no pair differs.
+    - `tolerance`, `seed`: as given to `transfer`.
     - `stopped`: `"budget"` or `"interrupted"`.
-    - `seconds`: that it took.
-    - `notes`: what else the two differ in.
-    - `sources`: what each was made of, as a run records it.
+    - `seconds`: duration of the comparison.
+    - `notes`: further differences of the two problems.
+    - `sources`: the files of each model, as a run records them.
     """
 
     _picture = "transfer", "plot_transfer"
@@ -193,7 +194,7 @@ class Transfer(Drawn, Reported, InNotebook):
 
     @property
     def differs(self) -> bool:
-        """True where traces of any pair part by more than rounding can do."""
+        """True if the traces of a pair differ by more than rounding can explain."""
         return bool(self.table["differs"].any())
 
     @property
@@ -207,9 +208,9 @@ class Transfer(Drawn, Reported, InNotebook):
         return simulation_key(run_keys(self.seed)[1], row)
 
     def rules(self, **options: Any) -> Any:
-        """Describe by a few boxes where only one of the two fails; see `analysis.rules`.
+        """Describe with a few boxes where only one of the two fails; see `analysis.rules`.
 
-        **Raises:** `ValueError` where there is no such pair.
+        **Raises:** `ValueError` if there is no such pair.
         """
         rows: Any = self.table[self.table["proper"]]
         rows = rows.assign(violated=rows.index.isin(self.flips.index), rho=-rows["gap"])

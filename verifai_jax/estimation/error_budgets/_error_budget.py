@@ -64,22 +64,23 @@ def error_budget(
     seed: int = 1,
     confidence: float = 0.95,
 ) -> ErrorBudget:
-    """Say how wrong a probability can be, part by part, and how far the prior may be wrong.
+    """Bound the error of a probability, part by part, and how wrong the prior may be.
 
     **Arguments:**
-    - `problem`: that was simulated; of a comparison the candidate, of a certificate the policy's.
+    - `problem`: the simulated problem; for a comparison the candidate, for a certificate that of
+      the policy.
     - `result`: an estimate, a rate (`run.failure_rate`), a certificate, or a candidate of a
       comparison, `comparison["NAME"]`.
     - `baseline`: the baseline of a comparison.
-    - `pairs`: samples of the prior that are simulated as they were, at a half and a quarter of the
-      step, in the other precision, and by each solver.
-    - `solvers`: the same problem by other algorithms, by name, such as with another integrator;
-      other backends of the system are added by themselves.
-    - `seeds`: further estimates with other seeds, each with the budget of the estimate.
-    - `limit`: that is claimed of the number; by default what `p0` of an estimate was, else twice
-      the upper end (0 of a difference).
-    - `seed`: the seed of the pairs: other samples than those of the result.
-    - `confidence`: with which all intervals hold together.
+    - `pairs`: number of samples of the prior that are simulated unchanged, at a half and a quarter
+      of the step, in the other precision, and by each solver.
+    - `solvers`: the same problem with other algorithms, by name, for example with another
+      integrator; other backends of the system are added automatically.
+    - `seeds`: number of further estimates with other seeds, each with the budget of the estimate.
+    - `limit`: the claimed upper limit of the number; by default `p0` of the estimate, or twice the
+      upper end (0 for a difference).
+    - `seed`: the seed of the pairs, which are different samples than those of the result.
+    - `confidence`: the probability that all intervals hold together.
     **Returns:** the `ErrorBudget`.
     **Raises:** `TypeError` for another result; `ValueError` for options out of range, a comparison
     without its baseline, and solvers with other features or formulas.

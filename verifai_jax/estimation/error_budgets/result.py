@@ -22,10 +22,10 @@ class ErrorPart:
 
     - `name`: `"sampling"`, `"step"`, `"precision"`, `"solver"` or a solver's name, `"seeds"`,
       `"randomness"`.
-    - `low`, `high`: by how much the number may be greater on account of it; of `"sampling"` the
-      ends of its interval, less the number. NaN for what was not measured.
-    - `text`: a sentence on how that was found, or why not.
-    - `counted`: whether it is in the sum.
+    - `low`, `high`: the range of this error: how much greater the true number may be. For
+      `"sampling"` the ends of its interval minus the number. NaN if it was not measured.
+    - `text`: a sentence on how it was measured, or why not.
+    - `counted`: whether it is part of the sum.
     """
 
     name: str
@@ -42,13 +42,13 @@ class ErrorPart:
 
 @dataclass(frozen=True)
 class PriorError:
-    """The error of the prior that makes a claim fall.
+    """The error of the prior that would make a claim false.
 
-    - `limit`: that the claim says the number is at most.
-    - `bound`: the upper end of the number, all parts of the error together.
-    - `radius`: the least Kullback-Leibler divergence, in nats, at which another prior makes the
-      number `limit`; 0 if the claim is not shown under this prior.
-    - `worst`: the greatest number within 0.01, 0.1 and 1 nat, by the radius.
+    - `limit`: the claimed upper limit of the number.
+    - `bound`: the upper end of the number, with all parts of the error.
+    - `radius`: the smallest Kullback-Leibler divergence, in nats, at which another prior raises the
+      number to `limit`; 0 if the claim is not shown under this prior.
+    - `worst`: the greatest number within a divergence of 0.01, 0.1 and 1 nat.
     """
 
     limit: float
@@ -58,7 +58,7 @@ class PriorError:
 
     @property
     def shift(self) -> float:
-        """By so many standard deviations the mean of one normal feature moves at `radius`."""
+        """The shift of the mean of one normal feature at `radius`, in standard deviations."""
         return math.sqrt(2 * self.radius)
 
     def __str__(self) -> str:
@@ -79,15 +79,14 @@ class PriorError:
 
 @dataclass(frozen=True)
 class ErrorBudget(Tabular):
-    """The error of a number by its parts, as `error_budget` returns it.
+    """The error of a number, split into parts, as `error_budget` returns it.
 
-    - `name`: the name of the problem; `what`: the number in words.
-    - `value`: the number as simulated; NaN where there is no estimate.
-    - `parts`: the parts of its error; each interval holds with its share of the error that is
-      allowed.
-    - `confidence`: with which all of them hold together.
+    - `name`: the name of the problem; `what`: a description of the number.
+    - `value`: the number as simulated; NaN if there is no estimate.
+    - `parts`: the parts of its error; each interval holds with its share of the allowed error.
+    - `confidence`: the probability that all of them hold together.
     - `prior`: how far the prior may be wrong.
-    - `simulations`: that it took.
+    - `simulations`: number of simulations used.
     """
 
     name: str
@@ -104,13 +103,13 @@ class ErrorBudget(Tabular):
 
     @property
     def low(self) -> float:
-        """The lower end of the number, the parts added."""
+        """The lower end of the number with all parts of the error added."""
         floor = -1.0 if self.what == DIFFERENCE else 0.0
         return max(floor, self._base + sum(part.low for part in self._counted))
 
     @property
     def high(self) -> float:
-        """The upper end of the number, the parts added."""
+        """The upper end of the number with all parts of the error added."""
         return min(1.0, self._base + sum(part.high for part in self._counted))
 
     @property

@@ -83,19 +83,20 @@ def modes(
     """Find every mode of failure, with its probability under the prior of the features.
 
     **Arguments:**
-    - `source`: a problem, or a run of one, whose failures are looked at too.
-    - `budget`: simulations at most; one with its gradient counts 2.
+    - `source`: a problem, or a run of one; failures of the run are then used too.
+    - `budget`: maximum number of simulations; one with its gradient counts as 2.
     - `batch`: simulations at once.
     - `seed`: the same seed gives the same modes on the same machine.
     - `confidence`: the confidence of all intervals, between 0 and 1.
-    - `min_share`: part of the failure probability below which a region is not listed.
+    - `min_share`: regions with a smaller share of the failure probability are not listed.
     - `precision`, `backend`: as in `falsify`.
-    - `max_seconds`: wall-clock seconds after which what is finished is divided into modes.
+    - `max_seconds`: wall-clock seconds after which the finished simulations are divided into modes.
     - `progress`: True draws a progress bar, False none; None draws one on a terminal.
-    **Returns:** the modes, the most probable first; empty if no failure was found or failures
-    could not be weighed, and a note says so. Where the system draws random numbers, probabilities
-    are over these too, and each mode holds the random key under which its likeliest failure fails.
-    **Raises:** `TypeError` for something that is not a problem or run; `ValueError` for options out
+    **Returns:** the modes, the most probable first. If no failure was found, or failures could not
+    be weighted, there are none and a note says why. If the system draws random numbers,
+    probabilities are over these too, and each mode holds the random key under which its likeliest
+    failure fails.
+    **Raises:** `TypeError` for a source that is not a problem or run; `ValueError` for options out
     of range, or a run that was loaded without its problem.
     """
     started = time.perf_counter()

@@ -41,15 +41,16 @@ Held = Callable[[int, int], LimitState]
 
 @dataclass(frozen=True)
 class Divided:
-    """Failing regions under held keys.
+    """Failing regions under fixed random keys.
 
     - `regions`: the regions; each point fails under a key.
     - `keys`: the number `[m]` of the key of each point.
-    - `joined`, `tried`: failures that a path joins to a region, of so many.
+    - `joined`, `tried`: the number of failures that a path joins to a region, and of those tried.
     - `under`: share of the failures that fail under one of the keys.
     - `held`: number of keys.
-    - `design`: row of the likeliest failure of each region; the least distant one when left out.
-    - `failing`: for a system with chance of its own, how many of `times` simulations of each
+    - `design`: row of the likeliest failure of each region; by default the one nearest to the
+      origin.
+    - `failing`: for a system with its own random numbers, how many of `times` simulations of each
       likeliest failure fail.
     """
 
@@ -70,7 +71,7 @@ class Divided:
 
     @property
     def note(self) -> str:
-        """Say what people have to know of these regions."""
+        """Return a note on these regions for the user."""
         which = "one random key" if self.held == 1 else f"{self.held} random keys"
         return (
             "the system draws random numbers, so that a point fails with a probability: the modes "
@@ -87,14 +88,14 @@ def divide_under_keys(
     samples: ImportanceSamples,
     starts: Float[np.ndarray, "m d"],
 ) -> Divided | None:
-    """Find the failing regions of a system that draws, within what is left of a budget.
+    """Find the failing regions of a system that draws random numbers, within the remaining budget.
 
     **Arguments:**
-    - `held`: the limit state under a key.
-    - `samples`: weighted samples, of which there are failures.
-    - `starts`: further points to begin from.
-    **Returns:** the regions, None without any.
-    **Raises:** `Ended` where time is over.
+    - `held`: the limit state under a fixed key.
+    - `samples`: weighted samples, some of which fail.
+    - `starts`: further points to start from.
+    **Returns:** the regions; None if there are none.
+    **Raises:** `Ended` when the time is over.
     """
     x = samples.x[samples.failing]
     asked = int(np.clip(np.sqrt(limit_state.left / 6), 1, ASKED))

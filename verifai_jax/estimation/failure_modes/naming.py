@@ -47,8 +47,8 @@ def name_mode(failures: pd.DataFrame, prior: pd.DataFrame) -> str:
     **Arguments:**
     - `failures`: features of failures of the mode, one a row.
     - `prior`: features of samples of the prior.
-    **Returns:** the conditions, the one that fewest samples of the prior fulfil first; `"anywhere"`
-    without one that tells the failures apart.
+    **Returns:** the conditions, in increasing order of how many samples of the prior satisfy them;
+    `"anywhere"` if no condition separates the failures.
     """
     varying = [name for name in failures.columns if len(set(prior[name].astype(str))) > 1]
     left = [each for name in varying for each in _conditions(failures, prior, name)]

@@ -43,11 +43,11 @@ SURELY_LESS = 0.05
 def divide_by_chance(
     limit_state: LimitState, rng: np.random.Generator, samples: ImportanceSamples
 ) -> Divided:
-    """Find the failing regions of a system with chance of its own, within what is left of a budget.
+    """Find the failing regions of a system with hidden randomness, within the remaining budget.
 
     **Arguments:**
-    - `limit_state`: the limit state; a part of its budget is kept for the answer.
-    - `samples`: weighted samples, of which there are failures.
+    - `limit_state`: the limit state; a part of its budget is reserved for the answer.
+    - `samples`: weighted samples, some of which fail.
     """
     limit_state.budget -= HANDED_OUT * GROUPS
     x = samples.x[samples.failing]

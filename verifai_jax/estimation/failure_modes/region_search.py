@@ -46,13 +46,13 @@ def find_regions(
     share: Float[np.ndarray, " n"],
     nearest: Float[np.ndarray, "m d"],
 ) -> Regions:
-    """Find the failing regions that weighted failures lie in.
+    """Find the failing regions that contain weighted failures.
 
     **Arguments:**
     - `z`: failures `[n, d]`.
-    - `share`: the part `[n]` of the failure probability that each stands for, of sum one.
+    - `share`: the share `[n]` of the failure probability that each represents; they sum to one.
     - `nearest`: further failures `[m, d]`, such as those of searches.
-    **Raises:** `Ended` where time is over, and where the budget is before a region was found.
+    **Raises:** `Ended` when the time is over, or if the budget is spent before a region was found.
     """
     regions = Regions(np.zeros((0, limit_state.dim)), np.zeros(0, int))
     try:
@@ -94,7 +94,7 @@ def share_explained(
     z: Float[np.ndarray, "n d"],
     share: Float[np.ndarray, " n"],
 ) -> tuple[int, int]:
-    """Draw failures, and count those that a path of failures joins to a region; return both."""
+    """Draw failures; return the number that a path joins to a region, and the total."""
     count = min(LOOKED_AT, max(2, limit_state.left // A_LOOK))
     _, joined = _look(limit_state, rng, regions, z, share, count)
     return int(joined.sum()), len(joined)

@@ -29,8 +29,8 @@ MIN_SCALE, MAX_SCALE = 1e-4, 3.0
 class Regions:
     """Regions of failures.
 
-    - `points`: failures `[m, d]`, several of a region.
-    - `region`: the region `[m]` of each.
+    - `points`: failures `[m, d]`, several for each region.
+    - `region`: the region `[m]` of each failure.
     """
 
     points: Float[np.ndarray, "m d"]
@@ -43,7 +43,7 @@ class Regions:
 
     @property
     def design_rows(self) -> list[int]:
-        """Rows of the least distant failure of each region."""
+        """Row of each region's failure nearest to the origin."""
         norms = np.linalg.norm(self.points, axis=1)
         return [
             int(np.flatnonzero(self.region == k)[norms[self.region == k].argmin()])
@@ -52,7 +52,7 @@ class Regions:
 
     @property
     def design_points(self) -> Float[np.ndarray, "k d"]:
-        """The least distant failure of each region."""
+        """Each region's failure nearest to the origin."""
         return self.points[self.design_rows]
 
     def assign(self, z: Float[np.ndarray, "n d"]) -> Int[np.ndarray, " n"]:
@@ -67,12 +67,12 @@ class Regions:
         return np.concatenate([np.take_along_axis(rows, order, axis=1), others], axis=1)
 
     def add(self, points: Float[np.ndarray, "n d"], region: Int[np.ndarray, " n"] | int) -> None:
-        """Add points of a region, or of the region of each."""
+        """Add points to one region, or each point to its own region."""
         self.points = np.concatenate([self.points, points])
         self.region = np.append(self.region, np.broadcast_to(region, len(points)))
 
     def standard_deviations(self) -> Float[np.ndarray, "k d"]:
-        """Return those of each region, the nearer to the prior's the fewer points it has."""
+        """Return those of each region, shrunk towards the prior's if it has few points."""
         stds = np.ones((self.count, self.points.shape[1]))
         for k in range(self.count):
             points = self.points[self.region == k]

@@ -27,22 +27,21 @@ class Mode(InNotebook):
     """One failing region.
 
     - `number`: its index in the order of probability; 0 is the most probable one.
-    - `name`: conditions in words that set it apart from the prior.
+    - `name`: conditions that distinguish it from the prior, as text.
     - `probability`: the probability of a failure in it, under the prior.
     - `low`, `high`: the interval, at the confidence of the result.
-    - `share`: its part of the whole failure probability.
+    - `share`: its share of the whole failure probability.
     - `features`: its likeliest failure under the prior (the design point).
     - `distance`: the distance of that point from the middle of the prior, in standard deviations of
       normal space (the reliability index).
-    - `rho`: robustness there.
-    - `cause`: the formula and the predicate that decide there, as text; empty without a verdict.
-    - `failures`: features of failures of this mode, distributed as the prior's, one a row.
+    - `rho`: robustness at that point.
+    - `cause`: the formula and the predicate that decide at that point, as text; empty without a
+      verdict.
+    - `failures`: features of failures of this mode, distributed as under the prior, one a row.
     - `problem`: the problem.
-    - `run`: the simulations of the likeliest failure, all with its random key where the system
-      draws.
-    - `row`: row of `run` that fails at, or just beyond, the likeliest failure; None if
-      none does.
-    - `chance`: where the system has memory or chance of its own, the share of several simulations
+    - `run`: the simulations of the likeliest failure, all with its random key if the system draws.
+    - `row`: row of `run` that fails at the likeliest failure or just beyond it; None if none does.
+    - `chance`: for a system with memory or randomness of its own, the share of several simulations
       of the likeliest failure that failed; None for other systems.
     """
 
@@ -76,7 +75,7 @@ class Mode(InNotebook):
         return self.low, self.high
 
     def replay(self, precision: str | None = None) -> Replay:
-        """Simulate the likeliest failure again, with its random key, and keep the trace."""
+        """Simulate the likeliest failure again with its random key, and keep the trace."""
         columns: Mapping[str, Any] = self.features
         again = replay(
             self.problem, columns, self.key, self.key_number, precision or self.precision
@@ -87,16 +86,16 @@ class Mode(InNotebook):
         """Draw the likeliest failure as an animated GIF.
 
         **Arguments:**
-        - `path`: a file that is written too; none when left out.
+        - `path`: a file to write as well; none when left out.
         - `options`: `camera`, `size` and `fps`, as in `Replay.animate`.
-        **Raises:** as `Replay.animate`.
+        **Raises:** the errors of `Replay.animate`.
         """
         return self.replay().animate(path, **options)
 
     def explain(self, nominal: Mapping[str, Any] | None = None) -> Explained:
-        """Explain the likeliest failure: predicate, instant, and the features that matter.
+        """Explain the likeliest failure: its predicate, instant, and the features that matter.
 
-        **Raises:** `ValueError` where it does not fail when it is simulated again.
+        **Raises:** `ValueError` if it does not fail when it is simulated again.
         """
         return explain(self.run, self._row(), nominal=nominal)
 
@@ -106,12 +105,12 @@ class Mode(InNotebook):
         by: Literal["count", "distance"] = "count",
         budget: int = 2000,
     ) -> Shrunk:
-        """Search the least departure from nominal that still fails in this mode.
+        """Find the smallest departure from nominal that still fails in this mode.
 
-        It stays on the side of nominal on which the likeliest failure lies.
+        It stays on the same side of nominal as the likeliest failure.
 
-        **Raises:** `ValueError` where that does not fail when it is simulated again, or a feature
-        has no nominal value.
+        **Raises:** `ValueError` if the likeliest failure does not fail when it is simulated again,
+        or if a feature has no nominal value.
         """
         return shrink(
             self.run, self._row(), nominal=nominal, by=by, budget=budget, others=False, stay=True
@@ -139,20 +138,20 @@ class Modes(Drawn, InNotebook):
 
     - `name`: the name of the problem.
     - `modes`: the regions.
-    - `probability`, `low`, `high`: of any failure, as `estimate` gives it; None without an
-      estimate, with 0 and the guaranteed bound.
+    - `probability`, `low`, `high`: probability of any failure, as `estimate` gives it. Without an
+      estimate None, with 0 and the guaranteed bound.
     - `confidence`: the confidence of all intervals.
-    - `unexplained`: share of the failures that no path of failures joins to a mode, from below to
-      above: the interval of a count.
-    - `rest`: probability of further regions that are too improbable to be listed.
-    - `simulations`, `budget`: used and allowed.
-    - `upper_bound`: guaranteed, by samples of the prior alone.
+    - `unexplained`: share of the failures that no path of failures joins to a mode, as an interval
+      `(low, high)`.
+    - `rest`: total probability of further regions that are too improbable to be listed.
+    - `simulations`, `budget`: simulations used and allowed.
+    - `upper_bound`: upper bound guaranteed by samples of the prior alone.
     - `notes`: sentences on anything surprising.
-    - `run`: simulations of the likeliest failures, as `falsify` keeps them.
+    - `run`: simulations of the likeliest failures, in the form of a run of `falsify`.
     - `seconds`: wall-clock time.
-    - `stopped`: what ended it early: `"max_seconds"` or `"interrupted"`; None if nothing did.
-    - `sources`: what the model was made of, as a run records it.
-    - `changed`: says that the model of the run from which they began is another one by now.
+    - `stopped`: the reason for an early end: `"max_seconds"` or `"interrupted"`; None without one.
+    - `sources`: the files of the model, as a run records them.
+    - `changed`: a sentence if the model has changed since the given run was made.
     """
 
     _picture = "modes", "plot_modes"

@@ -50,27 +50,28 @@ def real_trials(
     executor: "Executor | None" = None,
     progress: bool | None = None,
 ) -> RealTrials:
-    """Estimate the failure rate in reality from trials, with the help of the simulation.
+    """Estimate the failure rate of the real system from trials, with the help of the simulation.
 
-    The interval holds whatever the simulation is worth. Where its predictions are good, half as
+    The interval holds however good or bad the simulation is. If its predictions are good, half as
     many trials or fewer give an interval as short as that of Clopper and Pearson.
 
     **Arguments:**
-    - `problem`: the simulation. The prior of its features is the distribution of the trials.
+    - `problem`: the simulation. The prior of its features must be the distribution of the trials.
     - `trials`: the path of a CSV or Parquet file, or a data frame: a column for each feature as in
       the table of a run, and `failed` (yes or no; empty where a trial may have failed), or
       `recording` with a file of signals for each trial, which the formulas judge.
-    - `simulations`: the simulations of the prior, which say how often a failure is predicted.
-    - `confidence`: probability with which the interval is to hold.
+    - `simulations`: number of simulations of the prior, which tell how often a failure is
+      predicted.
+    - `confidence`: the probability that the interval holds.
     - `seed`: the seed of the simulations.
-    - `allocated`: the numbers of trials that are predicted to fail and not to fail were chosen
-      beforehand, as `next_trials` does; without that trials are samples of the prior.
-    - `at_any_time`: verdicts decided which trials were made, or when to stop.
-    - `time`, `dt`: of recordings, as `mtl.read` takes them.
+    - `allocated`: True if the numbers of trials with and without a predicted failure were chosen
+      beforehand, as `next_trials` does; otherwise the trials are samples of the prior.
+    - `at_any_time`: True if verdicts influenced which trials were made, or when to stop.
+    - `time`, `dt`: time column and period of recordings, as in `mtl.read`.
     - `precision`, `executor`, `progress`: as in `falsify`.
     **Returns:** the result, with the table of trials and predictions.
     **Raises:** `FileNotFoundError`; `ValueError` for tables without a verdict or a feature,
-    features outside their domains, and options out of range; what `falsify` raises.
+    features outside their domains, and options out of range; the errors of `falsify`.
     """
     if not isinstance(problem, Problem):
         raise TypeError(f"real_trials needs a Problem; got {type(problem).__name__}")

@@ -39,13 +39,14 @@ DRAWN = 50
 
 @dataclass(frozen=True, eq=False)
 class Calibration(InNotebook):
-    """The posterior of features that nobody measured, as `calibrate` returns it.
+    """The posterior of unmeasured features, as `calibrate` returns it.
 
     - `samples`: draws of the posterior, a column for each feature.
-    - `problem`: the problem with these features distributed as the draws, each on its own.
+    - `problem`: the problem in which each of these features has the distribution of its draws,
+      independently of the others.
     - `trials`: the number of trials with a verdict.
-    - `unexplained`: trials that contradict even the best values.
-    - `effective`: the number of independent draws that the samples are worth.
+    - `unexplained`: number of trials that contradict even the best values.
+    - `effective`: effective number of independent draws.
     """
 
     samples: "pd.DataFrame"
@@ -81,13 +82,13 @@ def calibrate(
     **Arguments:**
     - `problem`: the simulation.
     - `trials`: a table with the other features, and `failed` as in `real_trials`; a column
-      `robustness` of measured values is used instead, where there is one.
-    - `features`: names of the features that the trials had in common and nobody measured.
-    - `simulations`: all of them; each draw of values takes as many as there are trials.
+      `robustness` of measured values is used instead if there is one.
+    - `features`: names of the features that had the same unknown values in all trials.
+    - `simulations`: number of all simulations; each draw takes as many as there are trials.
     - `seed`: the seed of the draws.
     **Returns:** the posterior, and the problem with it.
-    **Raises:** `ValueError` for no or an unknown feature, one that is no single number, a table
-    without a verdict, and fewer simulations than 20 draws take; what `simulate` raises.
+    **Raises:** `ValueError` for no or an unknown feature, a feature that is not a single number, a
+    table without a verdict, and fewer simulations than 20 draws take; the errors of `simulate`.
     """
     table: Any = table_of(trials)[0]
     check_names("feature", dict.fromkeys(features), problem.space.domains)

@@ -22,12 +22,12 @@ MAX_FACTOR = 1024
 
 @dataclass(frozen=True)
 class TrialComparison(InNotebook):
-    """Two policies in pairs of real trials, as `compare_trials` returns it.
+    """Two policies compared in pairs of real trials, as `compare_trials` returns it.
 
     - `baseline`, `candidate`: names of the policies.
     - `rates`: the difference of their failure rates, candidate minus baseline.
     - `both`: pairs in which both fail.
-    - `margin`: difference that does not matter.
+    - `margin`: the largest difference that does not matter.
     """
 
     baseline: str
@@ -43,7 +43,7 @@ class TrialComparison(InNotebook):
 
     @property
     def pairs_to_go(self) -> int | None:
-        """Further pairs that decide, if they are like those so far; None if that is far away."""
+        """Number of further pairs needed if they are like those so far; None if far too many."""
         rates, factor = self.rates, 1.0
         while factor <= MAX_FACTOR:
             counts = (rates.only_first, rates.only_second, rates.pairs)
@@ -85,18 +85,18 @@ def compare_trials(
     margin: float = 0.0,
     confidence: float = 0.95,
 ) -> TrialComparison:
-    """Compare two policies by pairs of real trials, after any pair.
+    """Compare two policies by pairs of real trials; valid after any number of pairs.
 
     **Arguments:**
     - `trials`: a table with the columns `pair`, `policy` and `failed` (yes, no, or empty), such as
-      the one that `trial_protocol` makes; pairs of which a trial is missing are left out.
+      the one that `trial_protocol` makes; pairs with a missing trial are left out.
     - `baseline`, `candidate`: the policies' names.
-    - `key`: the table with the columns `code` and `policy` that `trial_protocol` made, where
-      trials name a policy by its code.
-    - `margin`: difference of failure rates that does not matter, from 0 on.
-    - `confidence`: probability with which the verdict holds, whenever one stops.
+    - `key`: the table with the columns `code` and `policy` that `trial_protocol` made, if trials
+      name a policy by its code.
+    - `margin`: the largest difference of failure rates that does not matter, at least 0.
+    - `confidence`: the probability that the verdict holds, whenever one stops.
     **Raises:** `FileNotFoundError`; `ValueError` for missing columns, an unknown policy, a pair
-    that has a policy twice, no complete pair, and numbers out of range.
+    that has a policy twice, trials without a complete pair, and numbers out of range.
     """
     check_fraction("confidence", confidence)
     if not 0 <= margin < 1:

@@ -44,17 +44,17 @@ def trial_protocol(
 ) -> "pd.DataFrame":
     """Write a protocol sheet for real trials, and a table to fill in.
 
-    Next to the sheet `path` stands a table of the same name that ends in `.csv`, whose column
-    `failed` is to be filled in, for `real_trials` or `compare_trials`. With policies, each pair of
-    trials has the same features; who runs them sees codes, whose meaning is in the file that ends
-    in `_key.csv`.
+    A table with the name of the sheet `path` and the ending `.csv` is written next to it; fill in
+    its column `failed` for `real_trials` or `compare_trials`. With policies, each pair of trials
+    has the same features. The person who runs them sees only codes; the file that ends in
+    `_key.csv` says which policy a code means.
 
     **Arguments:**
-    - `problem`: its features are drawn from the prior; its formulas are the property.
+    - `problem`: the problem; its features are drawn from the prior, its formulas are the property.
     - `path`: the path of the HTML file.
     - `count`: number of trials, or of pairs.
     - `policies`: names of two policies to compare.
-    - `trials`: features of the trials instead, such as those of `next_trials`.
+    - `trials`: features of the trials, such as those of `next_trials`, instead of drawn ones.
     - `seed`: the seed of the features, the order and the codes.
     **Returns:** the table.
     **Raises:** `ValueError` for a number of policies other than none or two; `OSError` where a file

@@ -31,13 +31,13 @@ def read_trials(
     """Read trials, and judge those that have a recording instead of a verdict.
 
     **Arguments:**
-    - `problem`: its features are columns of the table; its formulas judge recordings.
+    - `problem`: the problem; its features are columns of the table, its formulas judge recordings.
     - `trials`: a file or a data frame.
-    - `time`, `dt`: of recordings, as `mtl.read` takes them.
-    **Returns:** the features with a column `failed` of True, False or None (undecided), and why
-    recordings have no verdict, with how many.
-    **Raises:** `FileNotFoundError`; `ValueError` for no trial, a table without a verdict or without
-    a feature, and for a verdict that is none.
+    - `time`, `dt`: time column and period of recordings, as in `mtl.read`.
+    **Returns:** the features with a column `failed` of True, False or None (undecided), and the
+    reasons why recordings have no verdict, with their counts.
+    **Raises:** `FileNotFoundError`; `ValueError` for a table without trials, without a verdict or
+    without a feature, and for an invalid verdict.
     """
     table, folder = table_of(trials)
     if FAILED not in table.columns and RECORDING not in table.columns:
@@ -65,9 +65,9 @@ def read_trials(
 
 
 def table_of(trials: TrialTable) -> "tuple[pd.DataFrame, Path]":
-    """Return trials as a data frame, and the folder that paths in it start from.
+    """Return trials as a data frame, and the folder to which paths in it are relative.
 
-    **Raises:** `FileNotFoundError`; `TypeError` for something else; `ValueError` for no rows.
+    **Raises:** `FileNotFoundError`; `TypeError` for another type; `ValueError` for no rows.
     """
     import pandas as pd
 
@@ -91,7 +91,7 @@ def table_of(trials: TrialTable) -> "tuple[pd.DataFrame, Path]":
 def verdicts_of(table: "pd.DataFrame") -> list[bool | None]:
     """Return the column `failed` as True, False or None (undecided).
 
-    **Raises:** `ValueError` for a missing column, and for an entry that is no verdict.
+    **Raises:** `ValueError` for a missing column, and for an entry that is not a verdict.
     """
     if FAILED not in table.columns:
         raise missing_name("the table of trials", "column", FAILED, list(table.columns))

@@ -25,13 +25,13 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class RealTrials(InNotebook):
-    """Trials in reality next to their simulations, as `real_trials` returns it.
+    """Real trials together with their simulations, as `real_trials` returns it.
 
     - `problem`: the simulation.
     - `table`: a row for each trial: its features, whether it `failed` (True, False, or None if
-      that is open), whether the simulation `predicted` that, and the simulated `robustness`.
+      undecided), whether the simulation `predicted` a failure, and the simulated `robustness`.
     - `background`: features, `predicted` and `robustness` of the simulated samples of the prior.
-    - `rate`: the failure rate in reality with its interval, from trials and simulations.
+    - `rate`: the failure rate of the real system with its interval, from trials and simulations.
     - `seed`: the seed of the simulations.
     - `notes`: sentences on anything surprising.
     """
@@ -50,9 +50,10 @@ class RealTrials(InNotebook):
         return clopper_pearson(int(predicted.sum()), len(predicted), self.rate.confidence)
 
     def predictions(self, predicted: bool) -> Rate | None:
-        """Return how often the trials fail that are predicted to, or those that are not.
+        """Return how often trials fail, among those predicted to fail or among the others.
 
-        None if there is no such trial. The counts are what is known of the simulation's worth.
+        None if there is no such trial. These counts show how good the predictions of the simulation
+        are.
         """
         rows = self.table[self.table["predicted"] == predicted]["failed"]
         if not len(rows):
@@ -62,7 +63,7 @@ class RealTrials(InNotebook):
 
     @property
     def wrong(self) -> "pd.DataFrame":
-        """The trials whose verdict is not the predicted one."""
+        """The trials whose verdict differs from the prediction."""
         known = self._known
         return known[known["failed"].astype(bool) != known["predicted"]]
 
@@ -72,11 +73,11 @@ class RealTrials(InNotebook):
         return self.table[[verdict is not None for verdict in self.table["failed"]]]
 
     def rules(self, **options: Any) -> "Rules":
-        """Describe by a few boxes of the features where the simulation is wrong; see `vj.rules`.
+        """Describe with a few boxes where the simulation is wrong; see `analysis.rules`.
 
         **Arguments:**
         - `options`: the options of `analysis.rules`.
-        **Raises:** `ValueError` where all predictions are right, or all wrong.
+        **Raises:** `ValueError` if all predictions are right, or all wrong.
         """
         columns = list(self.problem.space.columns)
         known = self._known
@@ -86,10 +87,10 @@ class RealTrials(InNotebook):
     def next_trials(self, count: int = 1, *, seed: int = 0) -> "pd.DataFrame":
         """Choose the trials that would shorten the interval most, the safest first.
 
-        How many are predicted to fail follows Neyman's rule; within these and the others the
-        features are drawn at random, which the interval rests on. So make all of them, in any
-        order, and give their verdicts to `real_trials(..., allocated=True)`, or with
-        `at_any_time=True` if you stop in between.
+        Neyman's rule decides how many trials with a predicted failure there are; within both groups
+        the features are drawn at random, on which the interval relies. So make all of these trials,
+        in any order, and give their verdicts to `real_trials(..., allocated=True)`, with
+        `at_any_time=True` if you stop early.
 
         **Arguments:**
         - `count`: number of trials.

@@ -50,25 +50,25 @@ def fuzz(
     """Look for failures by covering what can happen, with or without formulas.
 
     **Arguments:**
-    - `problem`: a problem with formulas; or none, with `space` and `system` in its place.
+    - `problem`: a problem with formulas; without one give `space` and `system`.
     - `budget`: simulations at most.
-    - `space`, `system`: what varies and what is simulated, where there is no formula. A simulation
-      then fails if it raises, hangs, has a signal that is not finite or one outside its range.
-    - `name`: the name of the run, where there is no problem.
-    - `ranges`: signal -> `(low, high)`: within which it must stay.
+    - `space`, `system`: the feature space and the system, if there is no formula. A simulation then
+      fails if it raises, hangs, or has a signal that is not finite or outside its range.
+    - `name`: the name of the run, if there is no problem.
+    - `ranges`: signal -> `(low, high)`: the range in which it must stay.
     - `cells`: signal -> `(low, high, how many)`: cells of behaviour to cover, of all these signals
-      together. When left out those of the problem's `behaviour`, or each signal with a range is cut
-      in four, where these are few.
-    - `search`: another search; `search.Coverage` when left out.
+      together. The default is the problem's `behaviour`, or, if few signals have ranges, four cells
+      for each of these.
+    - `search`: the search; `search.Coverage` when left out.
     - all other arguments: as in `falsify`.
 
-    With formulas a simulation that raises or hangs has a status and no verdict, as in `falsify`;
-    `run.failures` has these rows too.
+    With formulas, a simulation that raises or hangs has a status and no verdict, as in `falsify`;
+    `run.failures` includes these rows.
 
-    **Returns:** the run: `run.coverage` says what was covered of how much, `run.corpus` has the
-    rows that extended it, and `run.problem` the implicit properties.
-    **Raises:** `ValueError` for ranges or cells that are none, both or neither of a problem and a
-    space with a system; as `falsify`.
+    **Returns:** the run: `run.coverage` says how much was covered, `run.corpus` has the rows that
+    extended the coverage, and `run.problem` includes the implicit properties.
+    **Raises:** `ValueError` for invalid ranges or cells, and unless either a problem or a space
+    with a system is given; the errors of `falsify`.
     """
     checked = with_implicit(problem, space, system, ranges or {}, cells, name)
     run = falsify(

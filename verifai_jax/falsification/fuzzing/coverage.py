@@ -21,12 +21,12 @@ MAX_NAMED = 4
 
 @dataclass(frozen=True)
 class Covered:
-    """One kind of thing to cover.
+    """One kind of item to cover.
 
-    - `where`: the feature, or `traces`.
+    - `where`: the name of the feature, or `traces`.
     - `what`: `states`, `transitions`, `pairs`, `cells` or `clauses`.
-    - `names`: all names.
-    - `hits`: how many simulations had each.
+    - `names`: the names of all items.
+    - `hits`: how many simulations covered each item.
     """
 
     where: str
@@ -36,17 +36,17 @@ class Covered:
 
     @property
     def covered(self) -> int:
-        """Number of them that some simulation had."""
+        """Number of items that at least one simulation covered."""
         return sum(count > 0 for count in self.hits)
 
     @property
     def total(self) -> int:
-        """Number of them."""
+        """Number of items."""
         return len(self.names)
 
     @property
     def missing(self) -> tuple[str, ...]:
-        """Names of those that no simulation had."""
+        """Names of the items that no simulation covered."""
         return tuple(name for name, count in zip(self.names, self.hits, strict=True) if not count)
 
     def __str__(self) -> str:
@@ -72,14 +72,14 @@ _NOUNS = {
 
 @dataclass(frozen=True, eq=False)
 class FuzzCoverage(InNotebook):
-    """Coverage of a run; `parts` are a `Covered` for each feature and kind."""
+    """Coverage of a run; `parts` holds a `Covered` for each feature and kind."""
 
     parts: tuple[Covered, ...]
     automata: tuple[tuple[str, Automaton], ...] = ()
 
     @classmethod
     def of(cls, problem: Problem, counts: Int[np.ndarray, " ids"]) -> "FuzzCoverage":
-        """Read the coverage from the counts of coverage ids of a run."""
+        """Compute the coverage from a run's counts of coverage ids."""
         parts: list[Covered] = []
         first = len(Status)
         automata = tuple(_automata(problem.space.root, ""))
@@ -106,7 +106,7 @@ class FuzzCoverage(InNotebook):
         raise KeyError(f"nothing to cover of kind {what!r}: {[part.what for part in self.parts]}")
 
     def pairs(self, name: str) -> tuple[Bool[np.ndarray, "t t"], Int[np.ndarray, "t t"]]:
-        """Return which pairs of transitions of an automaton are possible, and the hits of each."""
+        """Return the possible pairs of transitions of an automaton, and the hits of each."""
         automaton = dict(self.automata)[name]
         count = len(automaton.transitions)
         possible, hits = np.zeros((count, count), bool), np.zeros((count, count), int)
@@ -116,7 +116,7 @@ class FuzzCoverage(InNotebook):
         return possible, hits
 
     def plot(self, path: str | Path | None = None) -> Figure:
-        """Draw which transitions followed which; of the first automaton.
+        """Draw which transitions of the first automaton followed which.
 
         **Raises:** `ValueError` for a run without an automaton.
         """

@@ -43,15 +43,15 @@ MAX_CUT = 4
 
 
 class CheckedSystem(System):
-    """A system whose traces say whether it ended properly, with finite signals.
+    """A system whose traces also tell whether the simulation ended properly, with finite signals.
 
     **Arguments:**
     - `system`: the system.
-    - `ranges`: the ranges of signals; numbers that are not finite are replaced by the middle, as
-      they are reported anyway.
+    - `ranges`: the ranges of signals. Numbers that are not finite are reported, and replaced by the
+      middle of the range.
     - `verdicts`: whether a simulation that raises, hangs or is not finite gets a trace that breaks
-      a property, instead of a status without a verdict.
-    - `cells`: the cells of signals, as given to `fuzz`; they are for the record of the run.
+      a property; otherwise it has a status and no verdict.
+    - `cells`: the cells of signals given to `fuzz`, for the record of the run.
     """
 
     def __init__(
@@ -76,7 +76,7 @@ class CheckedSystem(System):
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """The system's own."""
+        """The notes of the system."""
         return self.system.notes
 
     def __repr__(self) -> str:
@@ -205,10 +205,10 @@ def with_implicit(
     cells: Cells | None,
     name: str,
 ) -> Problem:
-    """Return a problem with the implicit properties added to its own formulas, if any.
+    """Return a problem with the implicit properties added to its own formulas.
 
-    **Raises:** `ValueError` for both or neither of a problem and a space with a system, and for
-    ranges that are none.
+    **Raises:** `ValueError` unless either a problem or a space with a system is given, and for
+    invalid ranges.
     """
     for key, ends in ranges.items():
         if not (isinstance(ends, tuple | list) and len(ends) == 2 and all(map(is_number, ends))):
@@ -245,11 +245,11 @@ def with_implicit(
 
 
 def as_recorded(problem: Problem, derived: Mapping[str, Any]) -> Problem:
-    """Return a problem with the implicit properties that a run of `fuzz` recorded.
+    """Return a problem with the implicit properties recorded by a run of `fuzz`.
 
     **Arguments:**
-    - `problem`: with its own formulas alone; for a run without any its name, its space and its
-      system count.
+    - `problem`: the problem with its own formulas only; if the run had none, its name, space and
+      system are used.
     - `derived`: `CheckedSystem.derived` of the run.
     **Raises:** `ValueError`, `TypeError`, `KeyError` for a record that describes no such problem.
     """

@@ -17,14 +17,14 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class FuzzRun(Run):
-    """A run with its coverage; everything else as in `Run`.
+    """A run of `fuzz`: a `Run` with its coverage.
 
-    Traces are not kept, since they are recomputed exactly: `run.replay(row).trace`.
+    Traces are not stored, since `run.replay(row).trace` recomputes them exactly.
     """
 
     @cached_property
     def coverage(self) -> FuzzCoverage:
-        """Coverage, of how much.
+        """The coverage: what the run covered, and how much there is to cover.
 
         **Raises:** `ValueError` for a run without its problem or its counts.
         """
@@ -36,19 +36,19 @@ class FuzzRun(Run):
 
     @property
     def corpus(self) -> "pd.DataFrame":
-        """The rows that extended coverage: each covered something that no row before it did."""
+        """The rows that extended the coverage: each covered something that no earlier row did."""
         table = self.table.all
         # A run that was interrupted before its first batch has no row, nor this column.
         return table.loc[table["new_coverage"] > 0] if len(table) else table
 
     @property
     def failures(self) -> "pd.DataFrame":
-        """The rows that break a property, implicit ones included, or did not end properly."""
+        """The rows that break a property, including implicit ones, or did not end properly."""
         table = self.table.all
         return table.loc[table["violated"] | (table["status"] != "ok")]
 
     def summary(self) -> str:
-        """Write the summary of the run, and what it covered, every number from its data."""
+        """Write the summary of the run and of its coverage; every number comes from its data."""
         lines = [super().summary()]
         if self.problem is not None and self.checkpoint and SEEN in self.checkpoint:
             covered = [f"{part.where}: {part}" for part in self.coverage.parts]
@@ -63,7 +63,7 @@ class FuzzRun(Run):
 
 
 def as_fuzz_run(run: Run) -> FuzzRun:
-    """Return a run of `fuzz` with what belongs to it: its coverage and its corpus."""
+    """Return a run of `fuzz` as a `FuzzRun`, with its coverage and its corpus."""
     if isinstance(run, FuzzRun):
         return run
     return FuzzRun(**{field.name: getattr(run, field.name) for field in fields(run)})

@@ -38,7 +38,7 @@ from verifai_jax.systems.channels import Link, Passing
 
 @dataclass(frozen=True, eq=False)
 class Simulation:
-    """A user's function that simulates once, its trace checked; sent to worker processes."""
+    """A user's function that simulates once, with checked traces; sent to worker processes."""
 
     function: Callable[..., Trace]
     seeded: bool
@@ -52,7 +52,7 @@ class Simulation:
 
     @property
     def known_signals(self) -> KnownSignals:
-        """Signals of a trace, see `System.known_signals`."""
+        """The signals of a trace; see `System.known_signals`."""
         if self.declared.signals is not None:
             return self.declared.widths
         return getattr(self.function, "known_signals", None)
@@ -127,11 +127,11 @@ class BlackBox(_RowByRow):
         return as_system(self.simulation.function).can_refine
 
     def refined(self, factor: int) -> "BlackBox":
-        """Return the same simulator with a `factor` times smaller step, if it has one."""
+        """Return the same simulator with a step divided by `factor`, if it has one."""
         return BlackBox(replace(self.simulation, function=_finer(self.simulation.function, factor)))
 
     def renewed(self) -> "BlackBox":
-        """Return the same simulator made anew, if it has a `renewed()` of its own."""
+        """Return a fresh copy of the simulator, if it defines `renewed()`."""
         made = _renewed(self.simulation.function)
         if made is self.simulation.function:
             return self
@@ -140,13 +140,13 @@ class BlackBox(_RowByRow):
 
 @dataclass(frozen=True, eq=False)
 class PooledBlackBox(_RowByRow):
-    """A system on the host, in processes of its own; made by `blackbox(..., workers=n)`."""
+    """A system on the host in its own processes; made by `blackbox(..., workers=n)`."""
 
     pool: Pool
 
     @property
     def workers(self) -> int:
-        """Simulations that run side by side."""
+        """Number of simulations that run in parallel."""
         return self.pool.workers
 
     def __call__(self, features: Features, key: Seed = None) -> Trace:
@@ -167,7 +167,7 @@ class PooledBlackBox(_RowByRow):
         return PooledBlackBox(simulation, Pool(simulation, simulation.function, *options))
 
     def renewed(self) -> "PooledBlackBox":
-        """Return the same simulator in worker processes of its own."""
+        """Return the same simulator with new worker processes."""
         return PooledBlackBox(self.simulation, self.pool.renewed())
 
     def close(self) -> None:
@@ -204,11 +204,11 @@ class VectorisedBlackBox(System):
         return as_system(self.function).can_refine
 
     def refined(self, factor: int) -> "VectorisedBlackBox":
-        """Return the same simulator with a `factor` times smaller step, if it has one."""
+        """Return the same simulator with a step divided by `factor`, if it has one."""
         return replace(self, function=_finer(self.function, factor))
 
     def renewed(self) -> "VectorisedBlackBox":
-        """Return the same simulator made anew, if it has a `renewed()` of its own."""
+        """Return a fresh copy of the simulator, if it defines `renewed()`."""
         made = _renewed(self.function)
         return self if made is self.function else replace(self, function=made)
 
@@ -219,7 +219,7 @@ class VectorisedBlackBox(System):
         return self._simulate(features, seeds, len(keys))
 
     def may_draw(self, features: Features) -> bool:
-        """Return whether the simulator is given seeds."""
+        """Return whether the simulator receives seeds."""
         return self.seeded
 
     def abstract(self, features: Features) -> Trace | None:
@@ -281,24 +281,25 @@ def blackbox(
 
     **Arguments:**
     - `function(features) -> Trace`: numbers arrive as `float` and `int`, arrays as NumPy. It may
-      have a `refined(factor)`, the same function with a smaller step, to confirm failures with (not
-      in workers).
-    - `seeded`: call `function(features, seed)` with an integer seed in `[0, 2^32)` of the
-      simulation, the same on every replay.
-    - `workers`: simulate in that many processes, which start with the first simulation and stay;
-      `function` must then be at the top level of a module. One after the other in this process
-      when left out. A worker has one core for JAX, no GPU, and no standard output.
-    - `timeout`: seconds of wall clock for one simulation, after which it is a row with status
-      `timeout`; needs `workers`. What a worker's first simulation compiles or loads counts.
-    - `retries`: how often a simulation whose process dies is started again, in a new one.
-    - `vectorised`: `function` simulates many at a time: arrays of features are `[n, ...]`, `seeds`
-      is `[n]`, and so is every array of the trace; see `stack_traces`.
-    - `signals`, `dt`, `length`: the form of every trace; see `TraceForm`. One that differs is a
-      row with status `error`.
-    **Returns:** a `VectorisedBlackBox` with `vectorised`, a `PooledBlackBox` with `workers`, else a
-    `BlackBox`.
-    **Raises:** `ValueError` for a function that cannot be called, or that workers cannot import,
-    and for options that do not go together.
+      have a method `refined(factor)` that returns the same function with a smaller step, which is
+      used to confirm failures (not in workers).
+    - `seeded`: whether to call `function(features, seed)`, with an integer seed in `[0, 2^32)` that
+      is the same on every replay.
+    - `workers`: number of processes, which start with the first simulation and stay; `function`
+      must then be at the top level of a module. When left out, simulations run one after the other
+      in this process. A worker has one core for JAX, no GPU, and no standard output.
+    - `timeout`: wall-clock seconds for one simulation, after which it becomes a row with status
+      `timeout`; needs `workers`. Compiling and loading in a worker's first simulation count.
+    - `retries`: how often a simulation is repeated in a new process after its process died.
+    - `vectorised`: whether `function` simulates many rows at a time: arrays of features are `[n,
+      ...]`, `seeds` is `[n]`, and all arrays of the trace have the same leading axis; see
+      `stack_traces`.
+    - `signals`, `dt`, `length`: the form of every trace; see `TraceForm`. A trace of another form
+      becomes a row with status `error`.
+    **Returns:** a `VectorisedBlackBox` if `vectorised`, a `PooledBlackBox` if `workers` are given,
+    otherwise a `BlackBox`.
+    **Raises:** `ValueError` for an object that cannot be called, or that workers cannot import, and
+    for incompatible options.
     """
     if not callable(function):
         raise ValueError(f"blackbox needs a function (features) -> Trace; got {function!r}")
@@ -329,12 +330,12 @@ def stack_traces(
     held: bool = False,
     finite: tuple[str, ...] = (),
 ) -> Trace:
-    """Return many traces as one, as `jax.vmap` over a system would.
+    """Stack many traces into one, like the result of `jax.vmap` over a system.
 
     **Arguments:** those of `Trace`, each array with a leading axis: `signals` are `[n, time]` or
     `[n, time, k]`, `times` `[n, time]`, `valid` and `status` `[n]`.
     **Returns:** a `Trace` whose leaves have a leading axis `[n]`.
-    **Raises:** as `Trace` does for the first of them.
+    **Raises:** the errors of `Trace` for the first invalid one.
     """
     signals = {name: with_gaps(name, signal) for name, signal in signals.items()}
     first = None if times is None else np.asarray(times)[0]
@@ -353,7 +354,7 @@ def stack_traces(
 def single_trace(outcomes: Iterator[tuple[int, Outcome]]) -> Trace:
     """Return the trace of the only outcome.
 
-    **Raises:** `TimeoutError` or `RuntimeError` with its message where there is none.
+    **Raises:** `TimeoutError` or `RuntimeError` with its message if it has no trace.
     """
     ((_, outcome),) = outcomes
     if outcome.trace is None:
@@ -363,7 +364,7 @@ def single_trace(outcomes: Iterator[tuple[int, Outcome]]) -> Trace:
 
 
 def seed_of(key: Seed) -> int:
-    """Return the integer seed of a simulation: a function of its JAX key, or the number itself."""
+    """Return the integer seed of a simulation: computed from its JAX key, or the number itself."""
     if isinstance(key, int | np.integer):
         return int(key)
     if key is None:

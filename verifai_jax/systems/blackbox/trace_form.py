@@ -16,13 +16,13 @@ SignalNames = Sequence[str] | Mapping[str, int]
 
 @dataclass(frozen=True)
 class TraceForm:
-    """The form that every trace of a simulator must have; a part that is None may be anything.
+    """The required form of a simulator's traces; None means no requirement.
 
     **Arguments:**
     - `signals`: names of scalars, or names with their number of components (1 for a scalar).
     - `dt`: sampling period in seconds.
     - `length`: number of samples.
-    **Raises:** `ValueError` for a declaration that no trace can meet.
+    **Raises:** `ValueError` for requirements that no trace can meet.
     """
 
     signals: SignalNames | None = None
@@ -61,10 +61,10 @@ class TraceForm:
         return Trace(signals, dt=self.dt)
 
     def accept(self, trace: object) -> Trace:
-        """Return a simulator's trace with its signals as NumPy arrays, if it has this form.
+        """Return a simulator's trace with NumPy signals, if it has this form.
 
-        **Raises:** `TypeError` for anything but a trace of numbers, `ValueError` for one that is
-        not as declared; both say what was expected and what came.
+        **Raises:** `TypeError` for anything but a trace of numbers, `ValueError` for a trace of
+        another form; both name the expected and the received form.
         """
         if not isinstance(trace, Trace):
             raise TypeError(f"the system must return a Trace; it returned {type(trace).__name__}")

@@ -32,9 +32,9 @@ START = (
 def pickled_setup(
     simulation: Callable[[Features, int], Trace], function: Callable[..., object]
 ) -> bytes:
-    """Pickle everything that a worker needs to know.
+    """Pickle all that a worker needs to start.
 
-    **Raises:** `ValueError` for a function that cannot be imported elsewhere.
+    **Raises:** `ValueError` for a function that another process cannot import.
     """
     name = getattr(function, "__qualname__", None) or repr(function)
     where = "at the top level of a module or a script"
@@ -76,7 +76,7 @@ def main_guard() -> str:
 
 
 def work(fd: int) -> None:
-    """Simulate the tasks that come through the pipe until it closes; a worker process runs this."""
+    """Simulate the tasks received through the pipe until it closes; runs in a worker process."""
     global preparing
     os.set_inheritable(fd, False)
     pipe = Connection(fd)

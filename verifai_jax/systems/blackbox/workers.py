@@ -52,17 +52,17 @@ _numbers = itertools.count()
 
 
 class StartError(RuntimeError):
-    """An error of a worker that could not start, so that no simulation of its pool can run."""
+    """An error for workers that cannot start, so that their pool cannot simulate."""
 
 
 class Pool:
-    """Processes that run one simulation at a time each; started when first needed.
+    """Processes that each run one simulation at a time; started when first needed.
 
     **Arguments:**
-    - `simulation(features, seed) -> Trace`: picklable, as `function` is.
-    - `function`: the user's part of it, which errors speak of.
-    - `workers`, `timeout` (s), `retries`: see `blackbox`.
-    - `fresh`: each simulation gets a process of its own.
+    - `simulation(features, seed) -> Trace`: picklable, like `function`.
+    - `function`: the user's function, which errors name.
+    - `workers`, `timeout` (in seconds), `retries`: see `blackbox`.
+    - `fresh`: whether each simulation gets its own process.
     **Raises:** `ValueError` for numbers out of range, and for a function that a new process cannot
     import.
     """
@@ -105,11 +105,11 @@ class Pool:
     def outcomes(
         self, features: Sequence[Features], seeds: Sequence[int]
     ) -> Iterator[tuple[int, Outcome]]:
-        """Simulate all rows, and yield each index with its outcome as soon as it has one.
+        """Simulate all rows, and yield each index with its outcome as soon as that is known.
 
-        What was simulated before is simulated in another worker than then, where there are several.
-        Workers go on while the caller looks at an outcome. When the caller stops, or is
-        interrupted, the simulations that run are ended.
+        A row that was simulated before goes to another worker than then, if there are several.
+        Workers continue while the caller processes an outcome. If the caller stops, or is
+        interrupted, running simulations are ended.
 
         **Raises:** `StartError` if no worker can start.
         """
@@ -146,11 +146,11 @@ class Pool:
                 thread.join()
 
     def renewed(self) -> "Pool":
-        """Return a pool with workers of its own that simulates the same."""
+        """Return a pool of new workers for the same simulation."""
         return _pool(self.workers, self.timeout, self.retries, self._setup)
 
     def close(self) -> None:
-        """Let the idle workers end; those that work are ended by their batch."""
+        """End the idle workers; busy ones are ended by their batch."""
         _end(self._idle)
 
     def _work(self, batch: "_Batch") -> None:

@@ -32,9 +32,9 @@ BACKENDS = ("generalized", "spring", "positional", "mjx")
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Brax(PolicyLoop):
-    """A closed loop `(features, key) -> Trace`; made by `brax`, which says what its parts are.
+    """A closed loop `(features, key) -> Trace`; made by `brax`, which documents its parts.
 
-    - `exact_step`: the step belongs to the environment, so that it has no finer one.
+    - `exact_step`: whether the step belongs to the environment, so that it has no finer one.
     """
 
     binding: ClassVar[str] = "features={feature: part of the system} or initial={feature: 'q[0]'}"
@@ -42,13 +42,13 @@ class Brax(PolicyLoop):
 
     @property
     def effort(self) -> XlaOptimization:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """Effort of XLA: with `little` the generalized backend compiles sooner and runs as fast."""
+        """Effort of XLA: with `little` the generalized backend compiles sooner, runs as fast."""
         backend = getattr(self.env.unwrapped, "_backend", None)
         return "little" if backend == "generalized" else "most"
 
     @property
     def reverse_hint(self) -> str:
-        """A sentence on why derivatives in reverse mode may not exist."""
+        """A sentence on why reverse-mode derivatives may not exist."""
         return (
             f"{self.name}: the constraint solver of Brax's mjx backend loops until it converges, "
             "unless the model asks for one iteration; the other backends have fixed loops"
@@ -56,18 +56,18 @@ class Brax(PolicyLoop):
 
     @property
     def traced_factor(self) -> bool:
-        """True where JAX may trace the factor of `refined`."""
+        """True if JAX may trace the factor of `refined`."""
         return not self.exact_step and brax_model.steps_plainly(self.env)
 
     def refined(self, factor: int | Int[Array, ""]) -> "Brax":
-        """Return the same episode, decided and sampled as before, at a `factor` times smaller step.
+        """Return the same episode with a step divided by `factor`; samples and decisions stay.
 
-        The factor may be traced where `traced_factor` says so: one program then replays at every
+        The factor may be traced if `traced_factor` is true: one program then replays with every
         step.
 
         **Raises:** `ValueError` for a factor that is not a positive integer, for an environment
-        whose step belongs to it, and for one that is another model at another step (backends spring
-        and positional).
+        whose step belongs to it, and for the backends spring and positional, whose model changes
+        with the step.
         """
         if self.exact_step:
             raise ValueError(
@@ -153,47 +153,47 @@ def brax(
     **Arguments:**
     - `env`: the name of an environment, or an `Env` of your own without training wrappers.
     - `policy`: `observation -> action`, or `(observation, key) -> action` for a random one; a
-      function, or an object with a method `act`, such as an `rl.Policy`. An argument `features`
-      gets the features of the instant.
-    - `steps`: the maximum number of steps of the episode, or `duration` in seconds. The trace has a
-      sample after the reset and after each step, and its last valid sample is the one at which the
-      environment is done.
-    - `backend`: `"generalized"`, `"spring"`, `"positional"` or `"mjx"`, for an environment by name;
-      its own default when left out.
-    - `features`: which feature sets which part of the environment's `sys`, by attributes joined by
-      dots: `{"gravity": "opt.gravity[2]", "mass": "link.inertia.mass[pole]"}`. An entry is named by
-      its number; of a link (`link...`) or of MuJoCo's arrays (`body_...`, `geom_...`) also by the
-      name that the model gives it, and of an array of rows by two: `geom_friction[floor, 0]` is how
-      rough the floor is, `actuator_gear[knee, 0]` a gear (backend mjx). Nothing that was once
-      derived from it is computed again.
-    - `configure(sys, features) -> sys`: for anything else; for an environment without `sys`,
-      `(env, features) -> env`, with a copy of it.
-    - `initial`: which feature sets which entry of the initial position or velocity, by number or by
-      the joint's name: `{"angle": "q[hinge]", "speed": "qd[0]"}`; the rest is as the environment's
-      reset draws it. Or a function `(env, features, key) -> brax State`.
-    - `signals`: names of all entries of the observation, or `{name: index or key of it}`; `action`
-      and `reward` come along. Or a function `(state, observation, action, reward, features) ->
-      dict`, whose state is Brax's. When left out: `q`, `qd`, the metrics, `observation`, `action`
-      and `reward`, if they are scalars or vectors. An action of one number is a scalar.
-    - `dt`: seconds of a step; `env.dt` when left out.
-    - `policy_memory`: what a policy with memory remembers at first. It is then called
+      function, or an object with a method `act`, such as an `rl.Policy`. If it has an argument
+      `features`, it receives the features at that instant.
+    - `steps`: the maximum number of steps of the episode; alternatively `duration` in seconds. The
+      trace has a sample after the reset and after each step, and its last valid sample is the one
+      at which the environment is done.
+    - `backend`: `"generalized"`, `"spring"`, `"positional"` or `"mjx"`, for an environment given by
+      name; by default its own.
+    - `features`: which feature sets which part of the environment's `sys`, as a dotted path:
+      `{"gravity": "opt.gravity[2]", "mass": "link.inertia.mass[pole]"}`. An entry is given by its
+      index. For links (`link...`) and MuJoCo's arrays (`body_...`, `geom_...`) it may be given by
+      its name in the model, and a row of an array by two: `geom_friction[floor, 0]` is the sliding
+      friction of the floor, `actuator_gear[knee, 0]` a gear (backend mjx). Values derived from it
+      earlier are not recomputed.
+    - `configure(sys, features) -> sys`: for other changes; for an environment without `sys`, `(env,
+      features) -> env`, with a copy of it.
+    - `initial`: which feature sets which entry of the initial position or velocity, by index or
+      joint name: `{"angle": "q[hinge]", "speed": "qd[0]"}`; the other entries come from the
+      environment's reset. Or a function `(env, features, key) -> brax State`.
+    - `signals`: names of all entries of the observation, or `{name: index or key}` of some;
+      `action` and `reward` are added. Or a function `(state, observation, action, reward, features)
+      -> dict`, with Brax's state. By default: `q`, `qd`, the metrics, `observation`, `action` and
+      `reward`, if they are scalars or vectors. An action of one number is a scalar.
+    - `dt`: duration of a step in seconds; `env.dt` when left out.
+    - `policy_memory`: the initial memory of a policy with memory. It is then called as
       `(observation, memory)` or `(observation, memory, key)` and returns `(action, memory)`.
     - `options`: keyword arguments of an environment by name.
-    - `exact_step`: whether the environment is what its `step` computes, which a counterexample is
-      confirmed against in double precision and under rounding. False to take the step for an
-      approximation of continuous bodies: counterexamples are then also replayed at a half and a
-      quarter of it (backends generalized and mjx).
-    - `observation_delay`, `action_delay`: steps after which the policy sees an observation, and
-      after which its action takes effect: a number, or `{feature: greatest number}` for one that a
-      feature says. Before that it sees the first observation, and no action is zeros.
+    - `exact_step`: whether the environment is defined by its `step`; counterexamples are then
+      confirmed in double precision and under rounding. False if the step approximates continuous
+      motion: counterexamples are then also replayed at a half and a quarter of it (backends
+      generalized and mjx).
+    - `observation_delay`, `action_delay`: number of steps after which an observation reaches the
+      policy, and an action takes effect: a number, or `{feature: maximum}` for a number given by a
+      feature. Until then the policy sees the first observation, and the action is zero.
 
-    A `Signal` feature reaches `sys` and functions as its value at the beginning of the step.
+    A `Signal` feature is passed to `sys` and functions as its value at the start of the step.
 
     **Returns:** a `Brax` system; one episode is one simulation.
-    **Raises:** `MissingExtra` without brax, or with one that is too old; `UnknownNameError` for an
+    **Raises:** `MissingExtra` without brax, or with an outdated one; `UnknownNameError` for an
     unknown environment, backend or part; `ValueError` for a part that the backend does not read,
-    and numbers that do not fit; once the system is traced, for a policy, a state or signals that
-    do not, and for an environment that does not work with the installed versions.
+    and invalid numbers. When the system is traced, errors for an unsuitable policy, state or
+    signals, and for an environment that does not work with the installed versions.
     """
     import_quietly("brax.envs")
     check_version("brax", OLDEST)
@@ -239,7 +239,7 @@ def brax(
 
 
 def import_quietly(module: str, extra: str = "brax") -> Any:
-    """Import a module of a package, without the messages that it and its packages print."""
+    """Import a module without the messages that it and its dependencies print."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DeprecationWarning)
         require(module.partition(".")[0], extra=extra)

@@ -58,7 +58,7 @@ Env: TypeAlias = Any
 class EpisodeFunction:
     """A function `(features, seed) -> Trace` of one episode of an environment.
 
-    The environment is made once in each process, and does not travel to workers.
+    The environment is made once in each process, and is not sent to workers.
     """
 
     # An environment is the difference equation that its `step` computes.
@@ -89,14 +89,14 @@ class EpisodeFunction:
 
     @property
     def draws(self) -> bool:
-        """True for an environment that says that it draws pictures."""
+        """True if the environment says that it can draw pictures."""
         metadata = getattr(self.environment, "metadata", None) or {}
         return "rgb_array" in metadata.get("render_modes", ())
 
     def frames(
         self, features: Mapping[str, Any], seed: int, samples: Collection[int]
     ) -> dict[int, UInt8[np.ndarray, "height width 3"]]:
-        """Simulate again, and return what the environment draws at these samples.
+        """Simulate again, and return the pictures that the environment draws at these samples.
 
         **Raises:** `ValueError` for an environment that draws no pictures.
         """
@@ -120,7 +120,7 @@ class EpisodeFunction:
         return self.name
 
     def renewed(self) -> "EpisodeFunction":
-        """Return the same function with an environment that has seen nothing yet."""
+        """Return the same function with a new environment."""
         return dataclasses.replace(self)
 
     @property
@@ -179,7 +179,7 @@ class EpisodeFunction:
         )
 
     def check(self, features: Mapping[str, Any]) -> None:
-        """Refuse features that the environment does not have, or that nothing would read.
+        """Refuse features that the environment does not have, or that are never used.
 
         **Raises:** `UnknownNameError`, `ValueError`.
         """
@@ -206,7 +206,7 @@ class EpisodeFunction:
 
     @property
     def known_signals(self) -> KnownSignals:
-        """Signals of a trace with their numbers of components, where a simulation need not tell.
+        """The signals of a trace with their numbers of components, if known without a simulation.
 
         **Raises:** `UnknownNameError`, `ValueError` for entries that the observation does not have.
         """
@@ -220,7 +220,7 @@ class EpisodeFunction:
 
     @property
     def environment(self) -> Any:
-        """The environment of this process."""
+        """The environment in this process."""
         if self._env is None:
             if isinstance(self.make, str):
                 package = require("gymnasium", extra="gymnasium")
@@ -295,7 +295,7 @@ class EpisodeFunction:
         )
 
     def passing(self, features: Mapping[str, Any]) -> Passing:
-        """Return the forms of observations and actions; the names are those of `signals`."""
+        """Return the forms of observations and actions; `signals` gives the names."""
         env = self.environment
         observation, action = (
             jax.tree.map(episode_signals.entry_form, getattr(env, f"{name}_space").sample())
@@ -305,7 +305,7 @@ class EpisodeFunction:
         return Passing(observation, action, self.period, self.steps * self.period, names)
 
     def with_links(self, links: tuple[Link, ...]) -> "EpisodeFunction":
-        """Return the same episode with faults in it."""
+        """Return the same episode with these faults."""
         return dataclasses.replace(self, links=(*self.links, *links))
 
     def _act(
@@ -371,38 +371,38 @@ def gymnasium(
     """Make a black box from an environment of Gymnasium and a policy.
 
     **Arguments:**
-    - `env`: the id of a registered environment, or a function that makes one; it is called once in
-      each process.
-    - `policy`: `observation -> action`, or an object with a method `act` that is one, such as an
-      `rl.Policy`. An argument `features` gets the features of the instant. One that remembers
-      something has a method `reset()`, called before each episode.
+    - `env`: the id of a registered environment, or a function that makes one, called once in each
+      process.
+    - `policy`: `observation -> action`, or an object with such a method `act`, such as an
+      `rl.Policy`. If it has an argument `features`, it receives the features at that instant. A
+      policy with memory must have a method `reset()`, called before each episode.
     - `steps`: the maximum number of steps of the episode. The trace has a sample after the reset
       and after each step; the last valid one is that at which the environment terminates or is
-      truncated (by its own time limit, too). Each sample has the action that is taken there, and
-      the reward of the step that led there.
-    - `signals`: names of all entries of the observation, or `{name: index or key of it}`; `action`
-      and `reward` come along. Or a function `(env, observation, action, reward, features) -> dict`.
-      When left out: `observation`, `action` and `reward`.
+      truncated (also by its own time limit). Each sample has the action taken there, and the reward
+      of the step that led to it.
+    - `signals`: names of all entries of the observation, or `{name: index or key}` of some;
+      `action` and `reward` are added. Or a function `(env, observation, action, reward, features)
+      -> dict`. By default: `observation`, `action` and `reward`.
     - `features`: which feature sets which attribute of the unwrapped environment, `{"mass":
-      "masspole"}`, or names that are the same in both. What the cart-pole derives from its masses
-      and length follows; in other environments that is for `configure` to do. A `Signal` is set
-      anew before each step.
-    - `configure(env, features)`: for anything else, before the reset.
-    - `reset(env, features, seed) -> observation`: starts the episode, with the initial state that
-      the features say; `env.reset(seed=seed)` when left out.
-    - `dt`: seconds of a step; the environment's attribute `dt` or `tau` when left out, or 1.
+      "masspole"}`, or a list of names that are equal in both. Values that the cart-pole derives
+      from its masses and length are updated; in other environments `configure` has to do this. A
+      `Signal` is set before each step.
+    - `configure(env, features)`: for other changes, called before the reset.
+    - `reset(env, features, seed) -> observation`: starts the episode in the state given by the
+      features; `env.reset(seed=seed)` when left out.
+    - `dt`: duration of a step in seconds; by default the environment's attribute `dt` or `tau`, or
+      1.
     - `workers`, `timeout`, `retries`: see `blackbox`.
-    - `observation_delay`, `action_delay`: steps after which the policy sees an observation, and
-      after which its action takes effect: a number, or `{feature: greatest number}` for one that a
-      feature says. Before that it sees the first observation, and no action is zeros.
-    - `clip`: whether an action outside the bounds of a Box is set to the nearest bound before it
-      reaches the environment, as libraries do in training; False passes it on. Either way the run
-      counts it and says so among its notes. Whatever else is no action of the action space is an
-      error of its row.
-    **Returns:** a black box, with `workers` one in processes of its own; one episode is one
+    - `observation_delay`, `action_delay`: number of steps after which an observation reaches the
+      policy, and an action takes effect: a number, or `{feature: maximum}` for a number given by a
+      feature. Until then the policy sees the first observation, and the action is zero.
+    - `clip`: whether an action outside the bounds of a Box is clipped before it reaches the
+      environment, as libraries do in training; False passes it on. In both cases the run counts
+      such actions in its notes. Any other invalid action is an error of its row.
+    **Returns:** a black box, with its own processes if `workers` are given; one episode is one
     simulation.
-    **Raises:** `MissingExtra` without Gymnasium; `ValueError` for options that do not fit; when the
-    problem is checked, `UnknownNameError` for an attribute that the environment lacks.
+    **Raises:** `MissingExtra` without Gymnasium; `ValueError` for invalid options; when the problem
+    is checked, `UnknownNameError` for an attribute that the environment lacks.
     """
     if isinstance(env, str):
         package = require("gymnasium", extra="gymnasium")

@@ -40,7 +40,7 @@ DERIVED: dict[str, dict[str, Callable[[Any], Any]]] = {
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Gymnax(PolicyLoop):
-    """A closed loop `(features, key) -> Trace`; made by `gymnax`, which says what its parts are."""
+    """A closed loop `(features, key) -> Trace`; made by `gymnax`, which documents its parts."""
 
     binding: ClassVar[str] = "features={feature: parameter} or initial={feature: part of the state}"
     # An environment is the difference equation that its `step` computes.
@@ -125,36 +125,38 @@ def gymnax(
     **Arguments:**
     - `env`: the id of a registered environment, or an `Environment` of your own.
     - `policy`: `observation -> action`, or `(observation, key) -> action` for a random one; a
-      function, or an object with a method `act`, such as an `rl.Policy`. An argument `features`
-      gets the features of the instant.
-    - `steps`: the maximum number of steps of the episode, or `duration` in seconds; the
-      environment's own `max_steps_in_episode` when left out. The trace has a sample after the reset
-      and after each step, and its last valid sample is the one at which the environment is over.
+      function, or an object with a method `act`, such as an `rl.Policy`. If it has an argument
+      `features`, it receives the features at that instant.
+    - `steps`: the maximum number of steps of the episode; alternatively `duration` in seconds; by
+      default the environment's `max_steps_in_episode`. The trace has a sample after the reset and
+      after each step, and its last valid sample is the one at which the environment is over.
     - `features`: which feature sets which parameter of the environment, `{"mass": "masspole"}`, or
-      names that are the same in both. What `CartPole-v1` derives from its parameters follows.
-    - `configure(params, features) -> params`: for anything else.
+      a list of names that are equal in both. Values that `CartPole-v1` derives from its parameters
+      are updated.
+    - `configure(params, features) -> params`: for other changes.
     - `initial`: which feature sets which part of the initial state, `{"theta0": "theta"}`, or a
-      function `(state, features, key) -> state`. The rest is as the environment's reset draws it.
-    - `signals`: names of all entries of the observation, or `{name: index or key of it}`; `action`
-      and `reward` come along. Or a function `(state, observation, action, reward, features) ->
-      dict`. When left out: the parts of the state (but `time`), `observation`, `action` and
+      function `(state, features, key) -> state`. The other parts come from the environment's reset.
+    - `signals`: names of all entries of the observation, or `{name: index or key}` of some;
+      `action` and `reward` are added. Or a function `(state, observation, action, reward, features)
+      -> dict`. By default: the parts of the state (except `time`), `observation`, `action` and
       `reward`, if they are scalars or vectors. An action of one number is a scalar signal.
-    - `dt`: seconds of a step; the parameter `dt` or `tau` of the environment when left out, or 1.
-    - `params`: the parameters that features change; the environment's own when left out.
-    - `policy_memory`: what a policy with memory remembers at first. It is then called
+    - `dt`: duration of a step in seconds; by default the environment's parameter `dt` or `tau`, or
+      1.
+    - `params`: the parameters to which features are applied; by default the environment's own.
+    - `policy_memory`: the initial memory of a policy with memory. It is then called as
       `(observation, memory)` or `(observation, memory, key)` and returns `(action, memory)`.
-    - `truncate`: end also where the environment's time limit would cut the episode off.
-    - `observation_delay`, `action_delay`: steps after which the policy sees an observation, and
-      after which its action takes effect: a number, or `{feature: greatest number}` for one that a
-      feature says. Before that it sees the first observation, and no action is zeros.
+    - `truncate`: whether the environment's time limit ends the episode, too.
+    - `observation_delay`, `action_delay`: number of steps after which an observation reaches the
+      policy, and an action takes effect: a number, or `{feature: maximum}` for a number given by a
+      feature. Until then the policy sees the first observation, and the action is zero.
 
-    A `Signal` feature reaches parameters and functions as its value at the beginning of the step.
-    Environments that support gradients are asked for them; differentiating any other raises.
+    A `Signal` feature is passed to parameters and functions as its value at the start of the step.
+    Environments that support gradients are differentiated; others raise an error.
 
     **Returns:** a `Gymnax` system; one episode is one simulation.
-    **Raises:** `MissingExtra` without gymnax, or with one that is too old; `UnknownNameError` for
-    an unknown environment or parameter; `ValueError` for numbers that do not fit, and, once the
-    system is traced, for a policy, a state or signals that do not.
+    **Raises:** `MissingExtra` without gymnax, or with an outdated one; `UnknownNameError` for an
+    unknown environment or parameter; `ValueError` for invalid numbers, and, when the system is
+    traced, for an unsuitable policy, state or signals.
     """
     package = require("gymnax", extra="gymnax")
     check_version("gymnax", OLDEST)

@@ -117,29 +117,29 @@ def playground(
     **Arguments:**
     - `env`: the name of an environment, or an `MjxEnv` of your own without training wrappers.
     - `policy`: `observation -> action`, or `(observation, key) -> action` for a random one; a
-      function, or an object with a method `act`, such as what `vj.policy` returns.
-    - `steps`: the maximum number of steps of the episode, or `duration` in seconds. The trace has a
-      sample after the reset and after each step, and its last valid sample is the one at which the
-      environment is done.
-    - `bind`: for a feature's name the path of what it sets in the model or in the initial state, as
-      in `mujoco`: `"body/torso/mass"`, `"geom/floor/friction[0]"`, `"joint/hinge/qpos"`.
-    - `configure(env, features) -> env`: for anything else; it gets a copy of the environment.
-    - `initial(env, features, key) -> State`: instead of the environment's own reset.
-    - `signals`: names of all entries of the observation, or `{name: index or key of it}`; `action`
-      and `reward` come along. Or a function `(state, observation, action, reward, features) ->
-      dict`, whose state is Playground's. When left out: `qpos`, `qvel`, the metrics, `observation`,
+      function, or an object with a method `act`, such as a policy from `vj.policy`.
+    - `steps`: the maximum number of steps of the episode; alternatively `duration` in seconds. The
+      trace has a sample after the reset and after each step, and its last valid sample is the one
+      at which the environment is done.
+    - `bind`: a dictionary from a feature to the path that it sets in the model or in the initial
+      state, as in `mujoco`: `"body/torso/mass"`, `"geom/floor/friction[0]"`, `"joint/hinge/qpos"`.
+    - `configure(env, features) -> env`: for other changes; it gets a copy of the environment.
+    - `initial(env, features, key) -> State`: replaces the environment's own reset.
+    - `signals`: names of all entries of the observation, or `{name: index or key}` of some;
+      `action` and `reward` are added. Or a function `(state, observation, action, reward, features)
+      -> dict`, with Playground's state. By default: `qpos`, `qvel`, the metrics, `observation`,
       `action` and `reward`, if they are scalars or vectors.
-    - `dt`: seconds of a step; `env.dt` when left out.
-    - `policy_memory`: what a policy with memory remembers at first; that of `policy` itself when
-      left out.
-    - `options`: overrides of the configuration of an environment by name; `impl` is `"jax"` when
-      left out.
-    - `observation_delay`, `action_delay`: steps after which the policy sees an observation, and
-      after which its action takes effect: a number, or `{feature: greatest number}`.
+    - `dt`: duration of a step in seconds; `env.dt` when left out.
+    - `policy_memory`: the initial memory of a policy with memory; by default that of `policy`
+      itself.
+    - `options`: overrides of an environment's configuration by name; `impl` is `"jax"` when left
+      out.
+    - `observation_delay`, `action_delay`: number of steps after which an observation reaches the
+      policy, and an action takes effect: a number, or `{feature: maximum}`.
     **Returns:** a `Playground` system; one episode is one simulation.
     **Raises:** `MissingExtra` without Playground; `UnknownNameError` for an unknown environment or
-    path; `ValueError` for an environment whose assets are not installed, for forces and controls
-    in `bind`, and for numbers that do not fit.
+    path; `ValueError` for an environment whose assets are not installed, for forces and controls in
+    `bind`, and for invalid numbers.
     """
     env, name = loaded(env, options)
     shared = loop_options(
@@ -162,9 +162,9 @@ def playground(
 
 
 def loaded(env: Env, options: Mapping[str, object] | None = None) -> tuple[Any, str]:
-    """Return an environment, by its name or itself, and its name.
+    """Return an environment, given by name or as an object, and its name.
 
-    **Raises:** as `playground`.
+    **Raises:** the errors of `playground`.
     """
     package = import_quietly("mujoco_playground", "playground")
     check_version("playground", OLDEST)

@@ -38,7 +38,7 @@ _ROWS = {
 
 
 class Location(NamedTuple):
-    """An array somewhere in a Brax system, or a row or one entry of it."""
+    """An array in a Brax system, or a row or one entry of it."""
 
     parts: tuple[str, ...]
     index: tuple[int, ...] | None
@@ -50,7 +50,7 @@ class Location(NamedTuple):
 
 @contextlib.contextmanager
 def explain_errors(env: Env, name: str, what: str, backend: str | None = None) -> Iterator[None]:
-    """Raise errors from within Brax again, with the environment, the backend and the versions."""
+    """Raise errors from inside Brax again, with the environment, the backend and the versions."""
     try:
         with warnings.catch_warnings():
             # Brax still uses names that MuJoCo has moved, and nobody can do anything about it.
@@ -73,7 +73,7 @@ def system_location(env: Env, path: str, name: str) -> Location:
     """Return the location of a path such as `link.inertia.mass[pole]` or `geom_friction[floor, 0]`.
 
     **Raises:** `UnknownNameError` for a part or an entry that does not exist; `ValueError` for an
-    environment without `sys`, or a part that holds no numbers.
+    environment without `sys`, or a part without numbers.
     """
     sys = getattr(env.unwrapped, "sys", None)
     if sys is None:
@@ -171,7 +171,7 @@ def joint_location(env: Env, path: str, name: str) -> Location:
 
 
 def with_value(sys: BraxSystem, location: Location, value: ArrayLike, feature: str) -> Any:
-    """Return the system with one array, or one entry of it, set."""
+    """Return the system with one array, or one entry of it, replaced."""
     old: Any = sys
     for part in location.parts:
         old = getattr(old, part)
@@ -198,7 +198,7 @@ def _replaced(node: BraxSystem, parts: tuple[str, ...], value: ArrayLike) -> Any
 
 
 def with_system(env: Env, sys: BraxSystem) -> Any:
-    """Return a copy of the environment, within its wrappers, with another `sys`."""
+    """Return a copy of the environment, inside its wrappers, with another `sys`."""
     other = copy.copy(env)
     if "env" in vars(other) and "sys" not in vars(other):
         other.env = with_system(other.env, sys)
@@ -208,11 +208,11 @@ def with_system(env: Env, sys: BraxSystem) -> Any:
 
 
 def with_finer_step(env: Env, factor: int | Int[Array, ""], name: str) -> Any:
-    """Return a copy of the environment with a `factor` times smaller step of its physics.
+    """Return a copy of the environment whose physics step is divided by `factor`.
 
-    JAX may trace the factor where the environment `steps_plainly`.
+    JAX may trace the factor if `steps_plainly` is true for the environment.
 
-    **Raises:** `ValueError` for one whose physics is another at another step.
+    **Raises:** `ValueError` for an environment whose physics depends on the step.
     """
     other = copy.copy(env)
     if "env" in vars(other) and "sys" not in vars(other):
@@ -235,7 +235,7 @@ def with_finer_step(env: Env, factor: int | Int[Array, ""], name: str) -> Any:
 
 
 def steps_plainly(env: Env) -> bool:
-    """Return whether a step of the environment is Brax's own loop over frames of its physics."""
+    """Return whether a step of the environment is Brax's own loop over physics frames."""
     pipeline = require("brax.envs.base", extra="brax").PipelineEnv
     kind = type(env.unwrapped)
     plain = getattr(kind, "pipeline_step", None) is getattr(pipeline, "pipeline_step", ...)
@@ -259,7 +259,7 @@ def _with_counted_frames(kind: type) -> type:
 
 
 def with_start(env: Env, values: Mapping[Location, ArrayLike]) -> Any:
-    """Return a copy whose reset starts from, and observes, these entries of `q` and `qd`."""
+    """Return a copy whose reset starts from these entries of `q` and `qd`, and observes them."""
     other = copy.copy(env)
     if "env" in vars(other) and "sys" not in vars(other):
         other.env = with_start(other.env, values)
@@ -281,9 +281,9 @@ def with_start(env: Env, values: Mapping[Location, ArrayLike]) -> Any:
 
 
 def check_parts_are_read(env: Env, name: str, locations: Mapping[str, Location]) -> None:
-    """Refuse a part of the system that neither reset nor step reads: it would change nothing.
+    """Refuse a part of the system that neither reset nor step reads, since it has no effect.
 
-    Each backend reads its own copies of masses, gains and the like.
+    Each backend reads its own copies of masses, gains and similar values.
     """
     if not locations:
         return

@@ -39,7 +39,7 @@ Decide: TypeAlias = Callable[[PyTree, PyTree, Key[Array, ""], Features], tuple[P
 
 
 class Moment(NamedTuple):
-    """The state after the reset or a step, its observation and reward, and whether it is over."""
+    """The state after the reset or a step, with observation, reward, and whether it is over."""
 
     state: Any
     observation: Any
@@ -49,14 +49,15 @@ class Moment(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Episode:
-    """An environment with its features in place: its start, its step and its signals.
+    """An environment with its features applied: its start, its step and its signals.
 
     - `start(key) -> Moment`
-    - `step(time, state, action, key) -> Moment`: from the sample at `time` seconds to the next.
+    - `step(time, state, action, key) -> Moment`: goes from the sample at `time` seconds to the
+      next.
     - `decide(time, observation, memory, key) -> (action, memory)`: see `policy_function`.
-    - `signals(time, moment, action) -> dict`: the samples of the signals.
-    - `steps`, `dt`: how many at most, and seconds between two samples.
-    - `channels`: what observations and actions pass through.
+    - `signals(time, moment, action) -> dict`: returns one sample of the signals.
+    - `steps`, `dt`: maximum number of steps, and seconds between two samples.
+    - `channels`: the links in the path of observations and actions.
     """
 
     name: str
@@ -70,7 +71,7 @@ class Episode:
     channels: Channels = NOTHING_PASSED
 
     def next_moment(self, time: Time, state: PyTree, action: PyTree, key: Key[Array, ""]) -> Moment:
-        """Return the moment after a step, `over` as a truth value."""
+        """Return the moment after a step, with `over` as a truth value."""
         moment = self.step(time, state, action, key)
         return moment._replace(over=jnp.asarray(moment.over, bool))
 
@@ -91,12 +92,12 @@ def episode_keys(key: Seed) -> _Keys:
 def rollout(episode: Episode, key: Seed) -> Trace:
     """Simulate one episode: a sample after the reset and after each step, with its action.
 
-    The reward of a sample is that of the step which led to it. The first sample at which the
-    episode is over is the last valid one. The status is `NONFINITE` if it ends in a state with a
-    NaN, or in an observation that is not finite, and `ERROR` if a delay or a fault has a
-    number that it may not have.
+    The reward of a sample is that of the step that led to it. The first sample at which the episode
+    is over is the last valid one. The status is `NONFINITE` if the episode ends in a state with a
+    NaN, or in an observation that is not finite, and `ERROR` if a delay or a fault has an invalid
+    number.
 
-    **Raises:** `ValueError` while JAX traces it, for parts that do not fit together.
+    **Raises:** `ValueError` when JAX traces it, for parts that do not fit together.
     """
     last, age, _, samples = _run(episode, key, None, lambda _, sample: (None, sample))
     status = _status(last, episode.channels.valid())
@@ -108,7 +109,7 @@ def fold(
 ) -> tuple[Carry, Int[Array, ""]]:
     """Apply `carry = update(carry, sample)` to the samples of `rollout` without storing them.
 
-    After the end the last valid sample comes again. **Returns:** the last carry, and the status.
+    After the end the last valid sample is repeated. **Returns:** the last carry, and the status.
     """
     last, _, carry, _ = _run(episode, key, carry, lambda c, sample: (update(c, sample), None))
     return carry, _status(last, episode.channels.valid())
@@ -201,11 +202,11 @@ def policy_function(policy: object, memory: PyTree = None) -> Decide:
 
     **Arguments:**
     - `policy`: a function of the observation, or of `(observation, key)` for a random one; or an
-      object with a method `act` that is one, such as `rl.Policy`. It is given a key if that many
-      arguments have no default, and the features of the instant if one is called `features`.
-    - `memory`: the memory of a policy with memory at first. It is then called with `(observation,
+      object with such a method `act`, such as `rl.Policy`. It receives a key if it has that many
+      arguments without a default, and the features of the instant if it has an argument `features`.
+    - `memory`: the initial memory of a policy with memory. It is then called with `(observation,
       memory)` or `(observation, memory, key)` and returns `(action, memory)`.
-    **Raises:** `ValueError` for something that cannot be called so.
+    **Raises:** `ValueError` for an object that cannot be called so.
     """
     act = getattr(policy, "act", None)
     function = act if callable(act) else policy
@@ -234,18 +235,18 @@ def policy_function(policy: object, memory: PyTree = None) -> Decide:
 
 
 def without_extras(decided: Any) -> Any:
-    """Return the action of `(action, extras)`, as policies of Brax return it; else the action."""
+    """Return the action from `(action, extras)`, as policies of Brax return it; else the action."""
     pair = isinstance(decided, tuple) and len(decided) == 2
     return decided[0] if pair and isinstance(decided[1], Mapping) else decided
 
 
 def first_memory(policy: object, memory: PyTree) -> PyTree:
-    """Return what a policy remembers at first: what is stated, or what the policy says itself."""
+    """Return the initial memory of a policy: the given one, or the policy's own."""
     return getattr(policy, "initial_memory", None) if memory is None else memory
 
 
 def policy_that_sees(policy: object) -> Callable[..., Any] | None:
-    """Return the function of a policy that is given features; None for one that is not."""
+    """Return the function of a policy that receives features; None for any other."""
     act = getattr(policy, "act", None)
     function = act if callable(act) else policy
     return function if callable(function) and sees_features(function) else None
@@ -260,7 +261,7 @@ def sees_features(function: Callable[..., Any]) -> bool:
 
 
 def count_required(function: Callable[..., Any]) -> int | None:
-    """Count the arguments without a default but `features`; None for any or an unknown number."""
+    """Count the arguments without a default, except `features`; None if the number is unknown."""
     try:
         parameters = inspect.signature(function).parameters.values()
     except (TypeError, ValueError):
@@ -274,9 +275,9 @@ def count_required(function: Callable[..., Any]) -> int | None:
 
 
 def vector_action(action: ArrayLike, size: int, name: str) -> Float[Array, " size"]:
-    """Return a policy's output as the vector of an action; a number may stand for one entry.
+    """Return a policy's output as an action vector; a number may stand for a single entry.
 
-    **Raises:** `ValueError` for anything else than `size` real numbers.
+    **Raises:** `ValueError` for anything but `size` real numbers.
     """
     shape, dtype = getattr(action, "shape", None), getattr(action, "dtype", None)
     if shape is None and isinstance(action, int | float):
@@ -294,10 +295,10 @@ def vector_action(action: ArrayLike, size: int, name: str) -> Float[Array, " siz
 def check_features(
     features: Features, bound: Sequence[str], functions: Sequence[Any], name: str, how: str
 ) -> None:
-    """Refuse names of features that do not exist, and features that nothing would read.
+    """Refuse names of features that do not exist, and features that are never used.
 
-    - `bound`: features that set something, `functions`: what a user may have given, and would read
-      any of them; `how`: how one is bound, as text.
+    - `bound`: features that set something; `functions`: functions given by the user, any of which
+      would use all features; `how`: how to bind a feature, as text.
 
     **Raises:** `UnknownNameError`, `ValueError`.
     """
@@ -314,12 +315,12 @@ def check_features(
 
 
 def features_at(features: Features, time: Time) -> Any:
-    """Return the same features, each waveform by its value at a time in seconds."""
+    """Return the same features with each waveform replaced by its value at a time in seconds."""
     return jax.tree.map(lambda v: v(time) if is_waveform(v) else v, features, is_leaf=is_waveform)
 
 
 def has_waveforms(features: Features) -> bool:
-    """Return True where any of the features is a function of time."""
+    """Return True if any of the features is a function of time."""
     return any(map(is_waveform, jax.tree.leaves(features, is_leaf=is_waveform)))
 
 
@@ -342,7 +343,7 @@ def step_count(
 
 
 def sampling_period(seconds: object) -> float:
-    """Check a sampling period; one from a float32 becomes the decimal number that was meant."""
+    """Check a sampling period; one that was float32 becomes the intended decimal number."""
     value: Any = seconds
     number = isinstance(seconds, int | float | np.number) and not isinstance(seconds, bool)
     if isinstance(seconds, jax.Array | np.ndarray) and np.shape(seconds) == ():
@@ -355,9 +356,9 @@ def sampling_period(seconds: object) -> float:
 
 
 def used_inputs(function: Callable[..., Any], *arguments: Any) -> list[bool]:
-    """Return, for each leaf of the arguments, True if a result of the function depends on it.
+    """Return, for each leaf of the arguments, True if some result of the function depends on it.
 
-    Abstract: nothing is computed or compiled.
+    This is abstract: nothing is computed or compiled.
     """
     from jax.interpreters import partial_eval
 

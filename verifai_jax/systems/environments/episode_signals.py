@@ -29,11 +29,12 @@ def read_signals(
     named: Mapping[str, Any],
     name: str,
 ) -> Any:
-    """Return one sample of the signals that the option `signals` names.
+    """Return one sample of the signals given by the option `signals`.
 
     - `signals`: a function `(state, observation, action, reward, features) -> dict`; names of the
       observation's entries, in their order; or `{name: index or key of the observation}`. The last
-      two also give `action` and `reward`. None: `named`, `observation`, `action` and `reward`.
+      two forms also give `action` and `reward`. None gives `named`, `observation`, `action` and
+      `reward`.
 
     **Raises:** `ValueError` for an entry that the observation does not have.
     """
@@ -58,9 +59,9 @@ def read_signals(
 
 
 def check_signals_option(signals: object, state: str = "state") -> None:
-    """Refuse a `signals=` option that `read_signals` could not use.
+    """Refuse an option `signals` that `read_signals` cannot use.
 
-    - `state`: what a function gets first, as text.
+    - `state`: the first argument of a function, as text.
     """
     if signals is None:
         return
@@ -81,7 +82,7 @@ def check_signals_option(signals: object, state: str = "state") -> None:
 
 
 def names_of_entries(signals: SignalsOption) -> dict[str, NamedNumbers]:
-    """Return where an observation has the entries that the option `signals` names."""
+    """Return the locations in an observation of the entries named by the option `signals`."""
     if callable(signals) or signals is None:
         return {}
     entries = (
@@ -115,13 +116,13 @@ def _plain(value: PyTree) -> Any:
 
 
 def entry_form(leaf: object) -> Any:
-    """Return the form of an entry of a space, itself where it holds no numbers."""
+    """Return the form of an entry of a space; the space itself if it holds no numbers."""
     array = np.asarray(leaf)
     return jax.ShapeDtypeStruct(array.shape, array.dtype) if array.dtype.kind in "biuf" else leaf
 
 
 def single_picture(image: Any, name: str) -> UInt8[np.ndarray, "height width 3"]:
-    """Return what an environment drew, a single picture.
+    """Return the single picture that an environment drew.
 
     **Raises:** `ValueError` for anything else.
     """
@@ -136,7 +137,7 @@ def single_picture(image: Any, name: str) -> UInt8[np.ndarray, "height width 3"]
 
 
 def as_arrays(value: object) -> Any:
-    """Return an observation or action with its numbers as arrays, in its own form."""
+    """Return an observation or action with its numbers as arrays, in the same structure."""
     if isinstance(value, Mapping):
         return {name: as_arrays(part) for name, part in value.items()}
     if isinstance(value, tuple):

@@ -45,9 +45,9 @@ from verifai_jax.systems.pytree_checks import in_working_precision
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class PolicyLoop(System):
-    """A closed loop `(features, key) -> Trace`; the function that makes it says what its parts are.
+    """A closed loop `(features, key) -> Trace`; the function that makes it documents its parts.
 
-    - `binding`: how a feature is bound, for errors.
+    - `binding`: how to bind a feature, for errors.
     """
 
     binding: ClassVar[str]
@@ -65,7 +65,7 @@ class PolicyLoop(System):
 
     @property
     def duration(self) -> float:
-        """Simulated seconds."""
+        """Duration of a simulation in seconds."""
         return self.steps * self.dt
 
     def __call__(self, features: Features, key: Seed = None) -> Trace:
@@ -157,7 +157,7 @@ class PolicyLoop(System):
         return first_refusal(self.links, features, self.name)
 
     def passing(self, features: Features) -> Passing:
-        """Return the forms of observations and actions; the names are those of `signals`."""
+        """Return the forms of observations and actions; `signals` gives the names."""
 
         def first(features: Features, key: Key[Array, ""]) -> Any:
             episode = self._episode(features)
@@ -186,12 +186,12 @@ def loop_options(
     configured: str,
     started: str,
 ) -> dict[str, Any]:
-    """Check the options that all environments have, and return them as `PolicyLoop` takes them.
+    """Check the options common to all environments, and return the arguments of `PolicyLoop`.
 
     **Arguments:**
     - `delays`: the delays of observations and of actions.
-    - `configured`, `started`: what `configure`, and a function `initial`, is called with first.
-    **Raises:** `ValueError` for an option that cannot be used.
+    - `configured`, `started`: the first argument of `configure`, and of a function `initial`.
+    **Raises:** `ValueError` for an invalid option.
     """
     seconds = sampling_period(dt)
     check_signals_option(signals)

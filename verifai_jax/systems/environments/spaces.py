@@ -17,33 +17,33 @@ Space = Any
 
 
 class Misfit(ValueError):
-    """A value outside of a space; the message says why, and which part."""
+    """An error for a value outside of a space; the message says which part, and why."""
 
 
 class Fitted(NamedTuple):
-    """An action as the environment takes it, and whether it lay outside the bounds of a Box."""
+    """An action in the environment's form, and whether it lay outside the bounds of a Box."""
 
     action: Any
     outside: bool
 
 
 def kind_of(space: Space) -> str:
-    """Return the class of Gymnasium that a space belongs to; empty for one of another make."""
+    """Return the name of Gymnasium's class of a space; empty for a space of another library."""
     known = ("Discrete", "MultiDiscrete", "MultiBinary", "Box", "Dict", "Tuple", "Text")
     return next((c.__name__ for c in type(space).__mro__ if c.__name__ in known), "")
 
 
 def describe(space: Space) -> str:
-    """Write a space in one line."""
+    """Describe a space in one line."""
     text = " ".join(repr(space).split())
     return text if len(text) <= 120 else f"{text[:100]}...{text[-17:]}"
 
 
 def check_space(space: Space, name: str, delayed: bool) -> None:
-    """Refuse an action space for which no action can be checked, before anything is simulated.
+    """Refuse an action space whose actions cannot be checked, before anything is simulated.
 
     **Arguments:**
-    - `delayed`: whether actions arrive late, so that one has to stand for none.
+    - `delayed`: whether actions arrive late, so that a default action is needed.
     """
     if space is None:
         raise ValueError(f"{name} has no action_space, by which the policy's actions are checked")
@@ -81,9 +81,9 @@ def _parts(space: Space, path: str) -> Iterator[tuple[str, Space]]:
 
 
 def no_action(space: Space) -> Any:
-    """Return what an environment gets before the first action has arrived: zeros, or next to them.
+    """Return the default action before the first action has arrived: zero, or close to zero.
 
-    The first of the choices of a discrete space, and the shortest text.
+    It is the first choice of a discrete space, and the shortest text.
     """
     kind = kind_of(space)
     if kind == "Dict":
@@ -101,11 +101,11 @@ def no_action(space: Space) -> Any:
 
 
 def fit(space: Space, action: object, clip: bool = True) -> Fitted:
-    """Return an action in the form that the environment takes.
+    """Return an action in the environment's form.
 
     **Arguments:**
-    - `clip`: whether what lies outside the bounds of a Box is set to the nearest bound, as training
-      libraries do, or passed on. Either way `outside` says so.
+    - `clip`: whether values outside the bounds of a Box are clipped, as training libraries do, or
+      passed on. In both cases `outside` reports them.
     **Raises:** `Misfit` for a value that is not an action of the space.
     """
     kind = kind_of(space)
@@ -125,7 +125,7 @@ def fit(space: Space, action: object, clip: bool = True) -> Fitted:
 
 
 def check_observation(space: Space, observation: object) -> None:
-    """Refuse an observation outside of its space; it may exceed the bounds of a Box.
+    """Refuse an observation outside its space; it may exceed the bounds of a Box.
 
     **Raises:** `Misfit`.
     """
@@ -224,9 +224,9 @@ def _brief(value: object) -> str:
 
 
 def named_numbers(name: str, value: object) -> dict[str, np.ndarray]:
-    """Return the numbers of a value as signals by name, arrays as vectors; texts are left out.
+    """Return the numbers in a value as signals by name, arrays as vectors; texts are left out.
 
-    The parts of a Dict and of a Tuple have names of their own, `action.grip` and `action.0`.
+    Parts of a Dict and of a Tuple get names such as `action.grip` and `action.0`.
     """
     if isinstance(value, Mapping):
         parts = value.items()

@@ -58,13 +58,14 @@ class FMUSimulation:
 
     @property
     def known_signals(self) -> dict[str, int]:
-        """Signals of every trace."""
+        """The signals of every trace."""
         return dict.fromkeys(self.outputs, 1)
 
     def check(self, features: Features) -> None:
-        """Check that every feature finds its variable.
+        """Check that there is a variable for every feature.
 
-        **Raises:** `ValueError` that names the first that does not, and what is there instead.
+        **Raises:** `ValueError` that names the first feature without one, and the existing
+        variables.
         """
         for name in features:
             variable = self._variable(name)
@@ -184,31 +185,33 @@ def fmu(
     reuse: bool = True,
     exchange: bool | None = None,
 ) -> System:
-    """Make a system of a Functional Mock-up Unit: FMI 2 or 3, co-simulation or model exchange.
+    """Make a system from a Functional Mock-up Unit: FMI 2 or 3, co-simulation or model exchange.
 
-    A feature sets the variable of its name before each simulation: a parameter, a start value, or
-    an input; a `Signal` is an input over time. An FMU is a program: simulate only those that you
-    trust.
+    A feature sets the variable with its name before each simulation: a parameter, a start value, or
+    an input; a `Signal` is an input over time. An FMU is an executable program: simulate only those
+    that you trust.
 
     **Arguments:**
     - `file`: the FMU.
-    - `duration`: seconds of a simulation.
-    - `dt`: seconds between two samples, which is the step of communication.
-    - `bind`: variables by feature, where their names differ.
-    - `outputs`: variables that are the signals of the trace: names, or variables by the name of
-      their signal; those of causality `output` when left out, with `_` for what no name may have.
+    - `duration`: duration of a simulation in seconds.
+    - `dt`: seconds between two samples, which is also the communication step.
+    - `bind`: a dictionary from features to variables, if their names differ.
+    - `outputs`: variables that are signals of the trace: a list of names, or a dictionary from
+      signals to variables; by default those of causality `output`, with `_` for characters that
+      names may not have.
     - `controller`: a function `(time, outputs, features)` that returns inputs by the variables'
-      names, called once a step; features that are no variable are for it alone.
-    - `workers`: processes that simulate; None for this process, which a crash of the FMU ends.
-    - `timeout`: seconds after which a simulation is ended.
-    - `reuse`: whether a process uses its instance for the next simulation too, which saves its
-      loading: it goes back to the state that the FMU had when it was new, or is reset where the
-      FMU cannot save its state; False for an FMU whose reset forgets something.
-    - `exchange`: whether its equations are integrated here, by model exchange; when left out only
-      those of an FMU without a solver of its own.
+      names, called once a step; features that are not variables are passed only to it.
+    - `workers`: number of processes that simulate; None for this process, which a crash of the FMU
+      would end.
+    - `timeout`: seconds after which a simulation is aborted.
+    - `reuse`: whether a process reuses its instance for the next simulation, which saves loading
+      it. The instance is set back to its initial state, or reset if the FMU cannot save its state.
+      Use False for an FMU whose reset is incomplete.
+    - `exchange`: whether to integrate its equations here, by model exchange; by default only for an
+      FMU without its own solver.
     **Returns:** the system.
-    **Raises:** `FileNotFoundError`; `ValueError` for a file that is no such FMU, without a binary
-    for this machine, for variables that do not exist, and times out of range.
+    **Raises:** `FileNotFoundError`; `ValueError` for a file that is not such an FMU, or has no
+    binary for this machine, for variables that do not exist, and times out of range.
     """
     duration, dt = check_positive("duration", duration), check_positive("dt", dt)
     if dt > duration:
@@ -244,7 +247,7 @@ def fmu(
 def fmu_variables(file: str | Path) -> "pd.DataFrame":
     """List the variables of an FMU: causality, variability, type, unit, start value and range.
 
-    **Raises:** as `fmu`.
+    **Raises:** the errors of `fmu`.
     """
     import pandas as pd
 
@@ -257,15 +260,16 @@ def fmu_variables(file: str | Path) -> "pd.DataFrame":
 def fmu_ranges(
     file: str | Path, names: Iterable[str], around: float | None = None
 ) -> dict[str, tuple[float, float]]:
-    """Return the ranges that an FMU declares of variables, for `Box(low, high)`.
+    """Return the ranges that an FMU declares for variables, as ends of `Box(low, high)`.
 
     **Arguments:**
     - `file`: the FMU.
-    - `names`: parameters, start values or inputs.
-    - `around`: share of the start value to both sides, for variables without a range, such as 0.2.
+    - `names`: names of parameters, start values or inputs.
+    - `around`: relative deviation from the start value, such as 0.2, that is used as the range of
+      variables without one.
     **Returns:** the low and the high end for each name.
-    **Raises:** `ValueError` for a variable without a range, if `around` is left out or it has no
-    start value; as `fmu`.
+    **Raises:** `ValueError` for a variable without a range, unless `around` is given and it has a
+    start value; the errors of `fmu`.
     """
     description, ranges = read_description(file), {}
     for name in names:

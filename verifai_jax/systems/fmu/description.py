@@ -37,14 +37,15 @@ TYPES3 = {
 class Variable:
     """A scalar variable of an FMU.
 
-    - `name`, `reference`, `description`: as the FMU gives them.
-    - `type`: name of the functions that set and read it, such as `Real` or `Float64`.
+    - `name`, `reference`, `description`: as in the FMU.
+    - `type`: the type in the names of the functions that set and read it, such as `Real` or
+      `Float64`.
     - `causality`: `parameter`, `input`, `output`, `local` ...
     - `variability`: `constant`, `fixed`, `tunable`, `discrete` or `continuous`.
-    - `unit`: empty if there is none.
+    - `unit`: its unit; empty if there is none.
     - `start`: its start value as text; None without one.
-    - `low`, `high`: declared range; infinite where it has no end.
-    - `scalar`: whether it is no array.
+    - `low`, `high`: declared range; infinite if it has no end.
+    - `scalar`: False for an array.
     """
 
     name: str
@@ -61,7 +62,7 @@ class Variable:
 
     @property
     def settable(self) -> bool:
-        """True where a value can be given before a simulation begins."""
+        """True if its value can be set before a simulation starts."""
         return self.causality == "input" or (
             self.variability != "constant" and self.start is not None
         )
@@ -75,13 +76,13 @@ class Description:
     - `version`: the version of FMI, 2 or 3.
     - `name`: the name of the model.
     - `identifier`: the identifier of the binary.
-    - `token`: by which the binary knows its description.
-    - `variables`: by name.
-    - `exchange`: whether it is to be simulated by model exchange, and not by co-simulation.
-    - `sizes`: numbers of continuous states and event indicators, as FMI 2 declares them.
-    - `keeps_states`: whether the FMU can save its state, and go back to it.
-    - `only_once`: whether a process can have one instance of it only.
-    - `asks_after_steps`: whether it is to be asked after steps of the integrator.
+    - `token`: the token with which the binary recognises its description.
+    - `variables`: the variables by name.
+    - `exchange`: whether to simulate it by model exchange instead of co-simulation.
+    - `sizes`: numbers of continuous states and event indicators, which FMI 2 declares.
+    - `keeps_states`: whether the FMU can save and restore its state.
+    - `only_once`: whether a process can only have one instance of it.
+    - `asks_after_steps`: whether it must be called after each step of the integrator.
     """
 
     file: Path
@@ -99,7 +100,7 @@ class Description:
     def variable(self, name: str) -> Variable:
         """Return a scalar variable.
 
-        **Raises:** `ValueError` for one that does not exist, or that is an array or a text.
+        **Raises:** `ValueError` for a variable that does not exist, or is an array or a text.
         """
         if name not in self.variables:
             raise missing_name(f"the FMU {self.file.name}", "variable", name, list(self.variables))
@@ -111,9 +112,9 @@ class Description:
 
     @property
     def binary(self) -> str:
-        """Path within the archive of the binary for this machine.
+        """Path in the archive of the binary for this machine.
 
-        **Raises:** `ValueError` where there is none.
+        **Raises:** `ValueError` if there is none.
         """
         system = {"linux": "linux", "darwin": "darwin", "win32": "win"}.get(sys.platform, "linux")
         ending = {"linux": "so", "darwin": "dylib", "win": "dll"}[system]
@@ -140,10 +141,9 @@ def read_description(file: str | Path, exchange: bool | None = None) -> Descript
     """Read the description of an FMU.
 
     **Arguments:**
-    - `exchange`: whether its model exchange is meant; its co-simulation, if it has one, when left
-      out.
-    **Raises:** `FileNotFoundError`; `ValueError` for a file that is no FMU of FMI 2 or 3, lacks
-    what is meant, or declares a document type.
+    - `exchange`: whether to read its model exchange; by default its co-simulation, if it has one.
+    **Raises:** `FileNotFoundError`; `ValueError` for a file that is not an FMU of FMI 2 or 3, lacks
+    the requested interface, or declares a document type.
     """
     path = Path(file).absolute()
     if not path.exists():

@@ -88,9 +88,9 @@ class ExchangeInstance(Instance):
             self._settle()
 
     def step(self, time: float, size: float) -> bool:
-        """Integrate up to the next time of communication; False if the FMU ended its simulation.
+        """Integrate up to the next communication time; False if the FMU ended its simulation.
 
-        **Raises:** `FMUError` also where the integration fails, or events do not end.
+        **Raises:** `FMUError`, also if the integration fails or events do not end.
         """
         end, events = time + size, 0
         for _ in range(MAX_STEPS):

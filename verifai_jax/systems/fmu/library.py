@@ -55,7 +55,7 @@ class _Group(NamedTuple):
 
 
 class FMUError(RuntimeError):
-    """A function of an FMU failed; the message is what the FMU said."""
+    """An error returned by a function of an FMU, with the FMU's message."""
 
 
 class Instance:
@@ -63,8 +63,8 @@ class Instance:
 
     **Arguments:**
     - `description`: the description of the FMU.
-    - `folder`: where the FMU is unpacked.
-    **Raises:** `FMUError` where the binary cannot be loaded or does not make an instance.
+    - `folder`: the folder into which the FMU is unpacked.
+    **Raises:** `FMUError` if the binary cannot be loaded or does not make an instance.
     """
 
     def __init__(self, description: Description, folder: Path) -> None:
@@ -113,7 +113,7 @@ class Instance:
                 self._call(f"GetFMU{self._state}", byref(self.new_state))
 
     def begin(self, values: Mapping[str, float], duration: float) -> None:
-        """Set start values, and initialize, from the state that a new instance has."""
+        """Set start values and initialise, starting from the state of a new instance."""
         if self._begun:
             self._renew()
         self._begun, self.failed = True, False
@@ -153,7 +153,7 @@ class Instance:
         return found
 
     def free(self) -> None:
-        """Give the instance back; it cannot be used any more."""
+        """Free the instance; it cannot be used afterwards."""
         if self._component:
             self._function("FreeInstance", None)(self._component)
         self._component = c_void_p()

@@ -40,7 +40,7 @@ Bound = Mapping[str, "str | Scaled | Sequence[str | Scaled]"]
 
 @dataclass(frozen=True)
 class Scaled:
-    """A location whose value the feature multiplies: at 1 the model's value stays as it is.
+    """A location whose value is multiplied by the feature: 1 keeps the model's value.
 
     - `path`: the path of the location, as in `bind`: `"body/torso/mass"`.
     """
@@ -50,7 +50,7 @@ class Scaled:
 
 @dataclass(frozen=True)
 class Binding:
-    """One feature sets one location."""
+    """A feature together with the location that it sets."""
 
     feature: str
     location: Location
@@ -59,7 +59,7 @@ class Binding:
 
 @dataclass(frozen=True, eq=False)
 class Bindings:
-    """All bindings of a system, grouped by what they set; made by `resolve_bindings`."""
+    """All bindings of a system, grouped by the kind of location; made by `resolve_bindings`."""
 
     model: Model
     parameters: tuple[Binding, ...]
@@ -80,7 +80,7 @@ class Bindings:
 
     @cached_property
     def arrays(self) -> frozenset[str]:
-        """The model's arrays that differ between rows, derived ones included."""
+        """The model's arrays that differ between rows, including derived ones."""
         changed = {binding.location.array for binding in self.parameters}
         if changed & {"geom_size", "geom_pos", "geom_quat", GEOM_MASS} and self.solids:
             changed |= {"body_mass", "body_inertia", "body_ipos", "body_iquat"}
@@ -91,13 +91,14 @@ class Bindings:
 
     @cached_property
     def moves_constants(self) -> bool:
-        """True where constants that MuJoCo derives from the model differ between rows."""
+        """True if constants that MuJoCo derives from the model differ between rows."""
         return bool(self.arrays & _DERIVED_FROM)
 
     def leaves(self, features: Mapping[str, Any]) -> dict[str, Float[Array, "..."]]:
         """Return the model's arrays for this row of features, in the model's shapes.
 
-        Geometry comes first, then masses, along which inertia scales, then what is bound itself.
+        Geometry is computed first, then masses with their inertia, then the bound values
+        themselves.
         """
         ordered = ("geom_size", "geom_pos", "geom_quat", GEOM_MASS)
         groups = [
@@ -124,9 +125,9 @@ class Bindings:
         features: Mapping[str, Any],
         begin: Mapping[str, Float[Array | np.ndarray, " k"]] | None = None,
     ) -> dict[str, Float[Array, " k"]]:
-        """Return `qpos`, `qvel` and `act` at time 0, and where mocap bodies are, if that is set.
+        """Return `qpos`, `qvel` and `act` at time 0, and the positions of mocap bodies if bound.
 
-        - `begin`: what they are where no feature sets them; as in the model's keyframe if None.
+        - `begin`: their values if no feature sets them; those of the model's keyframe if None.
         """
         known = self.model.begin if begin is None else begin
         bound = {"qpos", "qvel", "act"} | {b.location.array for b in self.state} | set(known)
@@ -140,7 +141,7 @@ class Bindings:
     def applied_at(
         self, features: Mapping[str, Any], time: Float[Array, ""]
     ) -> dict[str, Float[Array, "..."]]:
-        """Return forces and controls that features apply from `time` on, by the array's name."""
+        """Return the forces and controls that features apply from `time` on, by array name."""
         compiled = self.model.compiled
         shapes = {"ctrl": (compiled.nu,), "xfrc_applied": (compiled.nbody, 6)}
         shapes["qfrc_applied"] = (compiled.nv,)
@@ -155,8 +156,8 @@ class Bindings:
     def check(self, features: Mapping[str, Any]) -> None:
         """Refuse features that the bindings do not fit.
 
-        **Raises:** `ValueError` for a bound feature that does not exist, one of another shape than
-        its location, and a `Signal` where only constants can go.
+        **Raises:** `ValueError` for a bound feature that does not exist or has another shape than
+        its location, and for a `Signal` bound to a constant.
         """
         for binding in self.all:
             check_names(f"feature bound to {binding.location.path!r}:", [binding.feature], features)
@@ -201,8 +202,8 @@ class Bindings:
 def resolve_bindings(model: Model, bind: Bound | None) -> Bindings:
     """Resolve the `bind` argument of a system.
 
-    **Raises:** as `model.locate` does; `ValueError` for two features on one number, or a
-    factor on what the model has no value of.
+    **Raises:** the errors of `model.locate`; `ValueError` for two features bound to one number, or
+    a factor for a value that the model does not have.
     """
     sorted_: dict[str, list[Binding]] = {"parameters": [], "state": [], "applied": []}
     taken: dict[tuple[str, int], str] = {}
@@ -290,7 +291,7 @@ def _float() -> Any:
 
 
 class RecordingFeatures(dict[str, Any]):
-    """Features that record which of them are read."""
+    """Features that record which of them are used."""
 
     def __init__(self, features: Mapping[str, Any], read: set[str]) -> None:
         super().__init__(features)
@@ -301,7 +302,7 @@ class RecordingFeatures(dict[str, Any]):
         return super().__getitem__(name)
 
     def get(self, name: str, default: object = None) -> Any:
-        """Return as a dictionary does."""
+        """Return as `dict.get` does."""
         if name in self:
             self.read.add(name)
         return super().get(name, default)
@@ -316,16 +317,16 @@ class RecordingFeatures(dict[str, Any]):
         return super().__iter__()
 
     def keys(self) -> Any:
-        """Return all names, and record all as read."""
+        """Return all names, recording all features as used."""
         self.read.update(super().keys())
         return super().keys()
 
     def values(self) -> Any:
-        """Return all values, and record all as read."""
+        """Return all values, recording all features as used."""
         self.read.update(super().keys())
         return super().values()
 
     def items(self) -> Any:
-        """Return all items, and record all as read."""
+        """Return all items, recording all features as used."""
         self.read.update(super().keys())
         return super().items()

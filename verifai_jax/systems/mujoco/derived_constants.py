@@ -28,11 +28,11 @@ Leaves = dict[str, Float[Array, "..."]]
 
 @dataclass(frozen=True)
 class SolidBody:
-    """A body whose mass and inertia come from its geoms.
+    """A body whose mass and inertia are computed from its geoms.
 
-    - `geoms`: their numbers; `kinds`: their MuJoCo types.
-    - `masses`: in kg where the model states a geom's mass, else None.
-    - `densities`: in kg/m^3.
+    - `geoms`: indices of its geoms; `kinds`: their MuJoCo types.
+    - `masses`: the geoms' masses in kg, None if the model gives no mass.
+    - `densities`: the geoms' densities in kg/m^3.
     - `bound`: whether a feature sets a geom's mass.
     """
 
@@ -47,16 +47,16 @@ class SolidBody:
 def bodies_of_geoms(
     model: Model, changed: Collection[int], massive: Mapping[int, str] | None = None
 ) -> tuple[SolidBody, ...]:
-    """Return the bodies with a `changed` geom whose inertia comes from their geoms.
+    """Return the bodies with a `changed` geom whose inertia is computed from geoms.
 
-    A model without a spec, and a body with an explicit `<inertial>`, keep their inertia.
+    The inertia is kept in a model without a spec, and for a body with an explicit `<inertial>`.
 
     **Arguments:**
-    - `model`: with the spec that it came from.
-    - `changed`: numbers of geoms of another size or in another location.
-    - `massive`: numbers of geoms with another mass, and the paths that say so.
+    - `model`: the model with its spec.
+    - `changed`: indices of geoms with a new size or location.
+    - `massive`: indices of geoms with a new mass, and the paths that set it.
     **Raises:** `ValueError` for a body whose inertia cannot be computed here (meshes, shells), and
-    for the mass of a geom that its body's does not come from.
+    for the mass of a geom that does not contribute to its body's mass.
     """
     compiled, spec, massive = model.compiled, model.spec, massive or {}
     changed = {*changed, *massive}
@@ -133,7 +133,7 @@ def _check_solid(compiled: MjModel, solid: SolidBody) -> None:
 
 
 def masses_of_geoms(compiled: MjModel, solids: Collection[SolidBody]) -> np.ndarray:
-    """Return the mass of each geom of these bodies as the model has it, in kg; NaN of others."""
+    """Return the mass of each geom of these bodies in the model, in kg; NaN for other geoms."""
     masses = np.full(compiled.ngeom, np.nan)
     for solid in solids:
         for geom, kind, mass, density in zip(
@@ -145,7 +145,7 @@ def masses_of_geoms(compiled: MjModel, solids: Collection[SolidBody]) -> np.ndar
 
 
 def recompute_inertia(compiled: MjModel, solids: Collection[SolidBody], leaves: Leaves) -> Leaves:
-    """Return the leaves with mass, centre and inertia of the `solids` as their geoms have them."""
+    """Return the leaves with mass, centre and inertia of the `solids` computed from their geoms."""
     leaves = dict(leaves)
     for solid in solids:
         parts = [

@@ -38,9 +38,9 @@ HUGE = 1e10
 class State(NamedTuple):
     """The state of a simulation for controller, signals and terminate, on both backends.
 
-    All of it is current but the sensors of acceleration and force (accelerometer, force, torque,
-    touch, actuatorfrc): they describe the last physics step before the sample, and are zero at
-    time 0.
+    All entries are current except the sensors of acceleration and force (accelerometer, force,
+    torque, touch, actuatorfrc): they describe the last physics step before the sample, and are zero
+    at time 0.
     """
 
     time: Float[Array, ""]
@@ -59,10 +59,10 @@ class State(NamedTuple):
 
 
 class Sample(NamedTuple):
-    """The signals at one sample, and the inputs of the control period that begins there.
+    """The signals at one sample, and the inputs of the control period that follows.
 
     - `inputs`: `ctrl`, and the forces that features apply.
-    - `frozen`: the state stays as it is from here on.
+    - `frozen`: whether the state stays fixed from here on.
     """
 
     inputs: dict[str, Float[Array, "..."]]
@@ -71,7 +71,7 @@ class Sample(NamedTuple):
 
 
 class Progress(NamedTuple):
-    """The carry from sample to sample in addition to the physics."""
+    """The carry from sample to sample, apart from the physics."""
 
     memory: Any
     age: Int[Array, ""]
@@ -81,7 +81,7 @@ class Progress(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Loop:
-    """Everything of a system but its engine; `mujoco` documents the parts."""
+    """All parts of a system except its engine; `mujoco` documents them."""
 
     bindings: Bindings
     controller: Callable[..., Any] | None
@@ -107,12 +107,12 @@ class Loop:
 
     @property
     def duration(self) -> float:
-        """Simulated seconds."""
+        """Duration of a simulation in seconds."""
         return self.periods * self.control_period
 
     @cached_property
     def shapes(self) -> dict[str, tuple[int, ...]]:
-        """The shape of each array of the state; the sensors added for contacts included."""
+        """The shape of each array of the state, including sensors added for contacts."""
         m = self.compiled
         return {
             "qpos": (m.nq,),
@@ -129,7 +129,7 @@ class Loop:
 
     @cached_property
     def locations(self) -> dict[str, Location]:
-        """The locations of signals that are named by a path."""
+        """The locations of signals that are given by a path."""
         if callable(self.signals):
             return {}
         chosen = self._default_signals() if self.signals is None else self.signals
@@ -154,7 +154,7 @@ class Loop:
 
     @cached_property
     def delayed_sensors(self) -> np.ndarray:
-        """A mask of the `sensordata` that describe the last physics step, `[nsensordata]`."""
+        """A mask of those `sensordata` that describe the last physics step, `[nsensordata]`."""
         delayed = np.zeros(self.compiled.nsensordata, bool)
         for i in range(self.compiled.nsensor):
             if self.compiled.sensor_needstage[i] >= 3:
@@ -189,11 +189,11 @@ class Loop:
         return Progress(memory, jnp.int32(0), jnp.array(True), states)
 
     def channels(self, features: Features) -> Channels:
-        """Return what observations and controls pass through in one simulation."""
+        """Return the links in the path of observations and controls in one simulation."""
         return Channels(self.links, self.control_period, features)
 
     def passing(self) -> Passing:
-        """Return what the controller sees and sets, with the names of sensors, joints, actuators.
+        """Return the controller's inputs and outputs, with names of sensors, joints and actuators.
 
         **Raises:** `ValueError` for a loop without a controller.
         """
@@ -212,16 +212,16 @@ class Loop:
         return Passing(state, control, self.control_period, self.duration, named, ("time",))
 
     def rest(self) -> Float[Array, " nu"]:
-        """Return the control where nothing controls: the keyframe's, or zero."""
+        """Return the control if there is no controller: the keyframe's, or zero."""
         real = jnp.result_type(float)
         return jnp.asarray(self.bindings.model.begin.get("ctrl", np.zeros(self.compiled.nu)), real)
 
     def sample(
         self, k: Int[Array, ""], arrays: Mapping[str, Array], progress: Progress, features: Features
     ) -> tuple[Sample, Progress]:
-        """Read the state at sample `k`, and decide the inputs until the next.
+        """Read the state at sample `k`, and compute the inputs until the next sample.
 
-        `arrays`: of the state, those that `reads` names at least.
+        `arrays` must contain at least those arrays of the state that `reads` names.
         """
         time = progress.age.astype(jnp.result_type(float)) * self.control_period
         state, sensors = self.state(time, arrays)
@@ -244,7 +244,7 @@ class Loop:
         return Sample(inputs, signals, frozen), after._replace(states=states)
 
     def state(self, time: Array, arrays: Mapping[str, Array]) -> tuple[State, Array]:
-        """Return the state as users see it, and all sensors; an array that is not given is zero."""
+        """Return the state as users see it, and all sensors; missing arrays are zero."""
         full = {
             name: arrays.get(name, jnp.zeros(shape, time.dtype))
             for name, shape in self.shapes.items()
@@ -327,7 +327,7 @@ class Loop:
         return values
 
     def finite_signals(self) -> tuple[str, ...]:
-        """Return the signals that are parts of the state, whose finiteness is the state's."""
+        """Return the signals that are part of the state, so that they are finite if it is."""
         parts = ("qpos", "qvel", "act", "ctrl")
         return tuple(name for name, location in self.locations.items() if location.array in parts)
 
@@ -362,7 +362,7 @@ class Loop:
         return frozenset(read & set(fields))
 
     def check(self, features: Features) -> None:
-        """Refuse features, and functions, that do not fit; abstract evaluation only.
+        """Refuse features and functions that do not fit; by abstract evaluation only.
 
         **Raises:** `ValueError`.
         """

@@ -147,9 +147,9 @@ _with_derivative_of.defjvp(lambda primals, tangents: (primals[0], tangents[1]))
 def solve_constraints(model: MjxModel, data: MjxData) -> Any:
     """Return the data after MJX's constraint solver, differentiable in forward and reverse mode.
 
-    The accelerations minimise a convex cost, so their derivative is that of one Newton step from
-    the minimum (implicit function theorem). The iterations themselves, a loop of unknown length,
-    are not differentiated; the result has to be converged for the derivative to be exact.
+    The accelerations minimise a convex cost, so their derivative is that of one Newton step at the
+    minimum (implicit function theorem). The iterations, a loop of unknown length, are not
+    differentiated; the derivative is exact if the result has converged.
     """
     mjx = mjx_module()
     create, update = _solver()
@@ -181,16 +181,16 @@ def _solver() -> tuple[Any, Any]:
 
 
 def prepare_model(bindings: Bindings, features: Features) -> tuple[Any, Any]:
-    """Return the MJX model of one row of features, and blank MJX data.
+    """Return the MJX model for one row of features, and blank MJX data.
 
-    **Raises:** `NotImplementedError` for a model that MJX cannot do.
+    **Raises:** `NotImplementedError` for a model that MJX does not support.
     """
     model, blank = _mjx_model(bindings)
     return with_leaves(model, bindings, features), blank
 
 
 def with_leaves(model: MjxModel, bindings: Bindings, features: Features) -> Any:
-    """Return an MJX model with what features set, and what follows from that."""
+    """Return an MJX model with the values set by features, and all values derived from them."""
     if not bindings.arrays:
         return model
     leaves = bindings.leaves(features)
@@ -325,7 +325,7 @@ def _integrator(mjx: ModuleType, model: MjxModel) -> Any:
 
 
 def reverse_hint(compiled: MjModel) -> str | None:
-    """Return why reverse mode does not work, and what makes it work; empty if it works."""
+    """Return why reverse mode does not work, and how to make it work; empty if it works."""
     if compiled.opt.integrator != 1 or not has_constraints(compiled):  # 1: Runge-Kutta
         return None
     return (

@@ -33,11 +33,11 @@ MjxData: TypeAlias = Any
 
 @dataclass(frozen=True, eq=False)
 class Model:
-    """A compiled model, and the spec that it came from where there was one.
+    """A compiled model, and the spec from which it was compiled, if there was one.
 
-    - `source_files`: the files that it was read from, with their hashes at that time.
-    - `begin`: arrays of the keyframe that simulations begin with, by name; none without one.
-    - `notes`: sentences on what was changed in the model.
+    - `source_files`: the files from which it was read, with their hashes at that time.
+    - `begin`: arrays of the initial keyframe, by name; none without a keyframe.
+    - `notes`: sentences on changes made to the model.
     """
 
     compiled: Any
@@ -62,13 +62,13 @@ def load(
 
     **Arguments:**
     - `source`: the path of an MJCF file, its text, an `mujoco.MjSpec`, or an `mujoco.MjModel`.
-    - `contacts`: paths `contact/GEOM` and `contact/GEOM/GEOM`, for which a sensor is added after
-      the model's own.
-    - `keyframe`: name or number of the keyframe that simulations begin with.
-    - `options`: fields of the model's options to set, where they are not None.
-    **Raises:** `MissingExtra` without MuJoCo; `FileNotFoundError`; `ValueError` for text that is
-    no model, for contacts of an `MjModel`, which takes no more sensors, and for a keyframe that
-    the model lacks.
+    - `contacts`: paths `contact/GEOM` and `contact/GEOM/GEOM`, for each of which a sensor is added
+      after the model's own.
+    - `keyframe`: name or number of the keyframe in which simulations start.
+    - `options`: values for fields of the model's options; None leaves a field unchanged.
+    **Raises:** `MissingExtra` without MuJoCo; `FileNotFoundError`; `ValueError` for a text that is
+    not a model, for contacts of an `MjModel`, to which no sensors can be added, and for a keyframe
+    that the model lacks.
     """
     mujoco = require("mujoco", extra="mujoco")
     if isinstance(source, mujoco.MjModel):
@@ -145,11 +145,11 @@ def _hashes_of_files(source: ModelSource) -> dict[str, str]:
 
 
 def free_centres_of_mass(model: Model, bodies: Collection[int]) -> Model:
-    """Return the same model, in which these bodies' centre of mass can leave their origin.
+    """Return the same model compiled so that these bodies' centres of mass can move.
 
-    MuJoCo leaves out parts of the mass matrix that are zero as compiled ("simple" bodies).
+    MuJoCo omits parts of the mass matrix that are zero when compiled ("simple" bodies).
 
-    **Raises:** `ValueError` where there is no spec to compile again.
+    **Raises:** `ValueError` if there is no spec to compile again.
     """
     mujoco = require("mujoco", extra="mujoco")
     old = model.compiled
@@ -178,7 +178,7 @@ def free_centres_of_mass(model: Model, bodies: Collection[int]) -> Model:
 
 
 def mjx_module() -> Any:
-    """Import the module `mujoco.mjx`, without what it prints about optional packages.
+    """Import the module `mujoco.mjx`, without its messages about optional packages.
 
     **Raises:** `MissingExtra`.
     """

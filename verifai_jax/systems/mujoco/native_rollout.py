@@ -33,14 +33,14 @@ HALVED = 64
 
 @dataclass(eq=False)
 class Native:
-    """Batches of one loop, and the programs that they need; made once for a system."""
+    """Batches of one loop with the programs that they need; made once for a system."""
 
     loop: Loop
     batches: dict[Any, Any] = field(default_factory=dict)
     programs: dict[Any, Any] = field(default_factory=dict)
 
     def simulate(self, features: Features, keys: Key[Array, " n"]) -> Trace:
-        """Simulate a batch: every leaf of `features` and `keys` has a leading axis `[n]`."""
+        """Simulate a batch: all leaves of `features` and `keys` have a leading axis `[n]`."""
         count = len(keys)
         # Few sizes, for which programs are compiled; the rows that fill one up are never stepped.
         size = power_of_two(count)
@@ -85,7 +85,7 @@ class Native:
         return self.programs[key]
 
     def batch(self, size: int, number: int) -> Any:
-        """Return a `mujoco.batch.Batch` of this many rows, made once."""
+        """Return a `mujoco.batch.Batch` with this many rows, made once."""
         if (size, number) not in self.batches:
             module = require("mujoco.batch", extra="mujoco")
             # Batches of other sizes are not needed again, or not soon.

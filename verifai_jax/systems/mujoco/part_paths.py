@@ -73,12 +73,12 @@ _PATH = re.compile(r"^(?P<kind>[^/\[\]]+)/(?P<rest>.+?)(\[(?P<index>[^\]]*)\])?$
 
 @dataclass(frozen=True)
 class Location:
-    """The location of some numbers in one array.
+    """The location of numbers in one array.
 
-    - `array`: its name in MjModel or MjData; `"opt.gravity"` is in the model's options.
-    - `index`: flat indices `[k]` into it.
+    - `array`: its name in MjModel or MjData; `"opt.gravity"` is one of the model's options.
+    - `index`: flat indices `[k]` into the array.
     - `shape`: `()` for one number, else `(k,)`.
-    - `sign`: each number is the value times this.
+    - `sign`: factor between the value and each number.
     """
 
     array: str
@@ -173,9 +173,9 @@ def _locate_input(
 
 
 def reading(model: MjModel, path: str) -> Location:
-    """Return the location of a signal's path in the state.
+    """Return the location in the state of a signal's path.
 
-    **Raises:** as `locate`.
+    **Raises:** the errors of `locate`.
     """
     kind, name, field, index = _split(path, (*_READINGS, "sensor", "contact"))
     if kind == "sensor":

@@ -61,7 +61,7 @@ class MuJoCo(System):
 
     @property
     def duration(self) -> float:
-        """Simulated seconds."""
+        """Duration of a simulation in seconds."""
         return self.loop.duration
 
     @cached_property
@@ -71,12 +71,12 @@ class MuJoCo(System):
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """Sentences on what was changed in the model, and on a controller that runs in Python."""
+        """Sentences on changes made to the model, and on a controller that runs in Python."""
         return (*self.loop.bindings.model.notes, *self.loop.said.values())
 
     @property
     def constants(self) -> dict[str, str | np.ndarray]:
-        """Options and arrays of the model by name, without what MuJoCo computes of the others."""
+        """Options and arrays of the model by name, without those that MuJoCo derives."""
         mujoco, compiled = require("mujoco", extra="mujoco"), self.loop.compiled
         found: dict[str, str | np.ndarray] = {}
         for name in dir(compiled.opt):
@@ -107,11 +107,11 @@ class MuJoCo(System):
         )
 
     def why_error(self, features: Features) -> str | None:
-        """Say which delay or fault has a number that it may not have."""
+        """Return a message that names a delay or fault with an invalid number."""
         return first_refusal(self.loop.links, features, "this system")
 
     def passing(self, features: Features) -> Passing:
-        """Return what the controller sees and sets."""
+        """Return the controller's inputs and outputs."""
         return self.loop.passing()
 
     def with_links(self, links: tuple[Link, ...]) -> "MuJoCo":
@@ -119,10 +119,10 @@ class MuJoCo(System):
 
     @property
     def likely(self) -> str:
-        """The engine that is likely faster on a CPU: MJX pays for contacts, native for the policy.
+        """The engine that is probably faster on a CPU: contacts slow down MJX, policies native.
 
-        Without anything for a constraint solver to do, MJX measured three times native's speed
-        (a cart-pole); with a contact a seventh of it (a ball).
+        In measurements MJX was three times as fast as native without constraints (a cart-pole), and
+        seven times slower with a contact (a ball).
         """
         return "native" if has_constraints(self.loop.compiled) else "mjx"
 
@@ -140,11 +140,11 @@ class MuJoCo(System):
 
     @property
     def traced_factor(self) -> bool:
-        """True where JAX may trace the factor of `refined`."""
+        """True if JAX may trace the factor of `refined`."""
         return not self.black_box
 
     def refined(self, factor: int) -> "MuJoCo":
-        """Return the same loop, sampled, decided and ended as before, at a finer step.
+        """Return the same loop with a finer step; samples, decisions and end keep their times.
 
         Sensors of acceleration and force then describe the last of the smaller steps.
 
@@ -158,19 +158,19 @@ class MuJoCo(System):
 
     @property
     def black_box(self) -> bool:
-        """True where JAX does not see into it: native, or a model that only native can simulate."""
+        """True if JAX cannot trace it: with native, or a model that only native can simulate."""
         return self.backend == "native" or (self.backend == "auto" and "mjx" not in self.backends)
 
     @cached_property
     def reverse_hint(self) -> str:
-        """A sentence on what makes reverse mode work, where it does not."""
+        """A sentence on how to make reverse mode work, if it does not."""
         return reverse_hint(self.loop.compiled) or ""
 
     def check(self, features: Features) -> None:
         self.loop.check(set_durations(features, self.duration))
 
     def abstract(self, features: Features) -> Trace:
-        """Return the trace of one simulation, as shapes alone."""
+        """Return the shapes of one simulation's trace."""
         loop, features = self.loop, set_durations(features, self.duration)
 
         def trace(features: Features) -> Trace:
@@ -217,7 +217,7 @@ class MuJoCo(System):
         return jax.tree.map(lambda leaf: leaf[0], batch)
 
     def simulate_batch(self, features: Features, keys: Key[Array, " n"]) -> Trace:
-        """Simulate a batch natively; every leaf has a leading axis `[n]`."""
+        """Simulate a batch natively; all leaves have a leading axis `[n]`."""
         return self._native.simulate(set_durations(features, self.duration), keys)
 
     @cached_property
@@ -250,30 +250,33 @@ def mujoco(
     - `duration`: in seconds, a multiple of `control_period`.
     - `control_period`: seconds between two runs of the controller, a multiple of the model's
       timestep, and the sampling period of the trace. Control and forces are held in between.
-    - `bind`: for a feature's name the path of what it sets, `"body/pole/mass"`, `Scaled(path)`
-      for a factor on the model's value, or a list of these. See docs/mujoco.md for all paths.
-    - `controller(time, state, features) -> control`: `[nu]`, or one number for one actuator;
-      `state` is a `systems.mujoco.loop.State`. JAX traces it; with `backend="native"` one that JAX
-      cannot trace, of NumPy or PyTorch, is called with arrays of NumPy, once for each decision.
+    - `bind`: a dictionary from a feature to the path that it sets, `"body/pole/mass"`, to
+      `Scaled(path)` for a factor on the model's value, or to a list of these. See docs/mujoco.md
+      for all paths.
+    - `controller(time, state, features) -> control`: returns `[nu]`, or one number for one
+      actuator; `state` is a `systems.mujoco.loop.State`. JAX traces it. With `backend="native"` a
+      controller that JAX cannot trace, such as one in NumPy or PyTorch, is called with NumPy
+      arrays, once for each decision.
     - `controller_memory`: as in `ode`.
-    - `initial(features, key, qpos, qvel) -> (qpos, qvel)`: the state at time 0, after `bind`.
-    - `signals`: for a signal's name a path (`"joint/slider/qpos"`, `"body/torso/xpos[2]"`,
-      `"sensor/imu"`, `"contact/floor/foot"`: how many contacts) or a function
-      `(time, state, control, features) -> value`; or one function that returns the dictionary.
-      When left out: joints `NAME` and `NAME_vel`, and sensors, by their names.
+    - `initial(features, key, qpos, qvel) -> (qpos, qvel)`: changes the state at time 0, after
+      `bind`.
+    - `signals`: a dictionary from a signal to a path (`"joint/slider/qpos"`,
+      `"body/torso/xpos[2]"`, `"sensor/imu"`, or `"contact/floor/foot"` for the number of contacts)
+      or to a function `(time, state, control, features) -> value`; or one function that returns the
+      dictionary. By default: joints as `NAME` and `NAME_vel`, and sensors by their names.
     - `terminate(state, features) -> bool`: as in `ode`.
-    - `backend`: `"mjx"`, `"native"`, or `"auto"`: a run takes the one with gradients where it
-      needs them, else the faster.
-    - `solver_iterations`, `ls_iterations`: of the constraint solver and its line search, instead
-      of the model's.
-    - `keyframe`: name or number of the model's keyframe that each simulation begins with, before
-      `bind`. Its `ctrl` is the control where there is no controller.
-    - `action_delay`: control periods after which a decision of the controller takes effect, or the
-      feature that says so with the greatest that it may be, `{"latency": 5}`. Until the first one
-      does, the control is the keyframe's, or zero.
+    - `backend`: `"mjx"`, `"native"`, or `"auto"`: a run takes MJX if it needs gradients, otherwise
+      the faster one.
+    - `solver_iterations`, `ls_iterations`: iterations of the constraint solver and of its line
+      search, instead of the model's.
+    - `keyframe`: name or number of the model's keyframe in which each simulation starts, before
+      `bind`. Its `ctrl` is the control if there is no controller.
+    - `action_delay`: number of control periods after which a decision of the controller takes
+      effect, or the feature that gives it with its maximum, `{"latency": 5}`. Until the first
+      decision takes effect, the control is the keyframe's, or zero.
     **Returns:** a `MuJoCo` system.
     **Raises:** `MissingExtra` without MuJoCo; `FileNotFoundError`; `ValueError` for a model that
-    does not compile, times that do not fit, and paths that are not in the model.
+    does not compile, inconsistent times, and paths that are not in the model.
     """
     if backend not in (*BACKENDS, "auto"):
         raise unknown_name("backend", backend, (*BACKENDS, "auto"))
@@ -323,10 +326,10 @@ def mujoco(
 
 
 def mjx(model: ModelSource, **options: Any) -> MuJoCo:
-    """Make a system of a MuJoCo model that JAX steps; the arguments are those of `mujoco`."""
+    """Make a system from a MuJoCo model simulated by MJX in JAX; arguments as in `mujoco`."""
     return mujoco(model, backend="mjx", **options)
 
 
 def native(model: ModelSource, **options: Any) -> MuJoCo:
-    """Make a system of a MuJoCo model that C steps on all cores; arguments as `mujoco`."""
+    """Make a system from a MuJoCo model simulated in C on all cores; arguments as in `mujoco`."""
     return mujoco(model, backend="native", **options)

@@ -46,38 +46,40 @@ def ode(
 
     **Arguments:**
     - `dynamics(time, state, control, features) -> derivative`: d state / d time, in the form of the
-      state; `time` in seconds; `control` is None without a controller. A `Signal` that is held
-      keeps its value within a step; a piece that begins within one begins with the next.
-    - `initial(features, key) -> state`: any pytree of real numbers, all made one float dtype.
-    - `controller(time, state, features) -> control`: any pytree.
+      state; `time` in seconds; `control` is None without a controller. A `Signal` with constant
+      pieces keeps its value during a step; a piece that begins during a step takes effect with the
+      next.
+    - `initial(features, key) -> state`: any pytree of real numbers, which are all converted to one
+      float dtype.
+    - `controller(time, state, features) -> control`: returns any pytree.
     - `dt`: step and sampling period in seconds; the trace has a sample at 0 and after each step.
-    - `duration`: in seconds, a multiple of `dt`; or the number of `steps`.
-    - `method`: `"rk4"`, `"euler"`, or `"semi_implicit_euler"`, whose state is a tuple
-      `(positions, velocities)`; or an integrator, as `vj.blocks.adaptive` makes them.
-    - `control_period`: seconds between two runs of the controller, a multiple of `dt`; its output
-      is held in between. `dt` when left out.
-    - `controller_memory`: the memory at time 0 of a controller that has one (an integrator, a
-      filter). It is then called `controller(time, state, memory, features)` and returns
-      `(control, memory)`.
-    - `signals(time, state, control, features) -> dict`: a scalar or vector for each name, at each
-      sample; `control` is the one applied from this sample on. When left out: the state's own
-      names, those of the control, and `control` for a control without names.
+    - `duration`: duration in seconds, a multiple of `dt`; alternatively the number of `steps`.
+    - `method`: `"rk4"`, `"euler"`, or `"semi_implicit_euler"`, whose state is a tuple `(positions,
+      velocities)`; or an integrator, such as those made by `vj.blocks.adaptive`.
+    - `control_period`: seconds between two calls of the controller, a multiple of `dt`, by default
+      `dt`; its output is held in between.
+    - `controller_memory`: the initial memory of a controller with memory (an integrator, a filter).
+      It is then called as `controller(time, state, memory, features)` and returns `(control,
+      memory)`.
+    - `signals(time, state, control, features) -> dict`: returns a scalar or vector for each name,
+      at each sample; `control` is the one applied from this sample on. By default the signals have
+      the names of the state and of the control; a control without names is called `control`.
     - `terminate(state, features) -> bool`: ends the simulation. The first sample at which it is
-      true is the last valid one; the state stays frozen from there on.
-    - `unroll`: steps in one iteration of the compiled loop; changes speed only.
-    - `exact_step`: True where the method and its step define the plant, as in an environment that
-      is published as a difference equation. A counterexample is then confirmed in double precision
-      and under rounding alone. False for a plant that moves continuously, of which a step is an
-      approximation: counterexamples are also replayed at a half and a quarter of it.
-    - `update(time, state, features) -> state`: what changes at once at each sample but the first,
-      before the controller runs: a delay line, a latch, a counter. The derivative of such a part
-      is 0.
-    - `switches`: jumps of the state, such as an impact or a change of the mode, at instants found
+      true is the last valid one; the state is frozen from there on.
+    - `unroll`: steps in one iteration of the compiled loop; affects speed only.
+    - `exact_step`: True if the method and its step define the plant, as in an environment that is
+      published as a difference equation. A counterexample is then confirmed only in double
+      precision and under rounding. False for a plant that moves continuously, which a step
+      approximates: counterexamples are also replayed at a half and a quarter of it.
+    - `update(time, state, features) -> state`: makes instantaneous changes at each sample except
+      the first, before the controller runs: a delay line, a latch, a counter. The derivative of
+      such a part is 0.
+    - `switches`: jumps of the state, such as an impact or a change of the mode, at instants located
       within the step; see `vj.blocks.Switch`.
     **Returns:** an `Ode`. The status of its trace is `NONFINITE` if the state became NaN or
     infinite.
-    **Raises:** `ValueError` for times that do not fit, an unknown method, and functions of other
-    arguments; once the system is traced, for functions whose results do not fit together.
+    **Raises:** `ValueError` for inconsistent times, an unknown method, and functions with other
+    arguments; when the system is traced, for functions whose results do not fit together.
     """
     if not (isinstance(dt, int | float) and math.isfinite(dt) and dt > 0):
         raise ValueError(f"dt must be a positive number of seconds; got {dt!r}")

@@ -18,19 +18,19 @@ from verifai_jax.systems.ode.integrators import Derivative, Integrator, Step, Ti
 def adaptive(
     solver: str = "Tsit5", *, rtol: float = 1e-6, atol: float = 1e-8, max_steps: int = 256
 ) -> Integrator:
-    """Make an integrator that takes each step of `ode` by as many steps of diffrax as it needs.
+    """Make an integrator that divides each step of `ode` into as many diffrax steps as needed.
 
     Needs the extra: `pip install 'verifai_jax[diffrax]'`. It can be differentiated, forward and
-    reverse. Samples, controller, `update` and switches stay on the beat of `dt`, at which the
-    solver starts anew. A refined loop has shorter steps and the same tolerances. Single precision
-    needs tolerances of 1e-6 or more.
+    reverse. Samples, controller, `update` and switches keep the period `dt`, at which the solver
+    restarts. A refined loop has shorter steps and the same tolerances. Single precision needs
+    tolerances of 1e-6 or more.
 
     **Arguments:**
-    - `solver`: the name of a solver of diffrax: `"Tsit5"` and `"Dopri8"` where the equations are
-      not stiff, `"Kvaerno3"` and `"Kvaerno5"` (implicit) where they are.
+    - `solver`: the name of a diffrax solver: `"Tsit5"` and `"Dopri8"` for non-stiff equations,
+      `"Kvaerno3"` and `"Kvaerno5"` (implicit) for stiff ones.
     - `rtol`, `atol`: relative and absolute tolerance of a step's error.
-    - `max_steps`: the maximum number of steps of diffrax in one step of `ode`; what needs more
-      becomes `NONFINITE`.
+    - `max_steps`: the maximum number of diffrax steps in one step of `ode`; a simulation that needs
+      more becomes `NONFINITE`.
     **Raises:** `MissingExtra` without diffrax, `UnknownNameError` for an unknown solver, and
     `ValueError` for tolerances that are not positive.
     """

@@ -33,8 +33,9 @@ from verifai_jax.systems.pytree_checks import (
 class Ode(System):
     """A closed loop `(features, key) -> Trace`; made by `ode`, which documents its parts.
 
-    - `substeps`: integration steps between two samples; more than one in a `refined` loop.
-    - `exact_step`: the step is part of the plant, so that the loop has no finer one.
+    - `substeps`: number of integration steps between two samples; more than one in a `refined`
+      loop.
+    - `exact_step`: whether the step is part of the plant, so that the loop has no finer one.
     """
 
     traced_factor: ClassVar[bool] = True
@@ -57,16 +58,16 @@ class Ode(System):
 
     @property
     def duration(self) -> float:
-        """Simulated seconds."""
+        """Duration of a simulation in seconds."""
         return self.steps * self.dt
 
     def refined(self, factor: int | Int[Array, ""]) -> "Ode":
-        """Return the same loop, sampled, decided and ended as before, at a finer step.
+        """Return the same loop with a finer step; samples, decisions and end keep their times.
 
-        The factor may be traced by JAX; the loop then has no derivative in reverse mode.
+        JAX may trace the factor; the loop then has no reverse-mode derivative.
 
-        **Raises:** `ValueError` for a factor that is not a positive integer, and for a loop whose
-        step is part of it.
+        **Raises:** `ValueError` for a factor that is not a positive integer, and for a loop with
+        `exact_step`.
         """
         if self.exact_step:
             raise ValueError(
@@ -92,11 +93,11 @@ class Ode(System):
             link.check(features)
 
     def why_error(self, features: Features) -> str | None:
-        """Say which fault has a number that it may not have."""
+        """Return a message that names a fault with an invalid number."""
         return first_refusal(self.links, features, "this system")
 
     def passing(self, features: Features) -> Passing:
-        """Return what the controller sees, the state, and what it returns.
+        """Return the controller's input, the state, and its output.
 
         **Raises:** `ValueError` for a plant without a controller.
         """
@@ -394,7 +395,7 @@ class _Rollout:
 def substep(
     loop: Ode, features: Features, control: PyTree, begin: Time, state: PyTree, dt: Step
 ) -> Any:
-    """Take one integration step of a loop from `begin` on, with its switches."""
+    """Take one integration step of a loop from `begin` on, including its switches."""
 
     def dynamics(now: Time, state: PyTree, inputs: Inputs) -> Any:
         control, features = inputs
@@ -407,7 +408,7 @@ def substep(
 
 
 def updated(loop: Ode, time: Time, state: PyTree, features: Features) -> Any:
-    """Return the state after what changes at a sample."""
+    """Return the state after the updates at a sample."""
     if loop.update is None:
         return state
     # What is not finite stays so: an update may not hide it.

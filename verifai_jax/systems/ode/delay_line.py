@@ -21,12 +21,12 @@ from verifai_jax.core.messages.checks import is_number
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class DelayLine:
-    """The last samples of a quantity, the newest first, with lines between them.
+    """The last samples of a quantity, newest first, interpolated linearly.
 
-    It is part of a state, or of a controller's memory, and made by `delay_line`.
+    It is part of a state, or of a controller's memory; made by `delay_line`.
 
-    **Fields:** `values` `[n, ...]`; `latest`, the time in seconds of the first of them; `period`
-    between two, in seconds.
+    **Fields:** `values` `[n, ...]`; `latest`, the time in seconds of the newest value; `period`
+    between two values, in seconds.
     """
 
     # JAX rebuilds the class with placeholders and with batches, which have other shapes.
@@ -36,14 +36,14 @@ class DelayLine:
     period: float = field(metadata={"static": True})
 
     def push(self, time: Any, value: Any) -> "DelayLine":
-        """Return the line with the value of this time, a period after the last one."""
+        """Return the line with the value at this time, one period after the last one."""
         values, latest = jnp.asarray(self.values), jnp.asarray(self.latest)
         newest = jnp.asarray(value, values.dtype)[None]
         values = jnp.concatenate([newest, values[:-1]])
         return DelayLine(values, jnp.asarray(time, latest.dtype), self.period)
 
     def at(self, time: Any) -> Any:
-        """Return the value at a time in seconds; beyond the ends that of the end."""
+        """Return the value at a time in seconds; beyond the ends that of the nearest end."""
         values, latest = jnp.asarray(self.values), jnp.asarray(self.latest)
         count = values.shape[0]
         position = (latest - jnp.asarray(time, latest.dtype)) / self.period
@@ -55,18 +55,18 @@ class DelayLine:
 
     @property
     def still(self) -> "DelayLine":
-        """The derivative of a line between two samples: zero, in the form of the line."""
+        """The derivative of a line between two samples: zeros in the form of the line."""
         return jax.tree.map(jnp.zeros_like, self)
 
 
 def delay_line(value: Any, *, longest: float, period: float) -> DelayLine:
-    """Make a line that has had one value until time 0.
+    """Make a delay line whose quantity has been constant until time 0.
 
     **Arguments:**
     - `value`: a number or an array.
-    - `longest`: seconds back at most; what is older has the value of that time.
+    - `longest`: maximum delay in seconds; longer delays read the oldest value.
     - `period`: seconds between two samples: `dt` for a line that `update` pushes, the control
-      period for one in a controller's memory. A delay shorter than it reads the newest sample.
+      period for one in a controller's memory. A shorter delay reads the newest sample.
     **Raises:** `ValueError` for seconds that are not positive, and a value that is not a number.
     """
     for name, seconds in (("longest", longest), ("period", period)):

@@ -33,8 +33,8 @@ def euler(derivative: Derivative, time: Time, state: PyTree, dt: Step) -> PyTree
 def semi_implicit_euler(derivative: Derivative, time: Time, state: PyTree, dt: Step) -> PyTree:
     """Take a step of symplectic Euler, order 1, on a state `(positions, velocities)`.
 
-    Velocities first, then positions with the new velocities. Source: Hairer, Lubich and Wanner,
-    Geometric Numerical Integration, 2nd ed., eq. I.1.9.
+    It updates velocities first, then positions with the new velocities. Source: Hairer, Lubich and
+    Wanner, Geometric Numerical Integration, 2nd ed., eq. I.1.9.
     """
     positions, velocities = state
     velocities = _advance(velocities, dt, derivative(time, state)[1])
@@ -59,7 +59,7 @@ def rk4(derivative: Derivative, time: Time, state: PyTree, dt: Step) -> PyTree:
 
 
 def looped_rk4(derivative: Derivative, time: Time, state: PyTree, dt: Step) -> PyTree:
-    """Take a step of `rk4` by a loop over its stages; equal up to rounding.
+    """Take a step of `rk4` with a loop over its stages; equal up to rounding.
 
     The derivative is traced once instead of four times.
     """
@@ -84,7 +84,7 @@ METHODS: dict[str, Integrator] = {
 
 
 def integrator(method: str | Integrator) -> Integrator:
-    """Return the integrator of this name; one of the user's own as it is.
+    """Return the integrator of this name; a user's own integrator is returned unchanged.
 
     **Raises:** `UnknownNameError` for a name that is not in `METHODS`.
     """

@@ -27,17 +27,17 @@ BEYOND = ("clip", "extrapolate")
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True, init=False)
 class LookupTable:
-    """A function of one or more numbers, linear in each between the points of a grid.
+    """A function of one or more numbers, interpolated linearly between the points of a grid.
 
-    It can be jitted, vmapped and differentiated, in its arguments and in its values. At a
+    It can be jitted, vmapped and differentiated with respect to its arguments and its values. At a
     breakpoint the derivative is that of the line after it.
 
     **Arguments:**
-    - `axes_and_values`: the increasing breakpoints of each argument, at least two of each, and
-      last the values, of shape `[len(axis), ...]` by `[len(axis), ...]` and so on. Axes after
-      these make a table of vectors.
-    - `beyond`: `"clip"` has the value at the end of an axis beyond it, `"extrapolate"` goes on
-      along the last line.
+    - `axes_and_values`: the increasing breakpoints of each argument, at least two of each, followed
+      by the values, of shape `[len(first axis), len(second axis), ...]`. Further axes make a table
+      of vectors.
+    - `beyond`: `"clip"` returns the value at the end of an axis beyond it, `"extrapolate"`
+      continues the last line.
     **Raises:** `ValueError` for breakpoints that do not increase, values that are not finite or of
     another shape, and an unknown `beyond`.
     """

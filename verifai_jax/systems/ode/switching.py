@@ -32,18 +32,18 @@ are more, a loop over the stages compiles faster."""
 class Switch:
     """A jump of the state at the instant at which a quantity falls to zero.
 
-    The instant is found within the step, to the order of the method, and is differentiated: the
-    derivative of the simulation is that of the hybrid system, not of one whose instants stay.
+    The instant is located within the step, to the order of the method, and is differentiated: the
+    derivative of the simulation includes how the instant moves.
 
     **Arguments:**
-    - `guard(time, state, features) -> number`: the switch happens where it was positive and is so
-      no more. A guard that is not positive at first waits until it has been.
-    - `reset(time, state, features) -> state`: the state from there on.
+    - `guard(time, state, features) -> number`: the switch happens when it stops being positive. A
+      guard that is not positive at the start has to become positive first.
+    - `reset(time, state, features) -> state`: returns the state after the jump.
 
-    The first switch of an integration step is located. What falls to zero in the rest of the same
-    step jumps at its end. A guard that falls to zero and rises again within one step is not seen.
+    The first switch in an integration step is located. Further guards that fall to zero in the same
+    step jump at its end. A guard that falls to zero and rises again within one step is missed.
 
-    **Raises:** `ValueError` for functions of other arguments.
+    **Raises:** `ValueError` for functions with other arguments.
     """
 
     guard: Callable[..., Any]
@@ -62,9 +62,9 @@ def hysteresis(on: Any, value: Any, low: Any, high: Any) -> Any:
     """Return the next mode of a switch with hysteresis: 1 from `high` on, 0 below `low`.
 
     **Arguments:**
-    - `on`: the mode now, 0 or 1, which stays between the two.
-    - `low`, `high`: where the mode changes; numbers, or traced.
-    **Raises:** `ValueError` for numbers with `low` above `high`.
+    - `on`: the present mode, 0 or 1, which is kept between the two thresholds.
+    - `low`, `high`: the thresholds; numbers, or traced.
+    **Raises:** `ValueError` if `low` is above `high`.
     """
     if is_number(low) and is_number(high) and low > high:
         raise ValueError(f"hysteresis needs low <= high; got (low={low}, high={high})")
@@ -73,7 +73,7 @@ def hysteresis(on: Any, value: Any, low: Any, high: Any) -> Any:
 
 
 def latch(on: Any, condition: Any) -> Any:
-    """Return 1 where the condition is true or a latch is already set (`on`), as a real number."""
+    """Return 1 if the condition is true or the latch is already set (`on`), as a real number."""
     on = jnp.asarray(on, jnp.result_type(float, on))
     return jnp.where(condition, 1, on).astype(on.dtype)
 
@@ -87,14 +87,14 @@ def switched_step(
     switches: Sequence[Switch],
     inputs: Inputs,
 ) -> Any:
-    """Take one step, with the first switch in it located and the others at its end.
+    """Take one step, locating its first switch and applying the others at its end.
 
-    A step in which nothing happens, in no lane of a batch, costs what one without switches does.
-    JAX traces the dynamics as often for many switches as for one.
+    A step in which no lane of a batch switches costs as much as one without switches. JAX traces
+    the dynamics as often for many switches as for one.
 
     **Arguments:**
     - `dynamics(time, state, inputs) -> derivative`.
-    - `inputs`: the control and the features, which guards and resets are given.
+    - `inputs`: the control and the features, which are passed to guards and resets.
 
     Source of the derivative: the implicit function theorem at the instant, as in J. Hiskens and
     M. Pai, Trajectory sensitivity analysis of hybrid systems, IEEE Trans. Circuits Syst. I 47

@@ -73,9 +73,8 @@ def sin_cos(
 
     **Arguments:**
     - `angle`: in radians, of any shape.
-    **Returns:** values within 1.2e-7 of the true ones for angles of at most 1e5, NaN beyond; in
-    float64 within 2.3e-16 for angles of at most 1e6; in any other precision those of `jnp.sin`
-    and `jnp.cos`.
+    **Returns:** values with an error of at most 1.2e-7 for angles up to 1e5, NaN beyond; in float64
+    at most 2.3e-16 for angles up to 1e6; in any other precision those of `jnp.sin` and `jnp.cos`.
     """
     angle = jnp.asarray(angle)
     numbers = _NUMBERS.get(np.dtype(angle.dtype))

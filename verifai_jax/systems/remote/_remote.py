@@ -38,9 +38,9 @@ LOOPBACKS = ("127.0.0.1", "::1")
 
 
 class Remote(System):
-    """A system on the host that other programs simulate; made by `remote`.
+    """A host system that is simulated by other programs, the clients; made by `remote`.
 
-    The port is opened when it is first needed, so a module that defines one does nothing yet.
+    The port is opened when it is first needed, so defining one in a module has no effect yet.
     """
 
     black_box: ClassVar[bool] = True
@@ -65,12 +65,12 @@ class Remote(System):
 
     @property
     def clients(self) -> list[str]:
-        """The names of the clients that are connected now."""
+        """The names of the clients that are connected."""
         return [client.name for client in tuple(self._open().clients) if client.here]
 
     @property
     def workers(self) -> int:
-        """Simulations that run side by side: one for each client that is connected now."""
+        """Number of simulations that run in parallel: one for each connected client."""
         return max(1, len(self.clients))
 
     def abstract(self, features: Features) -> Trace | None:
@@ -86,7 +86,7 @@ class Remote(System):
     def simulate_each(
         self, features: Sequence[Features], seeds: Sequence[int]
     ) -> Iterator[tuple[int, Outcome]]:
-        """Simulate each row by some client; see `System.simulate_each`.
+        """Simulate each row on some client; see `System.simulate_each`.
 
         **Raises:** `TypeError` for features that JSON cannot hold; `ConnectionError` if the server
         is closed meanwhile.
@@ -108,7 +108,7 @@ class Remote(System):
             batch.cancelled = True
 
     def close(self) -> None:
-        """Send the clients away and close the port; the next simulation opens it again."""
+        """Disconnect the clients and close the port; the next simulation opens it again."""
         with self._lock:
             server, self._server = self._server, None
         if server is not None:
@@ -153,31 +153,32 @@ def remote(
     max_bytes: int = MAX_BYTES,
     max_memory: int = MAX_MEMORY,
 ) -> Remote:
-    """Make a system that programs simulate which connect to this one.
+    """Make a system that is simulated by programs that connect to this process.
 
     **Arguments:**
-    - `host`: the address to listen at; this machine only when left out, `"localhost"` by IPv4 and
-      IPv6. Anything else needs a token.
-    - `port`: 0 for any that is free, see `Remote.address`.
-    - `token`: a secret that clients have to know. Without one, whoever can open a connection on
+    - `host`: the address to listen on; by default only this machine, `"localhost"` with IPv4 and
+      IPv6. Any other address needs a token.
+    - `port`: the port; 0 for any free one, see `Remote.address`.
+    - `token`: a secret that clients have to send. Without one, every program that can connect on
       this machine may answer.
-    - `certificate`: a PEM file with a certificate, by which connections are encrypted (TLS) and
-      clients know that this is the run; not encrypted when None.
-    - `private_key`: a PEM file with the certificate's key, where `certificate` does not hold it.
-    - `timeout`: seconds of wall clock for one simulation, after which it is a row with status
-      `timeout` and its client is sent away; None for no limit.
-    - `retries`: how often a point is handed out again if the client vanishes that simulates it.
-    - `patience`: seconds without any client after which the points that are left become rows with
-      status `error`; waits, and says so in the log, when left out.
+    - `certificate`: a PEM file with a certificate. Connections are then encrypted (TLS), and
+      clients can verify that they reached this run; not encrypted when None.
+    - `private_key`: a PEM file with the certificate's key, if `certificate` does not contain it.
+    - `timeout`: wall-clock seconds for one simulation, after which it becomes a row with status
+      `timeout` and its client is disconnected; None for no limit.
+    - `retries`: how often a point is sent again if its client disconnects.
+    - `patience`: seconds without any client after which the remaining points become rows with
+      status `error`; by default it waits, and logs that it does.
     - `signals`, `dt`, `length`: the form of every trace; see `blackbox.TraceForm`. A client that
-      sends another gets an error, and the row has status `error`.
+      sends another form gets an error, and the row has status `error`.
     - `max_bytes`: the maximum number of bytes of one message from a client.
-    - `max_memory`: bytes of unfinished messages of all clients together, at least `max_bytes`;
-      beyond it the client whose message began first is sent away, and may come back.
-    **Returns:** a `Remote`, which listens once it is needed, or in a `with` statement.
+    - `max_memory`: maximum bytes of unfinished messages of all clients together, at least
+      `max_bytes`; beyond it the client with the oldest unfinished message is disconnected, and may
+      reconnect.
+    **Returns:** a `Remote`; it starts listening when it is needed, or in a `with` statement.
     **Raises:** `ValueError` for options out of range, an address beyond this machine without a
-    token, files that are no certificate; when it is first needed, `OSError` for a port that is
-    taken.
+    token, and files that are not certificates; when it is first needed, `OSError` for a port in
+    use.
     """
     if not isinstance(host, str) or not host:
         raise ValueError(f"host must be a name or an address, such as '127.0.0.1'; got {host!r}")

@@ -42,7 +42,7 @@ REMEMBERED = 4096
 
 @dataclass(frozen=True)
 class Rules:
-    """The demands of a server on its clients; see `remote`."""
+    """The requirements of a server on its clients; see `remote`."""
 
     token: str | None
     timeout: float | None
@@ -56,7 +56,7 @@ class Rules:
 
 @dataclass(eq=False)
 class Batch:
-    """The points of one call, whose outcomes go to the caller's thread."""
+    """The points of one call, whose outcomes are passed to the caller's thread."""
 
     outcomes: queue.SimpleQueue[Any] = field(default_factory=queue.SimpleQueue)
     cancelled: bool = False
@@ -64,9 +64,9 @@ class Batch:
 
 @dataclass(eq=False)
 class Point:
-    """One simulation: the place for its outcome, and its history so far.
+    """One simulation: its outcome, once known, and its history so far.
 
-    `what` stands for its features and seed: the same number, the same simulation.
+    `what` identifies its features and seed: equal numbers mean equal simulations.
     """
 
     id: int
@@ -107,25 +107,25 @@ class Client:
 
     @property
     def held(self) -> int:
-        """The bytes that are kept for it: of an unfinished message, and of what it has not read."""
+        """Number of buffered bytes: of an unfinished message, and of data it has not read."""
         return len(self.frames) + len(self.out)
 
     @property
     def here(self) -> bool:
-        """True where points may be handed to it."""
+        """True if points may be sent to it."""
         return self.greeted and not self.leaving
 
     @property
     def room(self) -> int:
-        """The number of further points that it may have now."""
+        """Number of further points that it can take now."""
         return min(self.window, self.capacity) - len(self.has)
 
     def running(self) -> list[Point]:
-        """Return the points that it is simulating now, if it keeps their order."""
+        """Return the points that it is simulating now, if it answers in order."""
         return list(itertools.islice(self.has.values(), self.parallel))
 
     def hello(self, rules: Rules) -> None:
-        """Tell the client what is expected of it."""
+        """Tell the client the requirements."""
         about = {
             "type": "hello",
             "protocol": wire.PROTOCOL,
@@ -138,9 +138,9 @@ class Client:
         self.out += wire.frame(about)
 
     def greet(self, hello: dict[str, Any], rules: Rules) -> None:
-        """Take up the client's hello: its capacity, name and token.
+        """Process the client's greeting: its capacity, name and token.
 
-        **Raises:** `WireError` for a client that cannot be used, or does not know the token.
+        **Raises:** `WireError` for a client that cannot be used, or that sends a wrong token.
         """
         if hello.get("protocol") != wire.PROTOCOL:
             spoken = wire.brief(hello.get("protocol"))
@@ -176,7 +176,7 @@ class Client:
             raise wire.WireError("the token is wrong")
 
     def hand(self, points: list[Point], now: float) -> None:
-        """Hand points to the client to simulate."""
+        """Send points to the client to simulate."""
         for point in points:
             if not self.has:
                 self.progress = now
@@ -190,7 +190,7 @@ class Client:
                 texts = []
 
     def done(self, point: Point, now: float) -> None:
-        """Take back a point that the client has answered."""
+        """Remove a point that the client has answered."""
         del self.has[point.id]
         self.answered[point.id] = None
         if len(self.answered) > REMEMBERED:
@@ -202,7 +202,7 @@ class Client:
             self.window = max(self.window - 1, self.parallel)
 
     def overdue(self, now: float, timeout: float) -> list[Point]:
-        """Return the points that it has worked on for longer than the timeout."""
+        """Return the points whose simulation exceeds the timeout."""
         running = self.running()
         if now - self.progress > timeout:
             # It shows no progress, so all that it is simulating takes too long.
@@ -217,7 +217,7 @@ class Client:
     def tell(
         self, message: str, number: int | None = None, fatal: bool = False, retry: bool = False
     ) -> None:
-        """Send the client an error; with `retry` one that will not be there another time."""
+        """Send the client an error; with `retry` one that may be gone at the next attempt."""
         about = {"type": "error", "message": message, "id": number, "fatal": fatal}
         if retry:
             about["retry"] = True
@@ -225,13 +225,13 @@ class Client:
 
     @property
     def waits_to_send(self) -> bool:
-        """True where room to send is worth waiting for."""
+        """True if there is data to send, which waits for the socket."""
         return (bool(self.out) and not self._sends_after_reading) or self.reads_after_sending
 
     def receive(self) -> bytes | None:
-        """Return received bytes; empty at the end of the connection, None if nothing has come.
+        """Return received bytes; empty at the end of the connection, None if nothing has arrived.
 
-        **Raises:** `OSError` if it has vanished.
+        **Raises:** `OSError` if the client has disconnected.
         """
         self.reads_after_sending = False
         try:
@@ -247,9 +247,9 @@ class Client:
         return data
 
     def flush(self) -> None:
-        """Send as much as the socket takes.
+        """Send as much as the socket accepts.
 
-        **Raises:** `OSError` if it has vanished.
+        **Raises:** `OSError` if the client has disconnected.
         """
         self._sends_after_reading = False
         if self.out:
@@ -264,7 +264,7 @@ class Client:
 
 
 def keep_alive(sock: socket.socket) -> None:
-    """Let the operating system notice a peer whose machine is gone, within half a minute."""
+    """Make the operating system detect within half a minute that a peer's machine is gone."""
     sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
     sock.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
     # Not every system has each of them.
@@ -281,24 +281,24 @@ REMINDER = 10.0
 
 
 class Absence:
-    """The time since the last client left; the log reports it now and then."""
+    """The time since the last client disconnected; the log reports it now and then."""
 
     def __init__(self) -> None:
         self.since: float | None = None
         self._next = REMINDER
 
     def end(self) -> None:
-        """Note that a client is connected, or that no client is needed."""
+        """Record that a client is connected, or that no client is needed."""
         self.since, self._next = None, REMINDER
 
     def seconds(self, now: float) -> float:
-        """Return how long no client has been there."""
+        """Return for how many seconds no client has been connected."""
         if self.since is None:
             self.since = now
         return now - self.since
 
     def remind(self, seconds: float, host: str, port: int) -> None:
-        """Say in the log what to start, if it is time to."""
+        """Log which client to start, if it is time for a reminder."""
         if seconds <= self._next:
             return
         self._next += min(self._next, 60.0)
@@ -315,12 +315,12 @@ File = str | os.PathLike[str]
 
 
 def server_context(certificate: File, private_key: File | None) -> ssl.SSLContext:
-    """Return the settings of a server that shows a certificate.
+    """Return the TLS settings of a server with a certificate.
 
     **Arguments:**
-    - `certificate`: a PEM file with the certificate, and those between it and its authority.
-    - `private_key`: a PEM file with its key; the same file when None. The key is not encrypted.
-    **Raises:** `ValueError` for files that are not there, or hold no such thing.
+    - `certificate`: a PEM file with the certificate, and intermediate ones.
+    - `private_key`: a PEM file with its key, not encrypted; the same file when None.
+    **Raises:** `ValueError` for files that do not exist, or contain no certificate or key.
     """
     for name, file in (("certificate", certificate), ("private_key", private_key)):
         if file is not None and not Path(file).is_file():

@@ -65,7 +65,7 @@ class Server(threading.Thread):
         self._tell((batch, texts))
 
     def stop(self) -> None:
-        """Send all clients away and end the thread."""
+        """Disconnect all clients and end the thread."""
         if self.is_alive():
             self._tell(None)
             # Garbage is collected in any thread, in this one, too.

@@ -29,11 +29,11 @@ _LENGTH = struct.Struct(">I")
 
 
 class WireError(ValueError):
-    """An error of a message that the protocol does not allow."""
+    """An error for a message that violates the protocol."""
 
 
 class Message(NamedTuple):
-    """One frame: its JSON, its raw bytes, and numbers in it that JSON does not have (`NaN`)."""
+    """One frame: its JSON, its raw bytes, and its numbers that JSON does not have (`NaN`)."""
 
     header: dict[str, Any]
     raw: bytes
@@ -41,13 +41,13 @@ class Message(NamedTuple):
 
 
 def frame(message: Mapping[str, Any] | bytes) -> bytes:
-    """Return a message without raw bytes, or its JSON, ready to be sent."""
+    """Return a message without raw bytes, or its JSON, ready to send."""
     text = message if isinstance(message, bytes) else to_text(message).encode()
     return _LENGTH.pack(len(text)) + text
 
 
 def to_text(value: object) -> str:
-    """Write JSON in one line; a number that JSON does not have becomes null."""
+    """Write JSON in one line; numbers that JSON does not have become null."""
     try:
         return json.dumps(value, separators=(",", ":"), allow_nan=False)
     except ValueError:
@@ -55,9 +55,9 @@ def to_text(value: object) -> str:
 
 
 class Frames:
-    """A stream of bytes, cut into messages as they arrive.
+    """A stream of bytes, split into messages as they arrive.
 
-    - `max_bytes`: how many bytes a frame may have, raw ones included.
+    - `max_bytes`: maximum number of bytes in a frame, including raw ones.
     """
 
     def __init__(self, maximum: int) -> None:
@@ -68,9 +68,10 @@ class Frames:
         self._decoder = json.JSONDecoder(parse_constant=self._note)
 
     def feed(self, data: bytes) -> Iterator[Message]:
-        """Yield the whole messages among the bytes that have come so far.
+        """Yield the complete messages among the bytes received so far.
 
-        **Raises:** `WireError` for anything else. Later bytes cannot be understood either.
+        **Raises:** `WireError` for an invalid message, after which later bytes cannot be read
+        either.
         """
         self._bytes += data
         at = 0
@@ -234,12 +235,12 @@ def _is_integer(value: object) -> bool:
 
 
 def unknown_type(kind: object, known: Iterable[str]) -> WireError:
-    """Return the error for a message of a type that is not `known`."""
+    """Return the error for a message whose type is not `known`."""
     return WireError(str(unknown_name("type of message", printable(kind), known)))
 
 
 def brief(value: object) -> str:
-    """Write a value short enough for a message."""
+    """Write a value in a form short enough for a message."""
     try:
         text = ascii(value)
     except ValueError:  # An integer of more digits than Python prints.
@@ -248,7 +249,7 @@ def brief(value: object) -> str:
 
 
 def printable(value: object, maximum: int = 80) -> str:
-    """Write a stranger's text in one line that cannot garble a log or a terminal."""
+    """Write an untrusted text in one line that cannot affect a log or a terminal."""
     text = value if isinstance(value, str) else brief(value)
     text = "".join(c if c.isprintable() else " " for c in text[: maximum + 1])
     return text if len(text) <= maximum else text[: maximum - 3] + "..."

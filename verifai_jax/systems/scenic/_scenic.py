@@ -34,31 +34,31 @@ def scenic(
     scenario: str | None = None,
     features: Mapping[str, Domain] | None = None,
 ) -> ScenicProgram:
-    """Compile a Scenic program to a feature space and a function of JAX.
+    """Compile a Scenic program to a feature space and a JAX function.
 
         scene = vj.scenic("cones.scenic", params={"weather": "rain"})
         vj.Problem("cones", space=scene.space, system=scene.system(simulate), spec="always gap > 1")
 
-    Each random value becomes a feature by the inverse of its cumulative distribution, with the name
-    of the property or parameter that it feeds. What has no inverse (mutations, points in regions
-    that are random or no polygons, distributions of one's own) shares a coordinate `seed`, which is
-    the only one where a program draws nothing before it runs. A soft
-    requirement, `require[p]`, is a feature that is on or off; it is on with probability p among the
-    scenes that are accepted, as in Scenic.
+    Each random value becomes a feature, with the name of the property or parameter that it sets,
+    through its inverse cumulative distribution. Values without an inverse (mutations, points in
+    random or non-polygonal regions, custom distributions) share a coordinate `seed`; it is the only
+    one for a program that draws nothing before it runs. A soft requirement, `require[p]`, is an
+    on/off feature; it is on with probability p among the accepted scenes, as in Scenic.
 
     **Arguments:**
     - `program`: path of a `.scenic` file, or the code of a program.
-    - `mode2D`: Scenic's planar mode. In three dimensions features are the same, but Scenic computes
-      every scene, in Python.
+    - `mode2D`: whether to use Scenic's planar mode. In three dimensions features are the same, but
+      Scenic computes every scene in Python.
     - `params`: global parameters to override.
-    - `model`: Scenic module to use as world model.
-    - `scenario`: name of the modular scenario to compile, where there are several.
-    - `features`: domains by name, in addition to what the program draws. It reads their values as
-      global parameters while it runs: with `{"push": vj.Reactive({"gap": (0, 50)})}` a behavior
-      asks `globalParameters.push(gap=...)` at each step, and a search learns how to answer.
+    - `model`: Scenic module to use as the world model.
+    - `scenario`: name of the modular scenario to compile, if there are several.
+    - `features`: domains by name, in addition to the random values of the program. The program
+      reads their values as global parameters while it runs: with `{"push": vj.Reactive({"gap": (0,
+      50)})}` a behavior calls `globalParameters.push(gap=...)` at each step, and a search learns
+      how to react.
     **Raises:** `MissingExtra` without Scenic; `ProgramError` for a program that does not compile,
-    with Scenic's message, file and line, and for one that draws nothing at random; `ValueError`
-    for a feature whose name the program has taken.
+    with Scenic's message, file and line, and for one without random values; `ValueError` for a
+    feature whose name the program uses.
     """
     recipe = Recipe.of(program, mode2D, params or {}, model, scenario)
     compiled, sampling = recipe.compiled()

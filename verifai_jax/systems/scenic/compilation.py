@@ -23,17 +23,17 @@ from verifai_jax.core.messages.errors import require
 
 
 class ProgramError(ValueError):
-    """A Scenic program that does not compile: Scenic's own message, with file and line."""
+    """An error for a Scenic program that does not compile: Scenic's message, with file and line."""
 
 
 @dataclass(frozen=True, eq=False)
 class Compiled:
-    """A program as Scenic has compiled it.
+    """A program compiled by Scenic.
 
     - `scenario`: Scenic's `Scenario`.
     - `namespace`: the variables of the program, by name.
-    - `source`: its text.
-    - `filename`: as Scenic's messages name it.
+    - `source`: the text of the program.
+    - `filename`: the name of its file in Scenic's messages.
     """
 
     scenario: Any
@@ -43,7 +43,7 @@ class Compiled:
 
     @property
     def names(self) -> dict[int, str]:
-        """Names of the program's own variables, by the identity of what they hold."""
+        """Names of the program's own variables, by the identity of their values."""
         core = sys.modules["scenic.core.distributions"]
         held: dict[int, str] = {}
         parts = self.scenario.dynamicScenario
@@ -64,13 +64,13 @@ def compile_program(
     """Compile a Scenic program.
 
     **Arguments:**
-    - `program`: path of a `.scenic` file, or the code of a program, which has several lines or a
-      space.
-    - `mode2D`: of Scenic: objects lie in the plane.
+    - `program`: path of a `.scenic` file, or the code of a program, recognised by line breaks or
+      spaces.
+    - `mode2D`: Scenic's planar mode, in which objects lie in the plane.
     - `params`: global parameters to override.
     - `model`: Scenic module to use as world model instead of the program's own.
-    - `scenario`: name of the modular scenario to compile, where there are several.
-    **Raises:** `MissingExtra` without Scenic; `ProgramError` for a program that is not there or
+    - `scenario`: name of the modular scenario to compile, if there are several.
+    **Raises:** `MissingExtra` without Scenic; `ProgramError` for a program that does not exist or
     does not compile.
     """
     hook = sys.excepthook
@@ -165,7 +165,7 @@ def _message(error: BaseException, filename: str, source: str) -> str:
 
 
 def describe_error(error: BaseException) -> str:
-    """Return the kind of an error and its message, or the line that raised it where it has none."""
+    """Return the type of an error and its message, or its source line if it has no message."""
     return f"{type(error).__name__}: {str(error).strip() or _raised_at(error)}"
 
 

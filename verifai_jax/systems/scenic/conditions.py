@@ -54,7 +54,7 @@ CALLS = ("abs", "min", "max", "sin", "cos", "tan", "sqrt", "hypot", "floor", "ex
 
 
 def conditions(compiled: Compiled) -> dict[int, ast.AST]:
-    """Return the conditions of the program's `require`s by their lines, as Scenic parses them."""
+    """Return the conditions of the program's `require` statements by line, as parsed by Scenic."""
     parser: Any = sys.modules["scenic.syntax.parser"]
     tree = parser.parse_string(compiled.source, "exec", filename=compiled.filename)
     found: list[Any] = [node for node in ast.walk(tree) if type(node).__name__ == "Require"]
@@ -65,10 +65,10 @@ class Condition:
     """The condition of one `require`, as a function of traced values.
 
     **Arguments:**
-    - `requirement`: Scenic's compiled one.
-    - `tree`: its parsed condition.
+    - `requirement`: the requirement as compiled by Scenic.
+    - `tree`: the parsed condition.
     - `compiled`: the program.
-    **Raises:** `Unsupported` for one of another file, whose text is not at hand.
+    **Raises:** `Unsupported` for a condition in another file, whose text is not available.
     """
 
     def __init__(self, requirement: Any, tree: ast.AST, compiled: Compiled) -> None:

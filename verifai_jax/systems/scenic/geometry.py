@@ -19,7 +19,7 @@ CORNERS = 128
 
 
 class Rectangle(NamedTuple):
-    """A rectangle: its centre, its heading with cosine and sine, and its half sizes."""
+    """A rectangle: its centre, its heading with cosine and sine, and its half extents."""
 
     x: Any
     y: Any
@@ -43,7 +43,7 @@ class Rectangle(NamedTuple):
 
 
 def rectangle_of(body: Body) -> Rectangle:
-    """Return the rectangle that an object covers."""
+    """Return the rectangle covered by an object."""
     position = as_vec(body.get("position"))
     yaw = jnp.asarray(body.get("orientation").angle, jnp.result_type(float))
     return Rectangle(
@@ -58,7 +58,7 @@ def rectangle_of(body: Body) -> Rectangle:
 
 
 def boxes_apart(one: Rectangle, other: Rectangle) -> Bool[Array, ""]:
-    """Return whether two rectangles have no point in common (separating axes)."""
+    """Return whether two rectangles have no common point (separating axes)."""
     dx, dy = other.x - one.x, other.y - one.y
     cos = jnp.abs(one.cos * other.cos + one.sin * other.sin)
     sin = jnp.abs(one.cos * other.sin - one.sin * other.cos)
@@ -72,7 +72,7 @@ def boxes_apart(one: Rectangle, other: Rectangle) -> Bool[Array, ""]:
 
 
 def edges_of(polygons: Any) -> Float[np.ndarray, "n 2 2"]:
-    """Return the edges of Shapely's polygons, those of holes too."""
+    """Return the edges of Shapely polygons, including those of holes."""
     edges = []
     for polygon in getattr(polygons, "geoms", [polygons]):
         for ring in (polygon.exterior, *polygon.interiors):
@@ -82,7 +82,7 @@ def edges_of(polygons: Any) -> Float[np.ndarray, "n 2 2"]:
 
 
 def is_convex(polygons: Any) -> bool:
-    """Return whether Shapely's polygons are one without holes or dents."""
+    """Return whether Shapely polygons are a single convex one without holes."""
     parts = list(getattr(polygons, "geoms", [polygons]))
     if len(parts) != 1 or len(parts[0].interiors):
         return False
@@ -90,7 +90,7 @@ def is_convex(polygons: Any) -> bool:
 
 
 def point_inside(x: Any, y: Any, edges: Float[np.ndarray, "n 2 2"]) -> Bool[Array, ""]:
-    """Return whether a point lies in polygons: it sees an odd number of edges to its right."""
+    """Return whether a point lies in polygons: an odd number of edges lies to its right."""
     (x1, y1), (x2, y2) = edges[:, 0].T, edges[:, 1].T
     spans = (y1 > y) != (y2 > y)
     level = np.where(y1 == y2, 1.0, y2 - y1)
@@ -102,7 +102,7 @@ def box_inside(box: Rectangle, edges: Float[np.ndarray, "n 2 2"], convex: bool) 
     """Return whether a rectangle lies in polygons.
 
     **Arguments:**
-    - `convex`: True for one convex polygon, whose corners decide.
+    - `convex`: True for a single convex polygon, for which testing the corners suffices.
     """
     corners = box.corners
     if convex:
@@ -135,11 +135,12 @@ def _crosses(box: Rectangle, edges: Float[np.ndarray, "n 2 2"]) -> Bool[Array, "
 
 
 def sees_all_around(x: Any, y: Any, radius: Any, box: Rectangle) -> Bool[Array, ""]:
-    """Return whether a rectangle meets the disc around a point, as Scenic's polygon has it.
+    """Return whether a rectangle meets the disc around a point, a polygon as in Scenic.
 
-    Separating axes: those of the rectangle, and the normals of the polygon's edges. How far the
-    rectangle lies along a direction is concave in the direction wherever it is positive, and
-    greatest towards its nearest point, so the two normals next to that one decide.
+    It tests separating axes: those of the rectangle, and the normals of the polygon's edges. The
+    distance of the rectangle along a direction is, where positive, concave in the direction, with
+    its maximum towards the rectangle's nearest point. So the two normals next to that direction
+    decide.
     """
     step = 2 * math.pi / CORNERS
     dx, dy = box.x - x, box.y - y

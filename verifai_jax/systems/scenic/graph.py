@@ -18,7 +18,7 @@ PIECEWISE = ("PolygonalRegion", "PolylineRegion")
 
 
 def field(node: Any, name: str) -> Any:
-    """Return an attribute of a node as it is stored; None without one."""
+    """Return an attribute of a node as stored; None if it has none."""
     return vars(node).get(name)
 
 
@@ -28,16 +28,15 @@ def kind_of(node: Any) -> str:
 
 
 def is_random(value: Any) -> bool:
-    """Return whether a value is drawn anew in each scene."""
+    """Return whether a value differs from scene to scene."""
     return bool(sys.modules["scenic.core.distributions"].needsSampling(value))
 
 
 def law(node: Any) -> Any:
-    """Return the node that says how this one is computed.
+    """Return the node that defines how this one is computed.
 
-    Scenic replaces points in regions by points in the feasible part of them, of which there may be
-    no inverse. Then the whole region is taken, as it is where it has coordinates of its own; the
-    requirements refuse the rest.
+    Scenic replaces points in a region by points in its feasible part, which may have no inverse.
+    Then the whole region is used, if it has coordinates; the requirements refuse the other points.
     """
     conditioned = field(node, "_conditioned")
     if conditioned is None or conditioned is node:
@@ -55,13 +54,13 @@ def _is_fixed_pieces(region: Any) -> bool:
 
 
 def children(node: Any) -> tuple[Any, ...]:
-    """Return what a random node depends on."""
+    """Return the nodes on which a random node depends."""
     dependencies = field(law(node), "_dependencies")
     return () if dependencies is None else tuple(dependencies)
 
 
 def nodes(roots: Iterable[Any]) -> list[Any]:
-    """Return the random nodes below some roots, each once, after all that it depends on."""
+    """Return the random nodes below some roots, each once, after all its dependencies."""
     order: list[Any] = []
     seen: set[int] = set()
     stack = [(root, False) for root in reversed(list(roots))]
@@ -77,5 +76,5 @@ def nodes(roots: Iterable[Any]) -> list[Any]:
 
 
 def is_constructed(node: Any) -> bool:
-    """Return whether a node is an object or a point that the program has made by `new`."""
+    """Return whether a node is an object or a point made by `new` in the program."""
     return isinstance(node, sys.modules["scenic.core.object_types"].Constructible)

@@ -13,12 +13,12 @@ from verifai_jax.systems.scenic.graph import field, is_random, kind_of, law
 
 
 def leaf_of(node: Any, name: str, options: Sequence[Any] | None = None) -> leaves.Leaf | None:
-    """Return a random node as a leaf with an inverse; None for one that has none.
+    """Return a random node as a leaf with an inverse; None if it has no inverse.
 
     **Arguments:**
-    - `node`: in Scenic's graph.
+    - `node`: the node in Scenic's graph.
     - `name`: the name of the leaf.
-    - `options`: what the node selects from, for a selector.
+    - `options`: the options of a selector node.
     """
     drawn = law(node)
     match kind_of(drawn):

@@ -32,15 +32,15 @@ LABEL = 24
 
 
 class NothingToDrawError(ValueError):
-    """A leaf that has no value in this scene, such as a choice from an empty list."""
+    """An error for a leaf without a value in this scene, such as a choice from an empty list."""
 
 
 @dataclass(frozen=True, eq=False)
 class Leaf(abc.ABC):
-    """A place where a program draws at random.
+    """A random value that a program draws.
 
-    - `node`: in Scenic's graph.
-    - `name`: that a person recognises.
+    - `node`: its node in Scenic's graph.
+    - `name`: a name that a user recognises.
     - `domains`: its features by name, one for each unit coordinate.
     """
 
@@ -56,13 +56,13 @@ class Leaf(abc.ABC):
 
         **Arguments:**
         - `parts`: features of this leaf, by name.
-        - `given`: values of what it depends on.
-        - `xp`: `numpy` or `jax.numpy`, which computes.
+        - `given`: values of the nodes on which it depends.
+        - `xp`: the array module, `numpy` or `jax.numpy`.
         """
 
     @abc.abstractmethod
     def invert(self, value: Any, given: Given) -> dict[str, Any]:
-        """Return the features at which the value is this one."""
+        """Return the features at which the leaf has this value."""
 
     @property
     def feature(self) -> str:
@@ -81,7 +81,7 @@ class Number(Leaf):
 
 
 class Share(Leaf):
-    """A number between ends that are random themselves: its feature is the share of the way."""
+    """A number between random ends; its feature is the relative position between them."""
 
     def draw(self, parts: Parts, given: Given, xp: Any) -> Any:
         low, high = (given(field(law(self.node), end)) for end in ("low", "high"))
@@ -93,7 +93,7 @@ class Share(Leaf):
 
 
 class Deviation(Leaf):
-    """A normal number with a random mean or width: its feature counts standard deviations."""
+    """A normal number with a random mean or width; its feature counts standard deviations."""
 
     def draw(self, parts: Parts, given: Given, xp: Any) -> Any:
         mean, std = (given(field(law(self.node), part)) for part in ("mean", "stddev"))
@@ -124,7 +124,7 @@ class TruncatedShare(Leaf):
 
 
 class Histogram(Leaf):
-    """A number that is uniform within each of several cells of one width."""
+    """A number that is uniform within each of several cells of equal width."""
 
     def _edges(self) -> tuple[np.ndarray, np.ndarray]:
         node = law(self.node)
@@ -142,7 +142,7 @@ class Histogram(Leaf):
 
 @dataclass(frozen=True, eq=False)
 class Series(Leaf):
-    """A value of each step, `TimeSeries(VerifaiRange(0, 1))`: an array of what one draw takes.
+    """A value for each step, `TimeSeries(VerifaiRange(0, 1))`: an array of draws of one leaf.
 
     - `one`: the leaf of one step.
     """
@@ -165,12 +165,12 @@ class Series(Leaf):
 
 @dataclass(frozen=True)
 class SeriesValue:
-    """The value of a `TimeSeries` in a program: `getSample()` returns that of this step."""
+    """The value of a `TimeSeries` in a program; `getSample()` returns that of the present step."""
 
     steps: tuple[Any, ...]
 
     def getSample(self) -> Any:
-        """Return the value of the simulation's current step.
+        """Return the value at the simulation's current step.
 
         **Raises:** `RuntimeError` outside a simulation, and beyond the last step.
         """
@@ -191,7 +191,7 @@ class SeriesValue:
 class Chosen(Leaf):
     """An integer, or the index of an option.
 
-    - `values`: what the feature's choices stand for; None if the feature is the integer.
+    - `values`: the values of the feature's choices; None if the feature is the integer.
     """
 
     values: tuple[int, ...] | None = None
@@ -217,7 +217,7 @@ class Chosen(Leaf):
 
 
 class ChoiceIndex(Leaf):
-    """An integer between ends that are random, or far apart: its feature is a share of the way."""
+    """An integer between random or distant ends; its feature is the relative position."""
 
     def _ends(self, given: Given, xp: Any) -> tuple[Any, Any]:
         node = law(self.node)
@@ -272,9 +272,9 @@ class InRectangle(Leaf):
 
 
 class InSector(Leaf):
-    """A point in a disc or a sector: the share of its area within, and the angle.
+    """A point in a disc or a sector; its features are the share of the area within, the angle.
 
-    The angle is the share of the way from one side to the other, counterclockwise.
+    The angle is measured as a share of the sector, counterclockwise.
     """
 
     is_point = True
@@ -306,7 +306,7 @@ class InSector(Leaf):
 
 @dataclass(frozen=True, eq=False)
 class InPolygon(Leaf):
-    """A point in polygons: the triangle by its share of the area, and two shares in it.
+    """A point in polygons: the triangle, by its share of the area, and two coordinates in it.
 
     - `triangles`: `[n, 3, 2]`.
     - `cumulative`: shares of the area up to each triangle, `[n]`.
@@ -345,9 +345,9 @@ class InPolygon(Leaf):
 
 @dataclass(frozen=True, eq=False)
 class OnPolyline(Leaf):
-    """A point on a polyline: its feature is the length of the way to it, in metres.
+    """A point on a polyline; its feature is the length along the line in metres.
 
-    - `starts`, `ends`: of the segments, `[n, 2]`.
+    - `starts`, `ends`: those of the segments, `[n, 2]`.
     - `cumulative`: length up to the end of each segment, `[n]`.
     """
 
@@ -357,7 +357,7 @@ class OnPolyline(Leaf):
     is_point = True
 
     def segment(self, along: Any, xp: Any) -> Any:
-        """Return the index of the segment that a point lies on."""
+        """Return the index of the segment on which a point lies."""
         index = xp.searchsorted(xp.asarray(self.cumulative), along, side="right")
         return xp.clip(index, 0, len(self.starts) - 1)
 

@@ -90,7 +90,7 @@ FUNCTIONS: dict[str, Callable[..., Any]] = {
 
 
 class Tracer:
-    """Values of the nodes of one program at features, as JAX traces them."""
+    """Values of a program's nodes at given features, as traced by JAX."""
 
     def __init__(self, sampling: Sampling) -> None:
         self.sampling = sampling
@@ -101,7 +101,7 @@ class Tracer:
 
 
 class Values:
-    """Values of nodes at one point; each computed once."""
+    """Values of nodes at one point, each computed once."""
 
     def __init__(self, sampling: Sampling, features: Mapping[str, Any]) -> None:
         self.sampling, self.features = sampling, features
@@ -126,7 +126,7 @@ class Values:
         return known
 
     def body(self, node: Any) -> Body:
-        """Return an object, random or not."""
+        """Return an object, whether or not it is random."""
         if id(node) in self.sampling.seeded:
             raise Unsupported(self.sampling.seeded[id(node)])
         source = law(node) if is_random(node) else node
@@ -288,7 +288,7 @@ def _height(node: Any) -> float:
 
 
 def as_output(value: Any) -> Any:
-    """Return a value as one number for a system; the index of an option that is not a number.
+    """Return a value as one number for a system; for an option that is not a number, its index.
 
     **Raises:** `Unsupported` for anything else.
     """

@@ -34,8 +34,8 @@ def owner_names(
     """Return the names of the objects and points that a program makes by `new`, by identity.
 
     **Arguments:**
-    - `scenario`: Scenic's.
-    - `variables`: names of variables by the identity of what they hold.
+    - `scenario`: Scenic's `Scenario`.
+    - `variables`: names of variables by the identity of their values.
     """
     owners: list[Any] = []
     random_owners = [node for node in order if is_constructed(node)]
@@ -69,7 +69,7 @@ def owner_names(
 def leaf_names(
     scenario: Any, owners: Mapping[int, str], variables: Mapping[int, str], order: list[Any]
 ) -> dict[int, str]:
-    """Return a name for each random node that is not an object, by identity; all are different."""
+    """Return a unique name for each random node that is not an object, by identity."""
     found: dict[int, str] = {}
     made = [node for node in (*field(scenario, "_instances"), *order) if id(node) in owners]
     for owner in made:
@@ -94,7 +94,7 @@ def leaf_names(
 
 
 def unique(name: str, taken: Iterable[str]) -> str:
-    """Return a name that is not taken, if necessary with a number appended."""
+    """Return the name, with a number appended if it is taken."""
     known = set(taken)
     if name not in known:
         return name

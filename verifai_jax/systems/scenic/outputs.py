@@ -52,7 +52,7 @@ class Outputs:
     """The numbers of a scene as a function of its features.
 
     - `objects`: names of the numbers of each object, and of the parameters.
-    - `in_python`: names of those that Scenic computes, with the reason.
+    - `in_python`: names of the numbers that Scenic computes in Python, with the reason.
     """
 
     def __init__(self, sampling: Sampling, planar: bool) -> None:

@@ -30,7 +30,7 @@ HostSystem = BlackBox | PooledBlackBox | VectorisedBlackBox
 
 
 class SceneSystem(System):
-    """A system of compiled scenes: `function(scene, key) -> Trace` as a function of features."""
+    """A function of scenes, `function(scene, key) -> Trace`, as a system with features."""
 
     def __init__(self, scenes: Outputs, function: Callable[..., Trace]) -> None:
         self.scenes, self.function = scenes, function
@@ -48,12 +48,12 @@ class SceneSystem(System):
 class ScenicProgram:
     """A compiled Scenic program; made by `scenic`.
 
-    - `space`: one named feature for each random value; its constraint is the requirements. Uniform
-      points that it accepts are Scenic's own distribution.
+    - `space`: one named feature for each random value; its constraint is the program's
+      requirements. Uniform points that it accepts have the distribution of Scenic's scenes.
     - `objects`: names of the numbers of each object, and of the global parameters (`params`).
     - `seeded`: random values without an inverse, which share the coordinate `seed`.
-    - `in_python`: numbers that Scenic computes, in Python, with the reason.
-    - `by_scenic`: requirements that Scenic decides, in Python, with the reason.
+    - `in_python`: numbers that Scenic computes in Python, with the reason.
+    - `by_scenic`: requirements that Scenic checks in Python, with the reason.
     - `scenario`: Scenic's `Scenario`.
     """
 
@@ -70,30 +70,29 @@ class ScenicProgram:
 
     @property
     def compiled(self) -> bool:
-        """True where every number of a scene is a function of JAX."""
+        """True if every number of a scene is computed by JAX."""
         return not self.in_python
 
     def scenes(self, features: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
         """Return the numbers of a scene: `{"ego": {"x": ..., "y": ..., "heading": ...}, ...}`.
 
-        Pure JAX; `jax.vmap` it for batches. Positions are in metres, headings in radians,
-        counterclockwise from the y axis, as in Scenic. Global parameters come under `params`; an
-        option that is not a number comes as its index. What has no meaning in JAX (`in_python`) is
-        computed by Scenic, without derivatives.
+        Pure JAX; use `jax.vmap` for batches. Positions are in metres, headings in radians,
+        counterclockwise from the y axis, as in Scenic. Global parameters are under `params`; an
+        option that is not a number is given by its index. Values that JAX cannot compute
+        (`in_python`) are computed by Scenic, without derivatives.
 
         **Arguments:**
-        - `features`: as `space.unflatten` gives them, or as a person writes them and `features_of`
-          gives them.
+        - `features`: as returned by `space.unflatten`, or by `features_of` for a scene.
         **Raises:** `ValueError` for features whose names or shapes are not those of the space.
         """
         return self._outputs(self.space.convert(features))
 
     def system(self, function: Callable[..., Trace]) -> System:
-        """Return a system that JAX traces, given one of scenes.
+        """Return a system that JAX traces, from a function of scenes.
 
         **Arguments:**
-        - `function(scene, key) -> Trace`: pure JAX, of the numbers that `scenes` gives.
-        **Raises:** `ValueError` for what cannot be called.
+        - `function(scene, key) -> Trace`: a pure JAX function of the numbers returned by `scenes`.
+        **Raises:** `ValueError` for an object that cannot be called.
         """
         if not callable(function):
             raise ValueError(f"system needs a function (scene, key) -> Trace; got {function!r}")
@@ -101,19 +100,20 @@ class ScenicProgram:
 
     @property
     def given(self) -> tuple[str, ...]:
-        """Names of the features that the program does not draw, but reads."""
+        """Names of the features that the program reads instead of drawing."""
         return tuple(name for name in self.space.domains if name not in self._sampling.domains)
 
     def blackbox(
         self, function: Callable[..., Trace], *, seeded: bool = False, **options: Any
     ) -> HostSystem:
-        """Return a system on the host, given one of Scenic's own scenes.
+        """Return a host system, from a function of Scenic's own scenes.
 
         **Arguments:**
-        - `function(scene) -> Trace`: of Scenic's `Scene`; `function(scene, seed)` with `seeded`.
+        - `function(scene) -> Trace`: a function of Scenic's `Scene`; `function(scene, seed)` with
+          `seeded`.
         - `options`: those of `verifai_jax.blackbox`, such as `workers` and `timeout`. A worker
           compiles the program once.
-        **Raises:** as `verifai_jax.blackbox`.
+        **Raises:** the errors of `verifai_jax.blackbox`.
         """
         if not callable(function):
             raise ValueError(f"blackbox needs a function (scene) -> Trace; got {function!r}")
@@ -129,21 +129,21 @@ class ScenicProgram:
         timeout: float | None = None,
         **options: Any,
     ) -> HostSystem:
-        """Return the program's simulator as a system: behaviours, monitors and records.
+        """Return the program's simulator as a system, with behaviors, monitors and records.
 
-        The simulator is the one that the program names, or Scenic's Newtonian one. What behaviours
-        draw depends on the row alone.
+        It is the simulator that the program names, or else Scenic's Newtonian one. Random numbers
+        of behaviors depend only on the row.
 
         **Arguments:**
         - `steps`: the maximum number of steps of a simulation.
         - `records`: names of `record` statements, which become signals; all when left out.
-        - `dt`: seconds of a step; the simulator's own when left out.
-        - `workers`: processes, each of which compiles the program once; in this process when left
-          out.
-        - `timeout`: seconds of wall clock for one simulation; needs `workers`. A worker's first
-          simulation compiles the program.
-        - `options`: others of `verifai_jax.blackbox`.
-        **Raises:** `ValueError` for steps, records or a step that can be none, and as
+        - `dt`: duration of a step in seconds; the simulator's own when left out.
+        - `workers`: number of processes, each of which compiles the program once; in this process
+          when left out.
+        - `timeout`: wall-clock seconds for one simulation; needs `workers`. Compiling the program
+          in a worker's first simulation counts.
+        - `options`: further options of `verifai_jax.blackbox`.
+        **Raises:** `ValueError` for invalid steps, records or step duration; the errors of
         `verifai_jax.blackbox`.
         """
         named = check_simulation(steps, records, dt, self.scenario)
@@ -153,8 +153,8 @@ class ScenicProgram:
     def scene(self, features: Mapping[str, Any]) -> Any:
         """Return Scenic's `Scene` at these features.
 
-        **Raises:** `ValueError` for features outside the space, and for those where Scenic refuses
-        the scene.
+        **Raises:** `ValueError` for features outside the space, and for those at which Scenic
+        refuses the scene.
         """
         complete = self.space.root.coerce(self.space.completed(features))
         self.space.root.check(complete, "")
@@ -169,22 +169,23 @@ class ScenicProgram:
         return self._sampling.scene(values, here)
 
     def of(self, run: Any, row: "int | pd.Series") -> Any:
-        """Return Scenic's `Scene` of a row of a run's table.
+        """Return Scenic's `Scene` for a row of a run's table.
 
         **Arguments:**
         - `run`: a `Run`, or its table.
         - `row`: number of the row, or the row itself.
-        **Raises:** `IndexError` for a row that is not in the table, and as `scene`.
+        **Raises:** `IndexError` for a row that is not in the table; the errors of `scene`.
         """
         table = getattr(run, "table", run)
         values = table.row(int(row)) if isinstance(row, int | np.integer) else row
         return self.scene(self.space.from_row(values))
 
     def features_of(self, scene: Any) -> dict[str, Any]:
-        """Return the features at which a scene of Scenic's own sampler would come.
+        """Return the features that give a scene of Scenic's own sampler.
 
-        What a scene does not tell, such as the seed and the ends of an interval that Scenic's bytes
-        leave out, is in the middle of its domain, or where the scene is possible.
+        A feature that the scene does not determine, such as the seed or an end of an interval that
+        Scenic's bytes leave out, gets the middle of its domain, or a value at which the scene is
+        possible.
 
         **Raises:** `ValueError` for a scene of another program or compilation.
         """
@@ -204,9 +205,9 @@ class ScenicProgram:
             return str(error)
 
     def code(self, scene: Any) -> str:
-        """Return a Scenic program whose only scene is this one, to compile in the same `mode2D`.
+        """Return a Scenic program with this scene as its only one, to compile in the same `mode2D`.
 
-        What code cannot write, such as behaviours and meshes, is named in a comment.
+        Parts that code cannot express, such as behaviors and meshes, are named in a comment.
         """
         return scene_code(scene, self._recipe.planar)
 
@@ -220,7 +221,7 @@ class ScenicProgram:
             return self.scenario.sceneToBytes(scene)
 
     def from_bytes(self, data: bytes) -> Any:
-        """Return the scene that `to_bytes` wrote, of the same program."""
+        """Return the scene written by `to_bytes` for the same program."""
         with LOCK:
             return self.scenario.sceneFromBytes(data)
 
@@ -229,12 +230,12 @@ class ScenicProgram:
 
         **Arguments:**
         - `scene`: the scene of Scenic.
-        - `path`: file to write the picture to.
+        - `path`: file to which the picture is written.
         """
         return lazy_import("verifai_jax.reports.plotting.scenes", "draw_scene")(self, scene, path)
 
     def describe(self) -> str:
-        """Describe the features, and say what Scenic computes and decides in Python."""
+        """Describe the features, and list what Scenic computes and checks in Python."""
         lines = [self.space.describe()]
         lines += [f"seeded: {name}" for name in self.seeded]
         lines += [f"computed by Scenic: {name} ({why})" for name, why in self.in_python.items()]
@@ -261,15 +262,15 @@ class _NoCodeError(Exception):
 
 
 def scene_code(scene: Any, planar: bool) -> str:
-    """Return Scenic code whose only scene is this one.
+    """Return Scenic code with this scene as its only one.
 
     Scenic's own `dumpAsScenicCode` needs the classes of the program. Here they are defined, without
-    their properties, which each object has. What code cannot write, such as a behaviour, is named
-    in a comment. Requirements are left out, since they hold in this scene.
+    their properties, which each object lists. Parts that code cannot express, such as a behavior,
+    are named in a comment. Requirements are left out, since they hold in this scene.
 
     **Arguments:**
     - `scene`: the scene of Scenic.
-    - `planar`: Scenic's `mode2D`, in which the code is meant to be compiled.
+    - `planar`: Scenic's `mode2D`, in which the code has to be compiled.
     """
     lines = [f"# One scene of a Scenic program{', in mode2D' if planar else ''}."]
     for kind in dict.fromkeys(each for body in scene.objects for each in _own_classes(type(body))):

@@ -12,12 +12,12 @@ from verifai_jax.systems.scenic.sampling import Sampling
 
 @dataclass(frozen=True)
 class Recipe:
-    """Text and options of a program, with which any process can compile it.
+    """The text and options of a program, from which any process can compile it.
 
-    - `program`: path or code.
+    - `program`: the path or the code.
     - `planar`: Scenic's `mode2D`.
     - `params`: names and values of overridden parameters.
-    - `model`, `scenario`: as `scenic` takes them.
+    - `model`, `scenario`: as in `scenic`.
     """
 
     program: str
@@ -35,14 +35,14 @@ class Recipe:
         model: str | None,
         scenario: str | None,
     ) -> "Recipe":
-        """Return a recipe that holds in any process, wherever it stands."""
+        """Return a recipe that works in any process and working directory."""
         text = str(program)
         if "\n" not in text and Path(text).is_file():
             text = str(Path(text).resolve())
         return cls(text, planar, tuple(params.items()), model, scenario)
 
     def compiled(self) -> tuple[Compiled, Sampling]:
-        """Return the program as this process has compiled it, once."""
+        """Return the program compiled in this process, once."""
         return compiled_recipe(_Key(self))
 
 
@@ -62,7 +62,7 @@ class _Key:
 
 @functools.lru_cache(maxsize=8)
 def compiled_recipe(key: _Key) -> tuple[Compiled, Sampling]:
-    """Compile the program of a recipe; the last ones are kept."""
+    """Compile the program of a recipe; the latest results are cached."""
     recipe = key.recipe
     compiled = compile_program(
         recipe.program, recipe.planar, dict(recipe.params), recipe.model, recipe.scenario

@@ -37,9 +37,9 @@ FIRST_SHOWN, SHOWN_EVERY = 2.0, 10.0
 class Constraint:
     """All requirements of one program.
 
-    - `compiled`: names of those that JAX decides.
-    - `by_scenic`: names of those that Scenic decides in Python, with the reason.
-    - `draws`: True where Scenic may refuse a scene while it draws it.
+    - `compiled`: names of the requirements that JAX checks.
+    - `by_scenic`: names of those that Scenic checks in Python, with the reason.
+    - `draws`: True if Scenic may refuse a scene while drawing it.
     """
 
     def __init__(self, sampling: Sampling, program: Compiled, planar: bool) -> None:

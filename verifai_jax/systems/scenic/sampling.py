@@ -45,16 +45,16 @@ LOCK = threading.RLock()
 
 
 class Refused(Exception):
-    """A scene that Scenic refuses while it is drawn."""
+    """An error for a scene that Scenic refuses while drawing it."""
 
 
 class Sampling:
     """Scenes of one program as a function of features.
 
-    - `scenario`: Scenic's.
-    - `order`: its random nodes, each after what it depends on.
-    - `leaves`: those with an inverse, by identity.
-    - `seeded`: names of those without, by identity.
+    - `scenario`: Scenic's `Scenario`.
+    - `order`: its random nodes, each after its dependencies.
+    - `leaves`: the nodes with an inverse, by identity.
+    - `seeded`: names of the nodes without an inverse, by identity.
     - `owners`: names of the objects, by identity.
     - `soft`: soft requirements by the name of their feature.
     - `domains`: all features by name.
@@ -81,7 +81,7 @@ class Sampling:
 
     @property
     def is_dynamic(self) -> bool:
-        """True where something happens over time, in which program or simulator may draw."""
+        """True if the program is dynamic: it or the simulator may draw random numbers later."""
         parts = self.scenario.dynamicScenario
         behaves = any(field(body, "behavior") is not None for body in self.scenario.objects)
         composed = getattr(parts, "_compose", None) is not None
@@ -142,11 +142,11 @@ class Sampling:
         return soft
 
     def values(self, features: Mapping[str, Any]) -> Any:
-        """Return the value of each node at these features, as Scenic keeps them.
+        """Return the value of each node at these features, in Scenic's form.
 
         **Arguments:**
-        - `features`: numbers and choices by name, as `FeatureSpace.unflatten` gives them.
-        **Raises:** `Refused` where Scenic refuses the scene while it draws it.
+        - `features`: numbers and choices by name, as returned by `FeatureSpace.unflatten`.
+        **Raises:** `Refused` if Scenic refuses the scene while drawing it.
         """
         distributions = sys.modules["scenic.core.distributions"]
         utils = sys.modules["scenic.core.utils"]
@@ -186,20 +186,20 @@ class Sampling:
         return region.orient(vectors.Vector(x, y, region.z))
 
     def refusal(self, values: Any, features: Mapping[str, Any]) -> str | None:
-        """Return the reason why Scenic's own checker refuses a scene; None for an accepted one."""
+        """Return the reason why Scenic's own checker refuses a scene; None if it accepts it."""
         with LOCK, _seeded_generators(0):
             self.activate(features)
             return self.scenario.checker.checkRequirements(values)
 
     def activate(self, features: Mapping[str, Any]) -> None:
-        """Switch the soft requirements on or off as the features say."""
+        """Switch the soft requirements on or off according to the features."""
         for requirement in self.scenario.userRequirements:
             requirement.active = True
         for name, requirement in self.soft.items():
             requirement.active = bool(_plain(features[name]))
 
     def scene(self, values: Any, features: Mapping[str, Any] = MappingProxyType({})) -> Any:
-        """Return Scenic's `Scene` of these values, with features that the program does not draw.
+        """Return Scenic's `Scene` of these values, with the features that the program only reads.
 
         Those become global parameters.
         """
@@ -221,10 +221,10 @@ class Sampling:
             )
 
     def features_of(self, scene: Any) -> dict[str, Any]:
-        """Return the features at which Scenic's own scene would come.
+        """Return the features that give a scene of Scenic's own sampler.
 
-        A feature that the scene does not tell has the middle of its domain, as the seed has, or
-        another place where what the scene tells is impossible in the middle.
+        A feature that the scene does not determine gets the middle of its domain, like the seed, or
+        another value if the scene is impossible there.
 
         **Raises:** `ValueError` for a scene of another compilation.
         """

@@ -22,7 +22,7 @@ from verifai_jax.systems.scenic.sampling import LOCK, SEED, digest
 
 @dataclass(frozen=True)
 class OnScenes:
-    """A function of Scenic's scenes as a function of features.
+    """A function of Scenic's scenes, turned into a function of features.
 
     - `recipe`: the recipe of the program.
     - `function`: `(scene) -> Trace`, or `(scene, seed) -> Trace` with `seeded`.
@@ -43,17 +43,17 @@ class OnScenes:
 
 
 class SimulationRejected(RuntimeError):
-    """A simulation that breaks a requirement of its program over time."""
+    """An error for a simulation that violates a requirement of its program over time."""
 
 
 @dataclass(frozen=True)
 class ScenicSimulation:
-    """A dynamic scenario in its simulator, and what it records as a trace.
+    """A dynamic scenario in its simulator, with its records as a trace.
 
     - `recipe`: the recipe of the program.
     - `steps`: the number of steps of the simulation.
     - `records`: names of `record` statements; all when empty.
-    - `dt`: seconds of a step; the simulator's own when None.
+    - `dt`: duration of a step in seconds; the simulator's own when None.
     """
 
     recipe: Recipe
@@ -142,10 +142,10 @@ NOTHING_RECORDED = (
 def check_simulation(
     steps: int, records: Sequence[str], dt: float | None, scenario: Any
 ) -> tuple[str, ...]:
-    """Check what a simulation needs, and return its records.
+    """Check the options of a simulation, and return its records.
 
-    **Raises:** `ValueError` for steps that are no positive integer, records that are no names or
-    that the program does not record over time, and a step that is not positive.
+    **Raises:** `ValueError` for steps that are not a positive integer, records that are not names
+    or that the program does not record over time, and a step duration that is not positive.
     """
     check_count("steps", steps)
     if isinstance(records, str) or not all(isinstance(name, str) for name in records):

@@ -14,7 +14,7 @@ import numpy as np
 
 
 class Unsupported(Exception):
-    """A value that has no meaning in JAX, by its name."""
+    """An error for a value that JAX cannot compute, by its name."""
 
 
 def is_plain(*values: Any) -> bool:
@@ -23,7 +23,7 @@ def is_plain(*values: Any) -> bool:
 
 
 def function(name: str) -> Callable[..., Any]:
-    """Return a function of numbers: of `math` for plain ones, of JAX for others."""
+    """Return a function of numbers: from `math` for plain numbers, from JAX for others."""
     plain, traced = getattr(math, name), getattr(jnp, ARRAY_NAMES.get(name, name))
     return lambda *values: plain(*values) if is_plain(*values) else traced(*values)
 
@@ -96,7 +96,7 @@ class Yaw:
 def from_euler(yaw: Any, pitch: Any, roll: Any) -> Yaw:
     """Return the orientation of Euler angles.
 
-    **Raises:** `Unsupported` for one that leaves the plane.
+    **Raises:** `Unsupported` for an orientation outside the plane.
     """
     if not (is_plain(pitch, roll) and abs(pitch) + abs(roll) < 1e-12):
         raise Unsupported("an orientation out of the plane")
@@ -120,7 +120,7 @@ def as_yaw(value: Any) -> Yaw:
 
 @dataclass(frozen=True)
 class Vec:
-    """A vector; `heading` is that of a position with one, such as a point on a line."""
+    """A vector; `heading` is that of an oriented position, such as a point on a line."""
 
     x: Any
     y: Any
@@ -231,13 +231,13 @@ SIDES = {
 
 @dataclass(frozen=True)
 class Body:
-    """An object or an oriented point: its properties, computed when they are needed."""
+    """An object or an oriented point, whose properties are computed when needed."""
 
     properties: Callable[[str], Any]
     names: frozenset[str]
 
     def get(self, name: str) -> Any:
-        """Return a property, or what Scenic computes from several.
+        """Return a property, or a value that Scenic computes from several.
 
         **Raises:** `Unsupported` for any other name.
         """
@@ -265,14 +265,14 @@ class Body:
 
 @dataclass(frozen=True)
 class Choice:
-    """One of several values that are not numbers, by its index."""
+    """One of several values that are not numbers, given by its index."""
 
     index: Any
     options: tuple[Any, ...]
 
 
 def select(index: Any, options: Sequence[Any]) -> Any:
-    """Return the option at an index; a `Choice` of those that are no numbers."""
+    """Return the option at an index; a `Choice` if options are not numbers."""
     if is_plain(index):
         return options[int(index)]
     if all(isinstance(option, Vec) for option in options):
@@ -302,9 +302,9 @@ def is_number(value: Any) -> bool:
 
 
 def attribute(value: Any, name: str) -> Any:
-    """Return what Scenic's attribute of a value is.
+    """Return the attribute of a value, as Scenic defines it.
 
-    **Raises:** `Unsupported` for one without a meaning here.
+    **Raises:** `Unsupported` for an attribute that JAX cannot compute.
     """
     if isinstance(value, Body):
         return getattr(value, name) if name == "relativePosition" else value.get(name)
