@@ -1,19 +1,10 @@
-"""Hard values with smooth derivatives: what is switched, and what is rounded to whole periods."""
+"""A fault that begins and ends at once, with derivatives by its edges."""
 
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
-
-
-@jax.custom_jvp
-def straight(value: Array, smooth: Array) -> Array:
-    """Return `value` with the derivative of `smooth`."""
-    return value
-
-
-straight.defjvp(lambda primals, tangents: (primals[0], tangents[1]))
 
 
 @jax.custom_jvp
