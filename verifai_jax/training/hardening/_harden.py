@@ -26,7 +26,7 @@ from verifai_jax.core.compute.keys import run_keys
 from verifai_jax.core.compute.precision import reproducible_settings
 from verifai_jax.core.display.progress import say_done, shows_progress
 from verifai_jax.core.messages.checks import check_count, check_fraction
-from verifai_jax.core.messages.errors import suggests_options
+from verifai_jax.core.messages.errors import end_if_interrupted, suggests_options
 from verifai_jax.core.store.cache import Cache, locked_cache
 from verifai_jax.estimation.certification import Certificates, certify
 from verifai_jax.estimation.comparison import Comparison, compare
@@ -36,7 +36,7 @@ from verifai_jax.rl import PPO, Algorithm, evaluate
 from verifai_jax.search import Search
 from verifai_jax.statistics.confidence_sequences import safe_at
 from verifai_jax.training.hardening.arms import FunctionArms, TaskArms
-from verifai_jax.training.hardening.collecting import Collected, collect, end_if_interrupted
+from verifai_jax.training.hardening.collecting import Collected, collect
 from verifai_jax.training.hardening.mixture import (
     CAPACITY,
     HardeningError,
