@@ -101,9 +101,3 @@ def versions() -> list[tuple[str, str]]:
         except metadata.PackageNotFoundError:
             continue
     return [*found, ("machine", f"{platform.system()} {platform.machine()}")]
-
-
-def shown_folder(folder: Path) -> str:
-    """Return the path of a folder as a command names it: relative to the current one, if below."""
-    here, folder = Path.cwd().resolve(), folder.resolve()
-    return folder.relative_to(here).as_posix() if folder.is_relative_to(here) else folder.as_posix()
