@@ -1,5 +1,8 @@
 """Given features are simulated in their order, each once."""
 
+import gc
+import weakref
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -87,3 +90,16 @@ def test_a_replay_in_words(problem):
     assert first == f"row 0 of {problem.name}: {again._verdict()}"
     assert any(line.strip() == "features     a=0.25, kind=fast" for line in rest)
     assert any("samples every" in line for line in rest)
+
+
+@pytest.mark.thorough
+def test_a_problem_that_was_simulated_is_freed():
+    mine = vj.Problem(
+        "freed", {"a": vj.Box(0.0, 1.0)},
+        lambda features, key: vj.Trace({"x": features["a"] * jnp.ones(3)}, dt=0.1), "always x < 2",
+    )  # fmt: skip
+    vj.falsify(mine, "uniform", 8, progress=False).replay(0)
+    freed = weakref.ref(mine)
+    del mine
+    gc.collect()
+    assert freed() is None

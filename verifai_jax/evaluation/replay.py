@@ -5,6 +5,7 @@ replay(problem, row, key, number).trace             # the trace of a row of a ta
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -13,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Key
 
+from verifai_jax.core.compute.compilation import Slot
 from verifai_jax.core.compute.keys import simulation_key
 from verifai_jax.core.compute.precision import in_precision
 from verifai_jax.core.display.lazy import lazy_import
@@ -168,7 +170,9 @@ def replay(
         else:
             precise = jax.tree.map(lambda leaf: _cast(leaf, precision), features)
             trace = read = jax.jit(problem.system)(precise, key)
-        rho, status = jax.jit(trace_verdict, static_argnums=0)(problem, read)
+        # Kept with the problem: as a static argument it would never be freed.
+        judge = problem.programs.get(JUDGES, "", lambda: jax.jit(partial(trace_verdict, problem)))
+        rho, status = judge(read)
         return Replay(
             problem=problem,
             row=number,
@@ -180,6 +184,9 @@ def replay(
             # Of the whole trace: what an early end leaves of it is shorter.
             duration=float(read.clock()[-1] - read.clock()[0]) or None,
         )
+
+
+JUDGES: Slot[str, Any] = Slot("verdicts of replays")
 
 
 def _cast(leaf: ArrayLike, precision: str) -> Array:
