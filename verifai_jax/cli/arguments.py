@@ -24,7 +24,7 @@ PATH = click.Path(path_type=Path)
 
 
 def option(*names: str, **settings: Any) -> Callable[[Command], Command]:
-    """Return an option of a command; its help shows the default where there is one."""
+    """Return an option of a command; its help shows the default if there is one."""
     return click.option(*names, show_default=settings.get("default") is not None, **settings)
 
 
@@ -170,7 +170,7 @@ NAMES = all_of(
 def read_names(
     constants: tuple[str, ...], definitions: tuple[str, ...]
 ) -> tuple[dict[str, float], dict[str, str]]:
-    """Return the constants and the definitions of `NAMES`; a usage error names a wrong one."""
+    """Read the constants and the definitions of `NAMES`; a usage error names a wrong entry."""
     numbers = {}
     for name, value in split_pairs("--const", constants):
         try:
@@ -207,7 +207,7 @@ def load_problem(target: str, only: str | None = None) -> "Problem":
 
 
 def load_judged_run(folder: Path, target: str | None) -> "Run":
-    """Load the run in a folder as `load_run` does; one without any verdict ends the command."""
+    """Load the run in a folder like `load_run`; if it has no verdict, end the command."""
     run = load_run(folder, target)
     if len(run.table.failed) == run.simulations:
         raise CommandError(
@@ -219,12 +219,12 @@ def load_judged_run(folder: Path, target: str | None) -> "Run":
 
 
 def load_run(folder: Path, target: str | None) -> "Run":
-    """Load the run in a folder, with the problem named, or else the one that the run records."""
+    """Load the run in a folder, with the named problem, or else the one that it records."""
     return read_run(folder, load_problem(target or recorded_target(folder)))
 
 
 def read_run(folder: Path, problem: "Problem | None" = None) -> "Run":
-    """Read the run in a folder; say what the folder is where it holds none."""
+    """Read the run in a folder; if there is none, the error says what the folder is."""
     from verifai_jax import load
     from verifai_jax.core.messages.text import printable
 
@@ -248,9 +248,9 @@ def recorded_target(folder: Path, remedy: str = "--problem specs/FILE.py:NAME") 
 
 
 def read_record(folder: Path) -> dict[str, Any]:
-    """Read the record of the run in a folder; say what the folder is where it holds none.
+    """Read the record of the run in a folder; if there is none, the error says what it is.
 
-    **Raises:** as `verifai_jax.falsification.run_folder.read_record`.
+    **Raises:** the errors of `verifai_jax.falsification.run_folder.read_record`.
     """
     from verifai_jax.falsification import run_folder
 
@@ -280,17 +280,17 @@ def _describe_folder(folder: Path, record: str, missing: str) -> str:
 
 
 def is_sweep(folder: Path) -> bool:
-    """Return whether a folder is one that `verifai-jax sweep` has written."""
+    """Return whether a folder was written by `verifai-jax sweep`."""
     return any((folder / name).is_file() for name in ("sweep.json", "sweep.cache"))
 
 
 def split_names(text: str) -> list[str]:
-    """Split names at their commas."""
+    """Split names at commas."""
     return [name.strip() for name in text.split(",")]
 
 
 def split_pairs(option: str, texts: tuple[str, ...]) -> list[tuple[str, str]]:
-    """Split each NAME=VALUE of a repeated option; a usage error says which one is wrong."""
+    """Split each NAME=VALUE of a repeated option; a usage error names a wrong one."""
     pairs = []
     for text in texts:
         name, equals, value = text.partition("=")
@@ -301,7 +301,7 @@ def split_pairs(option: str, texts: tuple[str, ...]) -> list[tuple[str, str]]:
 
 
 def plain_values(option: str, texts: tuple[str, ...]) -> dict[str, Any]:
-    """Read each NAME=VALUE of a repeated option, the value as JSON where it is JSON."""
+    """Read each NAME=VALUE of a repeated option; values are parsed as JSON if possible."""
     values: dict[str, Any] = {}
     for name, value in split_pairs(option, texts):
         try:
@@ -312,10 +312,10 @@ def plain_values(option: str, texts: tuple[str, ...]) -> dict[str, Any]:
 
 
 def refuse_others(allowed: Container[str], why: str) -> None:
-    """Raise a usage error for an option of this command that was given and is not allowed now.
+    """Raise a usage error for an option that was given but is not allowed here.
 
     **Arguments:**
-    - `allowed`: names of parameters, in addition to those that every command has.
+    - `allowed`: names of allowed parameters, in addition to those of every command.
     - `why`: the end of the message, after the option.
     """
     context = click.get_current_context()
@@ -328,7 +328,7 @@ def refuse_others(allowed: Container[str], why: str) -> None:
 
 
 def target_apart(folder: Path, target: str | None) -> str | None:
-    """Return the target of a run where its folder alone does not name it for a command."""
+    """Return the target of a run, if the folder alone does not identify it for a command."""
     from verifai_jax.core.user_code.targets import TargetError, target_of_project
 
     if target is None:
@@ -341,12 +341,12 @@ def target_apart(folder: Path, target: str | None) -> str | None:
 
 
 def resuming(command: str, folder: Path, target: str | None, options: Mapping[str, object]) -> str:
-    """Write the command that goes on with a folder, as a shell reads it.
+    """Return the command that resumes a folder, in shell syntax.
 
     **Arguments:**
     - `command`: `falsify` or `sweep`.
-    - `target`: that the folder records; it is named where the record alone would not do.
-    - `options`: that the record does not hold, with their values; those that are None are left out.
+    - `target`: the recorded target; it is included if the record alone does not suffice.
+    - `options`: options that the record does not hold, with their values; None is left out.
     """
     apart = target_apart(folder, target)
     words = ["verifai-jax", command, *([] if apart is None else [apart]), "--resume", str(folder)]

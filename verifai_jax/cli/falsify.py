@@ -218,7 +218,7 @@ def _stopping_rule(within: float | None, decide: float | None) -> "Within | Deci
 
 
 def check_run(run: "Run", asked: Gate | None) -> None:
-    """End the command with code 1 where a run does not keep the gate that was asked for."""
+    """End the command with code 1 if a run fails the requested gate."""
     high = None if run.failure_rate is None else run.failure_rate.high
     failed = {"counterexample": run.table.counts.claimed > 0, RATE: exceeds(asked, high)}
     check_gate(asked, failed)
@@ -227,12 +227,11 @@ def check_run(run: "Run", asked: Gate | None) -> None:
 def print_run(
     run: "Run", pictures: bool, options: Mapping[str, object] = MappingProxyType({})
 ) -> None:
-    """Print the summary of a run and how to see more of it.
+    """Print the summary of a run, and the commands to see more of it.
 
     **Arguments:**
-    - `options`: the options of the command that the record does not hold, to be given again on
-      resuming.
-    **Raises:** `CommandError` where no simulation has a verdict.
+    - `options`: the options that the record does not hold and that must be given again on resuming.
+    **Raises:** `CommandError` if no simulation has a verdict.
     """
     click.echo(run.summary())
     give_result(**describe_run(run))

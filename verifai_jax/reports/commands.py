@@ -14,9 +14,10 @@ from verifai_jax.search import named
 
 
 def run_command(run: Run) -> str | None:
-    """Return the command that repeats a run; None if no command can.
+    """Return the command that repeats a run; None if there is none.
 
-    A run of a problem that no file names, or with a search that has no name, is repeated in Python.
+    A run of a problem without a file name, or with a search without a name, can only be repeated in
+    Python.
     """
     search = run.search_data or {}
     objective = ["--objective", "likelihood"] if "likeliest" in search else []
@@ -70,7 +71,7 @@ def run_python(run: Run) -> str:
 
 
 def replay_command(run: Run, row: int | None = None) -> str:
-    """Return what simulates a row again; without a row, what goes before its number."""
+    """Return the command that simulates a row again; without a row, its part before the number."""
     if run.folder is None or run.target is None:
         number = "" if row is None else row
         folder = "problem" if run.folder is None else f"{shown_folder(run.folder)!r}, problem"
@@ -87,7 +88,7 @@ def report_command(
     studies: bool | None = None,
     modes: int | None = None,
 ) -> str:
-    """Return the command that builds a report from a folder again, with its options."""
+    """Return the command that builds a report from a folder again, including its options."""
     words = ["verifai-jax", "report", shown_folder(folder)]
     for option, texts in (("--unit", units), ("--reason", reasons)):
         for name, text in texts.items():

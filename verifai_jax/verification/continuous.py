@@ -22,10 +22,10 @@ from verifai_jax.verification.sets import flow
 
 
 def between_samples(problem: Problem) -> Problem:
-    """Return the problem about the differential equation; its system is one for sets alone.
+    """Return the problem with the differential equation, whose system only sets can evaluate.
 
-    **Raises:** `ProblemError` for a system that `vj.ode` did not make, or that ends or jumps at
-    instants of its own, and for a formula about single samples.
+    **Raises:** `ProblemError` for a system that was not made by `vj.ode`, or that ends or jumps at
+    its own instants, and for a formula about single samples.
     """
     loop = problem.system
     if not isinstance(loop, Ode):

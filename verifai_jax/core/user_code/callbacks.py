@@ -24,7 +24,7 @@ Callback: TypeAlias = Callable[[int, dict[str, float]], object]
 def check_callbacks(callbacks: Iterable[Callback]) -> tuple[Callback, ...]:
     """Return the callbacks as a tuple.
 
-    **Raises:** `TypeError` for something that cannot be called.
+    **Raises:** `TypeError` for an object that cannot be called.
     """
     if callable(callbacks):
         raise TypeError(
@@ -41,7 +41,7 @@ def check_callbacks(callbacks: Iterable[Callback]) -> tuple[Callback, ...]:
 
 
 def notify(callbacks: Iterable[Callback], step: int, values: Values) -> None:
-    """Call the callbacks with a step and the values that are numbers, each with its own copy."""
+    """Call each callback with a step and its own copy of the numeric values."""
     # What is not a number, as the return of no episode, is left out: loggers store it as one.
     known = {name: value for name, value in values.items() if value == value}
     for callback in callbacks:

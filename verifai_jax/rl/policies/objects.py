@@ -37,9 +37,9 @@ def from_object(source: object, observation: ArrayLike | None, batched: bool) ->
 
     **Arguments:**
     - `source`: see `policy`.
-    - `observation`: an example, where the object cannot be translated without one.
-    - `batched`: a Python function takes a batch of observations.
-    **Raises:** `PolicyError` for something that is not a policy.
+    - `observation`: an example observation, for an object that cannot be translated without one.
+    - `batched`: whether a Python function takes a batch of observations.
+    **Raises:** `PolicyError` for an object that is not a policy.
     """
     root = type(source).__module__.partition(".")[0]
     if root in ("stable_baselines3", "sb3_contrib"):
@@ -79,10 +79,10 @@ def _is_a(source: object, module: str, name: str) -> bool:
 
 
 class RandomPolicy(Policy):
-    """A policy that draws: a function of `(observation, key)`, such as those of Brax."""
+    """A random policy: a function of `(observation, key)`, such as those of Brax."""
 
     def as_graph(self, observation: PyTree = None) -> Any:
-        """Refuse: a graph of ONNX does not draw."""
+        """Raise an error, because a graph of ONNX operators cannot draw random numbers."""
         raise PolicyError("a policy that draws cannot be saved: give its deterministic function")
 
     def act(self, observation: PyTree, key: Key[Array, ""]) -> Any:
@@ -252,9 +252,9 @@ def _translated(
 
 
 def read_brax(folder: Path) -> Policy:
-    """Return the deterministic policy of a checkpoint of Brax' or Playground's PPO.
+    """Return the deterministic policy of a PPO checkpoint of Brax or Playground.
 
-    **Raises:** `PolicyError` for a folder that holds none.
+    **Raises:** `PolicyError` for a folder without one.
     """
     networks = require("brax.training.agents.ppo.networks", extra="brax")
     known = require("brax.training.networks", extra="brax").ACTIVATION

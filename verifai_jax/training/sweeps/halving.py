@@ -22,7 +22,8 @@ class Halving:
     """Successive halving: keep the best 1/reduction of the configurations at each checkpoint.
 
     **Arguments:**
-    - `reduction`: greater than 1; of so many configurations one continues, rounded up.
+    - `reduction`: greater than 1; the share 1/reduction of the configurations continues, rounded
+      up.
     - `by`: the criterion. `"return"` is the nominal return at the checkpoint; `"safety"` is the
       failure rate of the closed loop in a few simulations, then the worst robustness, then the
       return.
@@ -46,9 +47,9 @@ class Halving:
         """Choose the configurations that continue.
 
         **Arguments:**
-        - `objective`: the objective of each configuration, by its number; the least is best, and
+        - `objective`: the objective of each configuration, by its number; the smallest is best, and
           NaN is worst.
-        **Returns:** numbers of the configurations, in ascending order; of equal ones the first
+        **Returns:** numbers of the configurations, in ascending order; among equal ones the first
         continue.
         """
         count = self.survivors(len(objective))

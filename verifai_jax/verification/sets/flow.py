@@ -63,11 +63,11 @@ _solution.multiple_results = True
 def flow(
     derivative: Callable[[Any, PyTree], PyTree], time: Any, state: PyTree, seconds: Any
 ) -> tuple[PyTree, PyTree]:
-    """Return what solutions are after some seconds, and at all times until then.
+    """Return enclosures of solutions after some seconds, and at all times until then.
 
     **Arguments:**
     - `derivative(time, state)`: d state / d time; smooth in both.
-    - `seconds`: the same in all boxes.
+    - `seconds`: the duration, equal for all boxes.
     **Raises:** `MissingRule` for dynamics that are not smooth, with the operation and its line.
     """
     leaves, tree = jax.tree.flatten(state)
