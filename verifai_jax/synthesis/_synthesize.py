@@ -76,7 +76,7 @@ def synthesize(
     - `parameters`: names of the features to choose; all when left out. The others are the
       environment, which varies.
     - `budget`: maximum number of simulations, without those of the final check.
-    - `aim`: `"robustness"`: the greatest worst-case robustness, found by an attack. `"probability"`:
+    - `aim`: `"robustness"`: the greatest worst-case robustness, found by attacks. `"probability"`:
       the lowest failure probability, counted in samples of the prior without attacks, for problems
       in which no parameters always keep the formula.
     - `attack`: the search over the environment that looks for failures of the parameters.
