@@ -62,7 +62,7 @@ def main():
             pairs.append([taken for _, taken in sorted((i, seconds(e, u)) for i, e, u in order)])
         taken = np.array(pairs)
         ratio, least = np.median(taken[:, 1] / taken[:, 0]), np.divide(*taken.min(axis=0)[::-1])
-        print(f"  {fault.label:<28} {ratio:.2f}, by minima {least:.2f}; same bits: {same}")
+        print(f"  {fault.name:<28} {ratio:.2f}, by minima {least:.2f}; same bits: {same}")
 
 
 if __name__ == "__main__":

@@ -19,7 +19,7 @@ from jaxtyping import Int
 from verifai_jax.analysis.data.samples import Samples, Source
 from verifai_jax.analysis.odd_conditions import Attribute
 from verifai_jax.analysis.operational_domain import OperationalDomain, choices_of, words
-from verifai_jax.core.display.notebook import InNotebook, frame_html
+from verifai_jax.core.display.notebook import Tabular
 from verifai_jax.core.messages.checks import check_count
 from verifai_jax.core.messages.text import format_percent
 
@@ -36,7 +36,7 @@ Codes = dict[str, np.ndarray]
 
 
 @dataclass(frozen=True, eq=False)
-class OddCoverage(InNotebook):
+class OddCoverage(Tabular):
     """Coverage of a domain, as `odd_coverage` measures it.
 
     - `table`: one row for each attribute: its `feature`, `inside` (the values the domain allows),
@@ -111,9 +111,6 @@ class OddCoverage(InNotebook):
         return "\n".join(lines)
 
     __repr__ = __str__
-
-    def _notebook_parts(self) -> list[str]:
-        return [frame_html(self.table)]
 
 
 def odd_coverage(

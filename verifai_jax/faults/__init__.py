@@ -7,32 +7,28 @@ faulty = problem.with_faults(
 vj.falsify(faulty)
 """
 
-from verifai_jax.faults.fault import AtMost as AtMost
-from verifai_jax.faults.fault import Fault as Fault
-from verifai_jax.faults.injection import on_host as on_host
-from verifai_jax.faults.kinds import Bias as Bias
-from verifai_jax.faults.kinds import ClockJitter as ClockJitter
-from verifai_jax.faults.kinds import Delay as Delay
-from verifai_jax.faults.kinds import Drift as Drift
-from verifai_jax.faults.kinds import Dropout as Dropout
-from verifai_jax.faults.kinds import Freeze as Freeze
-from verifai_jax.faults.kinds import HeldAction as HeldAction
-from verifai_jax.faults.kinds import LossOfAuthority as LossOfAuthority
-from verifai_jax.faults.kinds import Noise as Noise
-from verifai_jax.faults.kinds import PacketLoss as PacketLoss
-from verifai_jax.faults.kinds import Quantisation as Quantisation
-from verifai_jax.faults.kinds import Saturation as Saturation
-from verifai_jax.faults.kinds import SignFlip as SignFlip
-from verifai_jax.faults.kinds import Spikes as Spikes
-from verifai_jax.faults.kinds import Stuck as Stuck
-from verifai_jax.faults.kinds import WrongChannel as WrongChannel
+from typing import TYPE_CHECKING
 
-__all__ = [
-    "AtMost", "Bias", "ClockJitter", "Delay", "Drift", "Dropout", "Fault", "Freeze", "HeldAction",
-    "LossOfAuthority", "Noise", "PacketLoss", "Quantisation", "Saturation", "SignFlip", "Spikes",
-    "Stuck", "WrongChannel", "on_host",
-]  # fmt: skip
+from verifai_jax.core.display.lazy import attach
 
-
-def __dir__() -> list[str]:
-    return list(__all__)
+if TYPE_CHECKING:
+    from verifai_jax.faults.fault import AtMost as AtMost
+    from verifai_jax.faults.fault import Fault as Fault
+    from verifai_jax.faults.injection import on_host as on_host
+    from verifai_jax.faults.kinds import Bias as Bias
+    from verifai_jax.faults.kinds import ClockJitter as ClockJitter
+    from verifai_jax.faults.kinds import Delay as Delay
+    from verifai_jax.faults.kinds import Drift as Drift
+    from verifai_jax.faults.kinds import Dropout as Dropout
+    from verifai_jax.faults.kinds import Freeze as Freeze
+    from verifai_jax.faults.kinds import HeldAction as HeldAction
+    from verifai_jax.faults.kinds import LossOfAuthority as LossOfAuthority
+    from verifai_jax.faults.kinds import Noise as Noise
+    from verifai_jax.faults.kinds import PacketLoss as PacketLoss
+    from verifai_jax.faults.kinds import Quantisation as Quantisation
+    from verifai_jax.faults.kinds import Saturation as Saturation
+    from verifai_jax.faults.kinds import SignFlip as SignFlip
+    from verifai_jax.faults.kinds import Spikes as Spikes
+    from verifai_jax.faults.kinds import Stuck as Stuck
+    from verifai_jax.faults.kinds import WrongChannel as WrongChannel
+__getattr__, __dir__, __all__ = attach(__name__)

@@ -1,7 +1,7 @@
 """Random numbers of a fault at an instant: a hash of its seed, the instant and the entry.
 
-JAX's generator costs more than a step of a small plant, at every step of a fault that is off. Two
-rounds of the finalizer of MurmurHash3 over 32 bits do for noise, and are the same in NumPy.
+JAX's generator would cost more than a step of a small plant, even for a fault that is off. Two
+rounds of the finalizer of MurmurHash3 over 32 bits suffice for noise, and NumPy gives the same.
 """
 
 from typing import Any

@@ -1,4 +1,4 @@
-"""Descriptions of faults: a channel, when one begins and ends, and numbers for how bad it is.
+"""Descriptions of faults: the channel, the time, and numbers that say how severe they are.
 
 Each number is fixed, or a domain, which makes it a feature of the problem.
 """
@@ -15,6 +15,7 @@ from jaxtyping import Array, Bool, Float, PyTree
 
 from verifai_jax.core.messages.checks import check_count, check_name, is_number
 from verifai_jax.features import Categorical, Domain, Struct
+from verifai_jax.systems.delays import line_of
 
 Number: TypeAlias = float | Domain
 Vector: TypeAlias = Float[Array | np.ndarray, " n"]
@@ -26,15 +27,16 @@ def number(low: float = -math.inf, high: float = math.inf, default: Any = MISSIN
 
 
 class Moment(NamedTuple):
-    """The things that a fault knows at an instant.
+    """The instant at which a fault acts, and its numbers there.
 
     - `xp`: `jax.numpy`, or `numpy` on the host.
-    - `number`: its numbers by name.
-    - `live`: whether the instant lies in its time; `since`: seconds since its onset, from 0 on.
+    - `number`: the numbers of the fault by name.
+    - `live`: whether the onset has passed and the end has not; `since`: seconds since the onset, at
+      least 0.
     - `time`, `period`: of the instant, and between two instants, in seconds.
     - `first`: whether nothing passed before; `acts`: whether the channel is part of an action.
-    - `other`: the numbers of the channel that it reads instead, if it does.
-    - `uniform`: makes so many random numbers of this instant between 0 and 1.
+    - `other`: the values of the channel `source` of `WrongChannel`.
+    - `uniform(count)`: random numbers of this instant, between 0 and 1.
     """
 
     xp: Any
@@ -50,23 +52,17 @@ class Moment(NamedTuple):
 
 
 class FaultFeatures(Struct):
-    """The numbers of a fault that vary; nominal is the weakest, shortest and latest fault.
+    """The numbers of a fault that vary, or the choice of `AtMost`; nominal is the weakest fault."""
 
-    - `fault`: whose they are; None for the choice of `AtMost`.
-    """
+    fault: "Fault | AtMost"
 
-    fault: "Fault | None"
-
-    def __init__(
-        self, fields: Mapping[str, Domain], nominal: PyTree, fault: "Fault | None" = None
-    ) -> None:
-        super().__init__(fields)
-        for name, value in (("_nominal", nominal), ("fault", fault)):
-            object.__setattr__(self, name, value)
+    def __init__(self, fault: "Fault | AtMost") -> None:
+        super().__init__(fault.domains)
+        object.__setattr__(self, "fault", fault)
 
     @property
     def nominal(self) -> dict[str, PyTree]:
-        return dict(self._nominal)  # pyright: ignore[reportAttributeAccessIssue]
+        return {name: self.fault.weakest(name) for name in self.fault.domains}
 
 
 @dataclass_transform(kw_only_default=True, frozen_default=True, field_specifiers=(field, number))
@@ -94,10 +90,12 @@ class Fault:
     """Whether it draws random numbers."""
     holds: ClassVar[bool] = False
     """Whether it remembers a value to repeat it."""
+    late: ClassVar[tuple[str, ...]] = ()
+    """The numbers whose sum is the longest time, in seconds, by which a value can be late."""
     channel: str = field(kw_only=False)
-    onset: Number = 0.0
-    duration: Number | None = None
-    name: str | None = None
+    onset: Number = field(default=0.0, metadata={"ends": (-math.inf, math.inf)})
+    duration: Number | None = field(default=None, metadata={"ends": (0.0, math.inf)})
+    name: str = ""
 
     def __init_subclass__(cls, **traits: Any) -> None:
         for name, value in traits.items():
@@ -108,14 +106,13 @@ class Fault:
         kind = type(self).__name__
         if not isinstance(self.channel, str) or not self.channel.strip():
             raise ValueError(f"{kind} needs a channel, such as 'action'; got {self.channel!r}")
-        if self.name is None:
+        if not self.name:
+            words = re.sub(r"(?<=[a-z])(?=[A-Z])", "_", kind).lower()
             stem = re.sub(r"\W+", "_", self.channel).strip("_")
-            object.__setattr__(self, "name", f"{stem}_{_words(kind)}")
+            object.__setattr__(self, "name", f"{stem}_{words}")
         check_name("the name of a fault", self.name)
-        for name, (low, high) in self.all_ranges.items():
-            value, wanted = getattr(self, name), None
-            if value is None and name == "duration":
-                continue
+        for name, value in self.numbers.items():
+            (low, high), wanted = self.__dataclass_fields__[name].metadata["ends"], None
             if not is_number(value) and not (isinstance(value, Domain) and value.size == 1):
                 wanted = "a number, or a domain of one number such as vj.Box(0, 1)"
             elif not all(map(math.isfinite, ends(value))):
@@ -126,22 +123,12 @@ class Fault:
                 raise ValueError(f"{name} of {kind} must be {wanted}; got {value!r}")
 
     @property
-    def label(self) -> str:
-        """The name of the fault."""
-        assert self.name is not None
-        return self.name
-
-    @property
-    def all_ranges(self) -> dict[str, tuple[float, float]]:
-        """All numbers by name, each with the ends between which it has to lie."""
-        own = {each.name: each.metadata["ends"] for each in fields(self) if each.metadata}
-        return {**own, "onset": (-math.inf, math.inf), "duration": (0.0, math.inf)}
-
-    @property
     def numbers(self) -> dict[str, Number]:
-        """All numbers by name; no duration where the channel does not recover."""
-        values = {name: getattr(self, name) for name in self.all_ranges}
-        return {name: value for name, value in values.items() if value is not None}
+        """All numbers by name, those of the kind first; no duration if the fault never ends."""
+        timing = ("onset",) if self.duration is None else ("onset", "duration")
+        all_of_them = [each.name for each in fields(self) if each.metadata]
+        own = [name for name in all_of_them if name not in ("onset", "duration")]
+        return {name: getattr(self, name) for name in (*own, *timing)}
 
     @property
     def domains(self) -> dict[str, Domain]:
@@ -154,23 +141,18 @@ class Fault:
         ordered = (self.severity, "duration", "onset", *self.domains)
         return next(name for name in ordered if name in self.domains)
 
-    @property
-    def feature(self) -> FaultFeatures | None:
-        """The feature that the fault is; None for one of which nothing varies."""
-        nominal = {name: self.weakest(name) for name in self.domains}
-        return FaultFeatures(self.domains, nominal, self) if nominal else None
-
     def weakest(self, name: str) -> PyTree:
-        """Return the value of a number at which the fault is least: latest, shortest, weakest."""
-        low, high = ends(self.numbers[name])
-        wanted = {"onset": math.inf, "duration": 0.0, self.severity: self.off}.get(name)
-        value = (low + high) / 2 if wanted is None else min(max(wanted, low), high)
-        domain = self.numbers[name]
-        whole = isinstance(domain, Domain) and domain.levels != (0,)
-        return round(value) if whole else value
+        """Return the value of a number that varies in the weakest, shortest and latest fault."""
+        low, high = ends(self.domains[name])
+        wanted = {"onset": math.inf, "duration": 0.0, self.severity: self.off}
+        value = min(max(wanted.get(name, (low + high) / 2), low), high)
+        return value if self.domains[name].levels == (0,) else round(value)
 
     def memory(self, zero: Vector, period: float) -> PyTree:
         """Return what it remembers at first, for entries like `zero`."""
+        if self.late:
+            longest = sum(ends(self.numbers[name])[1] for name in self.late)
+            return line_of(zero, math.ceil(longest / period - 1e-6) + 1)
         return zero if self.holds else ()
 
     def corrupt(self, good: Vector, memory: PyTree, at: Moment) -> tuple[Vector, PyTree]:
@@ -202,28 +184,21 @@ class AtMost:
         object.__setattr__(self, "faults", faults)
 
     @property
-    def label(self) -> str:
-        """The name of the feature."""
-        return self.name
+    def domains(self) -> dict[str, Domain]:
+        """The choices, one for each fault that can happen at once."""
+        chosen = Categorical("none", *(fault.name for fault in self.faults))
+        return {str(i + 1): chosen for i in range(min(self.count, len(self.faults)))}
 
-    @property
-    def feature(self) -> FaultFeatures:
-        """The feature that says which faults happen."""
-        chosen = Categorical("none", *(fault.label for fault in self.faults))
-        slots = {str(i + 1): chosen for i in range(min(self.count, len(self.faults)))}
-        return FaultFeatures(slots, dict.fromkeys(slots, "none"))
+    def weakest(self, name: str) -> str:
+        """Return the choice of no fault."""
+        return "none"
 
 
 def ends(value: Number) -> tuple[float, float]:
-    """Return the least and the greatest that a number may be."""
+    """Return the lowest and the highest value of a number."""
     if not isinstance(value, Domain):
         return float(value), float(value)
     low, high = getattr(value, "low", None), getattr(value, "high", None)
     if not (is_number(low) and is_number(high)):
         low, high = (value.from_unit(jnp.full(1, end)) for end in (0.0, 1.0))
     return float(low), float(high)
-
-
-def _words(kind: str) -> str:
-    """Return the name of a kind as that of a feature: `loss_of_authority`."""
-    return re.sub(r"(?<=[a-z])(?=[A-Z])", "_", kind).lower()

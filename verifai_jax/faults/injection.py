@@ -1,10 +1,11 @@
-"""A fault in the loop of a system: the link that observations or actions pass through."""
+"""Faults in the loop of a system: links through which observations or actions pass."""
 
 import operator
 import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial, reduce
+from itertools import starmap
 from typing import Any
 
 import jax
@@ -12,9 +13,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Key, PyTree
 
-from verifai_jax.core.messages.errors import unknown_name
+from verifai_jax.core.messages.errors import check_names
 from verifai_jax.faults.chance import uniform
-from verifai_jax.faults.fault import AtMost, Fault, Moment
+from verifai_jax.faults.fault import AtMost, Fault, FaultFeatures, Moment
 from verifai_jax.faults.kinds import WrongChannel
 from verifai_jax.faults.smoothing import blend
 from verifai_jax.features import FeatureSpace
@@ -28,79 +29,61 @@ SLACK = 1e-3
 
 @dataclass(frozen=True)
 class Injected(Link):
-    """A fault, and where in an observation or an action it is.
+    """A fault at its channel, in the loop of a system; `inject` makes it.
 
+    - `entries`: the numbers of the channel; `other`: those that it has instead, if it does.
     - `choice`: the feature of `AtMost` that decides whether it happens, and its number there.
     """
 
     fault: Fault
     entries: Entries
-    other: Entries | None = None
-    choice: tuple[str, int] | None = None
-
-    @property
-    def side(self) -> Side:  # pyright: ignore[reportIncompatibleVariableOverride]
-        return self.entries.side
-
-    @property
-    def draws(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
-        return self.fault.draws
+    other: Entries | None
+    choice: tuple[str, int] | None
+    side: Side
+    draws: bool
 
     @property
     def features(self) -> tuple[str, ...]:
-        own = (self.fault.label,) if self.fault.domains else ()
+        own = (self.fault.name,) if self.fault.domains else ()
         return own if self.choice is None else (*own, self.choice[0])
 
     @property
     def arrays(self) -> tuple[str, ...]:
-        both = (self.entries, *([] if self.other is None else [self.other]))
+        both = [each for each in (self.entries, self.other) if each is not None]
         return tuple(n for e in both if e.side == "observation" for n in e.names if n)
 
     def check(self, features: PyTree) -> None:
-        for name in self.features:
-            if name not in features:
-                raise unknown_name("feature", name, features)
-
-    def numbers(self, features: PyTree) -> dict[str, Any]:
-        """Return the numbers of the fault in one simulation."""
-        drawn = features[self.fault.label] if self.fault.domains else {}
-        return {name: drawn.get(name, value) for name, value in self.fault.numbers.items()}
+        check_names("feature", self.features, features)
 
     def valid(self, features: PyTree) -> Any:
-        valid: Any = True
-        for name in self.fault.domains:
-            number = features[self.fault.label][name]
-            valid = valid & (abs(number) < np.inf)
-            if name == "duration":
-                valid = valid & (number >= 0)
-        return valid
+        numbers = [(name, features[self.fault.name][name]) for name in self.fault.domains]
+        return reduce(operator.and_, starmap(_can_be, numbers), True)
 
     def refusal(self, features: PyTree, owner: str) -> str | None:
         for name in self.fault.domains:
             # Of a table, whose columns have the names of both, or of a simulation.
-            column, whole = f"{self.fault.label}.{name}", features.get(self.fault.label)
+            column, whole = f"{self.fault.name}.{name}", features.get(self.fault.name)
             number = features.get(column) if whole is None else whole[name]
-            good = number is not None and np.isfinite(number)
-            if number is not None and not (good and (name != "duration" or number >= 0)):
-                return f"{name} of fault {self.fault.label!r} of {owner} must be a number; " + (
-                    "and it may not be negative; " * (name == "duration") + f"got {number}"
-                )
+            if number is not None and not _can_be(name, number):
+                wanted = f"a number{', 0 or more' * (name == 'duration')}; got {number}"
+                return f"{name} of fault {self.fault.name!r} of {owner} must be {wanted}"
         return None
 
     def begin(self, value: PyTree, now: Instant, key: Key[Array, ""] | int | None) -> PyTree:
-        host, number = now.xp is np, zlib.crc32(self.fault.label.encode())
+        host, number = now.xp is np, zlib.crc32(self.fault.name.encode())
         good = np.zeros(self.entries.count) if host else self.entries.take(value, jnp)
         memory = self.fault.memory(now.xp.zeros_like(good), now.period)
         if not self.draws:
-            return memory
+            return None, memory
         if host:
             return np.array([int(key or 0), number], np.uint32), memory
         key = jax.random.key(0) if key is None else key
         return jax.random.key_data(jax.random.fold_in(key, number))[-2:], memory
 
     def through(self, state: PyTree, value: PyTree, now: Instant) -> tuple[PyTree, PyTree]:
-        xp, number, possible = now.xp, self.numbers(now.features), self._happens(now.features)
-        seed, memory = state if self.draws else (None, state)
+        xp, (seed, memory), possible = now.xp, state, self._happens(now.features)
+        drawn = now.features[self.fault.name] if self.fault.domains else {}
+        number = {**self.fault.numbers, **drawn}
         other = None if self.other is None else self.other.take(value, xp)
         leaves, form = jax.tree.flatten(value)
         parts = [xp.asarray(leaves[i]) for i, _ in self.entries.parts]
@@ -112,13 +95,13 @@ class Injected(Link):
         parts, memory = change(passing, given)
         for (i, _), part in zip(self.entries.parts, parts, strict=True):
             leaves[i] = part
-        return jax.tree.unflatten(form, leaves), memory if seed is None else (seed, memory)
+        return jax.tree.unflatten(form, leaves), (seed, memory)
 
     def _severe(self, number: Mapping[str, Any]) -> Any:
         """Return whether it acts at any time."""
-        named = [name for name in (self.fault.severity, "duration") if name in number]
-        off = {"duration": 0.0, self.fault.severity: self.fault.off}
-        return reduce(operator.and_, (number[name] != off[name] for name in named), np.bool_(True))
+        off = {self.fault.severity: self.fault.off, "duration": 0.0}
+        differs = (number[name] != off[name] for name in off if name in number)
+        return reduce(operator.and_, differs, np.bool_(True))
 
     def _faulty(
         self, now: Instant, passing: tuple[list[Any], PyTree], given: tuple[Any, ...]
@@ -153,10 +136,14 @@ class Injected(Link):
     def _happens(self, features: PyTree) -> Any:
         if self.choice is None:
             return np.bool_(True)
-        happens: Any = np.bool_(False)
-        for chosen in features[self.choice[0]].values():
-            happens = happens | (chosen == self.choice[1])
-        return happens
+        chosen = (each == self.choice[1] for each in features[self.choice[0]].values())
+        return reduce(operator.or_, chosen, np.bool_(False))
+
+
+def _can_be(name: str, number: Any) -> Any:
+    """Return whether a number of a fault is finite, and a duration not negative."""
+    finite = abs(number) < np.inf
+    return finite & (number >= 0) if name == "duration" else finite
 
 
 def inject(fault: Fault, passing: Passing, choice: tuple[str, int] | None = None) -> Injected:
@@ -179,7 +166,7 @@ def inject(fault: Fault, passing: Passing, choice: tuple[str, int] | None = None
                 f"source of WrongChannel must be part of the same {entries.side} as "
                 f"{fault.channel!r}, with 1 or {entries.count} entries; got {fault.source!r}"
             )
-    return Injected(fault, entries, other, choice)
+    return Injected(fault, entries, other, choice, entries.side, fault.draws)
 
 
 def with_faults(problem: Problem, faults: Sequence[object], by_simulator: bool = False) -> Problem:
@@ -189,14 +176,14 @@ def with_faults(problem: Problem, faults: Sequence[object], by_simulator: bool =
         raise ValueError("with_faults needs at least one fault; got none")
     names, space = [*problem.space.domains], problem.space
     for each in (*(e for e in faults if isinstance(e, AtMost)), *(fault for fault, _ in chosen)):
-        if each.label in names:
+        if each.name in names:
             raise ValueError(
-                f"there is a feature or a fault {each.label!r} already: give the fault another "
+                f"there is a feature or a fault {each.name!r} already: give the fault another "
                 "name=..."
             )
-        names.append(each.label)
-        if each.feature is not None:
-            features[each.label] = each.feature
+        names.append(each.name)
+        if each.domains:
+            features[each.name] = FaultFeatures(each)
     system, nominal = problem.system, problem.nominal
     if not by_simulator:
         passing = system.passing(space.feature_form)
@@ -247,8 +234,7 @@ class OnHost:
             channels = Channels(links, period, features, np)
             self._loops[side] = channels, channels.begin(None, None, seed)
         channels, states = self._loops[side]
-        pass_on = channels.observation if side == "observation" else channels.action
-        value, states = pass_on(states, value, time)
+        value, states = getattr(channels, side)(states, value, time)
         self._loops[side] = channels, states
         return value
 

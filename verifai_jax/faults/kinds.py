@@ -9,9 +9,9 @@ import numpy as np
 from jaxtyping import PyTree
 
 from verifai_jax.faults.chance import normal
-from verifai_jax.faults.fault import Fault, Moment, Number, Vector, ends, number
+from verifai_jax.faults.fault import Fault, Moment, Number, Vector, number
 from verifai_jax.faults.smoothing import straight
-from verifai_jax.systems.delays import entry, line_of, moved_up
+from verifai_jax.systems.delays import entry, moved_up
 
 
 class Dropout(Fault):
@@ -51,18 +51,15 @@ class HeldAction(Fault, severity="hold", holds=True):
         return held, held
 
 
-class Delay(Fault, severity="seconds"):
+class Delay(Fault, severity="seconds", late=("seconds", "swing")):
     """The channel is `seconds` late, in whole periods.
 
-    It swings by `swing` seconds up and down once in `cycle` seconds.
+    The delay swings up and down by `swing` seconds, once in `cycle` seconds.
     """
 
     seconds: Number = number(0)
     swing: Number = number(0, default=0.0)
     cycle: Number = number(1e-9, default=1.0)
-
-    def memory(self, zero: Vector, period: float) -> PyTree:
-        return _line(zero, (ends(self.seconds)[1] + ends(self.swing)[1]) / period)
 
     def corrupt(self, good: Vector, memory: PyTree, at: Moment) -> tuple[Vector, PyTree]:
         number = at.number
@@ -70,13 +67,10 @@ class Delay(Fault, severity="seconds"):
         return _late(good, memory, number["seconds"] + number["swing"] * turn, at)
 
 
-class ClockJitter(Fault, severity="jitter", draws=True):
+class ClockJitter(Fault, severity="jitter", draws=True, late=("jitter",)):
     """Each value is late by a random time up to `jitter` seconds, in whole periods."""
 
     jitter: Number = number(0)
-
-    def memory(self, zero: Vector, period: float) -> PyTree:
-        return _line(zero, ends(self.jitter)[1] / period)
 
     def corrupt(self, good: Vector, memory: PyTree, at: Moment) -> tuple[Vector, PyTree]:
         return _late(good, memory, at.uniform(1)[0] * at.number["jitter"], at)
@@ -92,7 +86,7 @@ class PacketLoss(Fault, severity="loss", draws=True, holds=True):
         held = at.xp.where(lost, memory, good)
         if at.xp is np or good.dtype.kind != "f":
             return held, held
-        # On average: the derivative of the probability with which the older value is used.
+        # The derivative of the mean: the older value is used with probability `loss`.
         expected = held + (memory - good) * at.number["loss"]
         constant = (memory - good) * jax.lax.stop_gradient(at.number["loss"])
         return straight(held, expected - constant), held
@@ -150,7 +144,7 @@ class Quantisation(Fault, severity="step", choices=False):
         rounded = at.xp.round(exact) * step
         if at.xp is np:
             return rounded, memory
-        # Rounding has no slope: the value is followed, and the remainder grows with the step.
+        # Rounding has no slope: it is 1 by the value, and the remainder's by the step.
         left = jax.lax.stop_gradient(at.xp.round(exact) - exact)
         return straight(rounded, good + left * step), memory
 
@@ -191,22 +185,11 @@ class WrongChannel(Fault):
         return at.other, memory
 
 
-KINDS: tuple[type[Fault], ...] = (
-    Delay, Dropout, Freeze, Bias, Drift, Noise, Spikes, Quantisation, Saturation, Stuck,
-    LossOfAuthority, HeldAction, PacketLoss, ClockJitter, SignFlip, WrongChannel,
-)  # fmt: skip
-"""All kinds."""
-
-
-def _line(zero: Vector, periods: float) -> Any:
-    return line_of(zero, math.ceil(periods - 1e-6) + 1)
-
-
 def _late(good: Vector, line: Any, seconds: Any, at: Moment) -> tuple[Vector, Any]:
     """Return the value of some seconds ago, in whole periods, and the line with the newest."""
     xp, line = at.xp, moved_up(line, good, at.xp)
     if not at.acts:
-        # Before the first observation there was none other; before the first action, no action.
+        # The line begins with the first observation; before the first action there is none.
         line = jax.tree.map(lambda values: xp.where(at.first, good, values), line)
     latest = len(line) - 1
     periods = xp.clip(seconds / at.period, 0, latest)

@@ -28,9 +28,9 @@ def blend(
 ) -> Float[Array, " n"]:
     """Return `bad` where `on` and `good` elsewhere, with derivatives by the edges.
 
-    Between two samples a fault that begins a little earlier changes nothing. The derivative is
-    that of the line between the values at both samples: with it the sum over the samples of a
-    simulation grows by one for each period by which the fault is longer.
+    A fault that begins a little earlier, between two samples, changes no value. The derivative is
+    therefore that of the line between the values at both samples: the sum over the samples grows by
+    one difference for each period by which the fault is longer.
 
     **Arguments:**
     - `on`: whether the fault acts; `live`: whether the instant lies in its time, so that it would

@@ -14,7 +14,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, TypeAlias
 
-from verifai_jax.core.display.notebook import InNotebook, frame_html
+from verifai_jax.core.display.notebook import Tabular
 from verifai_jax.core.messages.text import counted
 from verifai_jax.core.values.trace import Trace
 from verifai_jax.mtl import formula as ast
@@ -69,7 +69,7 @@ class Mutant:
 
 
 @dataclass(frozen=True)
-class Mutants(InNotebook):
+class Mutants(Tabular):
     """The mutants of a formula, killed and surviving; `str()` lists the surviving ones."""
 
     formula: Formula
@@ -124,9 +124,6 @@ class Mutants(InNotebook):
         return "\n".join(lines)
 
     __str__ = summary
-
-    def _notebook_parts(self) -> Iterator[str]:
-        yield frame_html(self.table)
 
 
 def mutants(

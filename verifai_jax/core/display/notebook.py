@@ -2,6 +2,7 @@
 
 class Estimate(InNotebook): ...     # `_repr_html_` is its text
 class Replay(InNotebook): ...       # ... and what `_notebook_parts` returns, such as its picture
+class Mutants(Tabular): ...         # ... and its `table`, which `to_csv` writes
 """
 
 import base64
@@ -9,9 +10,11 @@ import functools
 import html
 import io
 from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar, TypeVar
 
 from verifai_jax.core.display.figure import Figure
+from verifai_jax.core.display.lazy import lazy_import
 from verifai_jax.core.messages.text import printable
 
 if TYPE_CHECKING:
@@ -51,6 +54,24 @@ class InNotebook(ForUsers):
 
     def _repr_html_(self) -> str:
         return "\n".join([text_html(str(self)), *self._notebook_parts()])
+
+
+class Tabular(InNotebook):
+    """A result with a `table`, which a notebook shows."""
+
+    def to_csv(self, path: str | Path) -> Path:
+        """Write the table as CSV; return the path.
+
+        **Raises:** `OSError` that names the file, for whatever the file system refuses.
+        """
+        table: pd.DataFrame = self.table  # pyright: ignore[reportAttributeAccessIssue]
+        replacing = lazy_import("verifai_jax.core.store.atomic_files", "replacing")
+        with replacing(path) as partial:
+            table.to_csv(partial, index=table.index.name is not None)
+        return Path(path)
+
+    def _notebook_parts(self) -> Iterable[str]:
+        return [frame_html(self.table)]  # pyright: ignore[reportAttributeAccessIssue]
 
 
 def _in_printable_characters(write: Callable[[T], str]) -> Callable[[T], str]:

@@ -6,11 +6,10 @@ budget.low, budget.high; budget["step"].low; budget.prior.radius
 """
 
 import math
-from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from verifai_jax.core.display.notebook import InNotebook, frame_html
+from verifai_jax.core.display.notebook import Tabular
 from verifai_jax.core.messages.text import format_percent
 
 if TYPE_CHECKING:
@@ -79,7 +78,7 @@ class PriorError:
 
 
 @dataclass(frozen=True)
-class ErrorBudget(InNotebook):
+class ErrorBudget(Tabular):
     """The error of a number, split into parts, as `error_budget` returns it.
 
     - `name`: the name of the problem; `what`: a description of the number.
@@ -148,9 +147,6 @@ class ErrorBudget(InNotebook):
             ends = f"{part.low:+z.2g} to {part.high:+z.2g}" if part.measured else "not measured"
             lines.append(f"  {part.name:<12} {ends}\n    {part.text}")
         return "\n".join([*lines, f"  prior\n    {self.prior}"])
-
-    def _notebook_parts(self) -> Iterable[str]:
-        yield frame_html(self.table)
 
 
 PROBABILITY = "the failure probability"

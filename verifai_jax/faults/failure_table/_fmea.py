@@ -24,11 +24,11 @@ from verifai_jax.core.messages.checks import check_count, check_fraction, is_num
 from verifai_jax.core.messages.errors import check_names, suggests_options
 from verifai_jax.core.store.cache import locked_cache
 from verifai_jax.evaluation.backends import resolved
-from verifai_jax.falsification import load, simulate
+from verifai_jax.falsification import simulate
 from verifai_jax.falsification.run import Run
-from verifai_jax.faults.failure_table.effects import Found, effect_of
+from verifai_jax.faults.failure_table.effects import with_counterexample
 from verifai_jax.faults.failure_table.result import FailureTable
-from verifai_jax.faults.failure_table.rows import Rows
+from verifai_jax.faults.failure_table.rows import Points, Rows
 from verifai_jax.faults.fault import AtMost, Fault, FaultFeatures
 from verifai_jax.problem.problem import Problem
 
@@ -101,22 +101,24 @@ def fmea(
         healthy = not rows("healthy", rows.nominal.u[None])[0][0]
         found = [rows.try_out((name,), samples, budget) for name in known]
         if pairs:
-            safe = [each.faults[0] for each in found if not len(each.candidates)]
+            safe = [effect.name for effect, _ in found if not effect.fails]
             both = [rows.try_out(pair, samples, 0) for pair in itertools.combinations(safe, 2)]
-            found += [each for each in both if len(each.candidates)]
-        starts = itertools.accumulate((len(each.candidates) for each in found), initial=0)
-        found = [each._replace(first=first) for each, first in zip(found, starts, strict=False)]
-        run, verdicts = _run_of(rows, found, folder, target), {}
+            found += [each for each in both if each[0].fails]
+        run, verdicts, last = _run_of(rows, [points for _, points in found], folder, target), {}, 0
         if run is not None:
             again = confirm(run, max_rows=len(run.table), progress=False)
             verdicts = dict(zip(again.numbers.tolist(), again.verdict.tolist(), strict=True))
-        for each in found:
-            known_rates = [] if rates is None else [rates[name] for name in each.faults]
+        for effect, points in found:
+            first, last = last, last + len(points)
+            known_rates = [] if rates is None else [rates[name] for name in effect.faults]
             chance = math.prod(-math.expm1(-one * (mission_time or 0.0)) for one in known_rates)
-            numbers = (chance * rows.probability(each, confidence, budget)).tolist()
-            within = dict(zip(("low", "high", "probability"), numbers, strict=True))
-            effect = effect_of(run, each, known, verdicts)
-            effects.append(replace(effect, occurrence=chance, **within))
+            given = rows.probability(effect, confidence, budget)
+            low, high, probability = (chance * given).tolist()
+            if run is not None:
+                own = {row: verdicts[row] for row in range(first, last) if row in verdicts}
+                effect = with_counterexample(effect, run, own, known)
+            bounds = {"probability": probability, "low": low, "high": high}
+            effects.append(replace(effect, occurrence=chance, **bounds))
     effects.sort(key=lambda effect: (-effect.fails, -effect.probability, effect.faults))
     return FailureTable(
         faulty.name, tuple(effects), run, rates, mission_time, confidence, bool(healthy),
@@ -125,24 +127,19 @@ def fmea(
 
 
 def _run_of(
-    rows: Rows, found: list[Found], folder: str | Path | None, target: str | None
+    rows: Rows, points: list[Points], folder: str | Path | None, target: str | None
 ) -> Run | None:
-    """Simulate the candidates of all faults as one run; None without any."""
-    points = [each.candidates for each in found if len(each.candidates)]
-    if not points:
+    """Simulate the failing points of all faults as one run; None without any."""
+    failing = np.concatenate(points)
+    if not len(failing):
         return None
     space = rows.problem.space
-    given = space.features_at(np.asarray(rows.nominal.settle(np.concatenate(points))))
-    frame = pd.DataFrame(space.rows(given))
-    if folder is None:
-        return simulate(rows.problem, frame, seed=rows.seed, progress=False)
-    path = Path(folder) / "counterexamples"
-    if rows.cache.note("counterexamples") is None:
-        # A run that was cut off is made again: it takes seconds.
+    frame = pd.DataFrame(space.rows(space.features_at(rows.nominal.settle(failing))))
+    path = None if folder is None else Path(folder) / "counterexamples"
+    if path is not None:
+        # Made again each time: it takes seconds, as its confirmation does.
         shutil.rmtree(path, ignore_errors=True)
-        simulate(rows.problem, frame, seed=rows.seed, folder=path, target=target, progress=False)
-        rows.cache.note("counterexamples", len(frame))
-    return load(path, rows.problem)
+    return simulate(rows.problem, frame, seed=rows.seed, folder=path, target=target, progress=False)
 
 
 def _faults_of(problem: Problem) -> dict[str, Fault]:
@@ -154,10 +151,9 @@ def _faults_of(problem: Problem) -> dict[str, Fault]:
     for name, domain in problem.space.domains.items():
         if not isinstance(domain, FaultFeatures):
             continue
-        if domain.fault is None:
-            raise ValueError(f"fmea takes faults one by one; {name!r} is {AtMost.__name__}")
-        fault = domain.fault
-        weakest = {number: fault.weakest(number) for number in fault.domains}
+        fault, weakest = domain.fault, domain.nominal
+        if isinstance(fault, AtMost):
+            raise ValueError(f"fmea takes faults one by one; {name!r} is AtMost")
         if weakest.get("duration") != 0 and weakest.get(fault.severity) != fault.off:
             at = ", ".join(f"{number} {value:zg}" for number, value in weakest.items())
             raise ValueError(
@@ -183,12 +179,9 @@ def _rates(
         return None
     rates = dict(rate) if isinstance(rate, Mapping) else dict.fromkeys(known, rate)
     check_names("fault", rates, known)
-    for name in known:
-        if not is_number(rates.get(name)) or not 0 <= rates[name] < np.inf:
-            raise ValueError(
-                f"rate of fault {name!r} must be a number of occurrences in an hour, 0 or more; "
-                f"got {rates.get(name)!r}"
-            )
-    if not is_number(mission_time) or not 0 <= mission_time < np.inf:
-        raise ValueError(f"mission_time must be a number of hours; got {mission_time!r}")
+    numbers = {f"rate of fault {n!r}": (rates.get(n), "occurrences in an hour") for n in known}
+    numbers["mission_time"] = (mission_time, "hours")
+    for name, (value, unit) in numbers.items():
+        if not is_number(value) or not 0 <= value < np.inf:
+            raise ValueError(f"{name} must be a number of {unit}, 0 or more; got {value!r}")
     return rates

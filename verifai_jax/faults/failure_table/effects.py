@@ -4,12 +4,8 @@ import math
 import shlex
 from collections.abc import Mapping
 from dataclasses import replace
-from pathlib import Path
-from typing import NamedTuple
 
-import jax
 import numpy as np
-from jaxtyping import Float
 
 from verifai_jax.core.compute.keys import run_keys
 from verifai_jax.core.values.trace import Trace
@@ -24,55 +20,34 @@ DIFFERS = 0.05
 """Share of the range of a signal by which it has to differ before it shows a fault."""
 
 
-class Found(NamedTuple):
-    """The findings on a fault or a pair.
-
-    - `candidates`: failing points `[n, d]`, the least severe first.
-    - `failures`, `without`, `simulations`: of the samples: failing, without a verdict, all.
-    - `first`: the row of the first of the candidates in the run of the table.
-    """
-
-    faults: tuple[str, ...]
-    candidates: Float[np.ndarray, "n d"]
-    failures: int
-    without: int
-    simulations: int
-    first: int = 0
-
-
-def effect_of(
-    run: Run | None, found: Found, faults: Mapping[str, Fault], verdicts: Mapping[int, str]
+def with_counterexample(
+    effect: Effect, run: Run, verdicts: Mapping[int, str], faults: Mapping[str, Fault]
 ) -> Effect:
-    """Return what is known of a fault or a pair, without probabilities.
+    """Return an effect with its counterexample, and with what that shows.
 
     **Arguments:**
-    - `run`: with the candidates as rows; `verdicts`: of the confirmation, by row.
+    - `run`: the run of the table; `verdicts`: of the confirmation, by row, of the failures of this
+      fault or pair, the least severe first.
     - `faults`: all of them by name.
     """
-    effect = Effect(found.faults, len(found.candidates) > 0, found.failures, found.simulations)
-    rows = range(found.first, found.first + len(found.candidates))
     # The first that is confirmed; without one, the first that fails at all.
-    known = [row for row in rows if row in verdicts]
-    tried = sorted(known, key=lambda row: verdicts[row] != "confirmed")
-    if run is None or run.problem is None or not tried:
+    row = min(verdicts, key=lambda row: verdicts[row] != "confirmed", default=None)
+    if row is None or run.problem is None:
         return effect
-    again, space = run.replay(tried[0]), run.problem.space
+    again, own = run.replay(row), {name: faults[name] for name in effect.faults}
     columns = again.columns()
-    onset = min(
-        float(columns.get(f"{name}.onset", faults[name].numbers["onset"]))  # pyright: ignore[reportArgumentType]
-        for name in found.faults
-    )
-    healthy = {**again.features, **{name: space.domains[name].nominal for name in found.faults}}
-    batch = jax.tree.map(lambda leaf: np.asarray(leaf)[None], space.coerce(healthy))
-    one = {name: np.asarray(column)[0] for name, column in space.rows(batch).items()}
-    without = simulate_again(run.problem, one, run_keys(run.seed)[1], tried[0], run.precision)
+    fixed = {f"{name}.onset": fault.numbers["onset"] for name, fault in own.items()}
+    onset = min(float({**fixed, **columns}[name]) for name in fixed)
+    off = {f"{name}.{n}": fault.weakest(n) for name, fault in own.items() for n in fault.domains}
+    key = run_keys(run.seed)[1]
+    without = simulate_again(run.problem, {**columns, **off}, key, row, run.precision)
     shown_by, shown = _first_difference(again.trace, without.trace)
-    numbers = [f"{name}.{faults[name].grade}" for name in found.faults]
+    grades = [f"{name}.{fault.grade}" for name, fault in own.items()]
     return replace(
-        effect, row=tried[0], severity={number: float(columns[number]) for number in numbers},
-        verdict=verdicts[tried[0]], broken=again.worst,
+        effect, row=row, severity={number: float(columns[number]) for number in grades},
+        verdict=verdicts[row], broken=again.worst,
         delay=_violation(again, onset) - max(onset, 0.0), shown_by=shown_by,
-        shown_after=shown - max(onset, 0.0), command=_command(run, tried[0]),
+        shown_after=shown - max(onset, 0.0), command=_command(run, row),
     )  # fmt: skip
 
 
@@ -88,20 +63,19 @@ def _violation(again: Replay, onset: float) -> float:
 
 
 def _first_difference(trace: Trace, without: Trace) -> tuple[str, float]:
-    """Return the signal that differs first, the most of several, and when, in seconds."""
-    clock = np.asarray(trace.clock())
-    best: tuple[float, float, str] | None = None
+    """Return the signal that differs first, of several the one that differs more, and when."""
+    clock, found = np.asarray(trace.clock()), []
     for name, signal in trace.signals.items():
-        one, other = np.asarray(signal, float), np.asarray(without.signals[name], float)
-        count = min(len(one), len(other))
-        one, other = one[:count].reshape(count, -1), other[:count].reshape(count, -1)
+        other = np.asarray(without.signals[name], float)
+        one = np.asarray(signal, float)[: len(other)]
+        other = other[: len(one)]
         spread = np.maximum(np.ptp(other, axis=0), 1e-3 * np.abs(other).max(axis=0) + 1e-9)
-        apart = (np.abs(one - other) / spread).max(axis=1)
+        apart = (np.abs(one - other) / spread).reshape(len(one), -1).max(axis=1)
         if (apart > DIFFERS).any():
             at = int(np.argmax(apart > DIFFERS))
-            entry = (float(clock[at]), -float(apart[at]), name)
-            best = entry if best is None else min(best, entry)
-    return ("", math.nan) if best is None else (best[2], best[0])
+            found.append((float(clock[at]), -float(apart[at]), name))
+    when, _, name = min(found, default=(math.nan, 0.0, ""))
+    return name, when
 
 
 def _command(run: Run, row: int) -> str:
@@ -109,4 +83,4 @@ def _command(run: Run, row: int) -> str:
         return f"table.run.replay({row})"
     if run.target is None:
         return f"vj.load({str(run.folder)!r}, problem).replay({row})"
-    return shlex.join(["verifai-jax", "replay", str(Path(run.folder)), str(row)])
+    return shlex.join(["verifai-jax", "replay", str(run.folder), str(row)])

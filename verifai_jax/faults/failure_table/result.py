@@ -3,15 +3,12 @@
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from verifai_jax.core.display.figure import Drawn
-from verifai_jax.core.display.lazy import lazy_import
-from verifai_jax.core.display.notebook import InNotebook, frame_html
+from verifai_jax.core.display.figure import Drawn, Reported
+from verifai_jax.core.display.notebook import Tabular
 from verifai_jax.core.messages.errors import check_names
 from verifai_jax.core.messages.text import format_percent, format_seconds
-from verifai_jax.core.store.atomic_files import replacing
 from verifai_jax.falsification.run import Run
 
 if TYPE_CHECKING:
@@ -23,15 +20,16 @@ class Effect:
     """The effect of a fault, or of a pair of faults.
 
     - `faults`: their names.
-    - `fails`: whether any simulation with it, and without another fault, breaks the property.
+    - `fails`: whether any simulation with these faults alone breaks the property.
     - `failures`, `simulations`: the samples of the fault's prior that `probability` rests on.
-    - `severity`: the least at which one does, by the name of the number; empty if none does.
+    - `undecided`: those among them without a verdict.
+    - `severity`: the lowest at which it fails, by the name of the number; empty if it never does.
     - `row`: the row of the counterexample in the run of the table; None if there is none.
     - `verdict`: the verdict of the confirmation of that counterexample, see `vj.confirm`.
     - `broken`: the name of the formula.
     - `delay`: seconds from the onset to the violation.
     - `shown_by`: the signal that differs first from the same simulation without the fault;
-      `shown_after` seconds from the onset.
+      `shown_after`: seconds from the onset until it does.
     - `occurrence`: probability that it happens in a mission.
     - `probability`, `low`, `high`: of a mission that fails by it, with the interval.
     - `command`: what simulates the counterexample again.
@@ -41,6 +39,7 @@ class Effect:
     fails: bool
     failures: int
     simulations: int
+    undecided: int = 0
     severity: Mapping[str, float] = field(default_factory=dict)
     row: int | None = None
     verdict: str = ""
@@ -93,7 +92,7 @@ COLUMNS = {
 
 
 @dataclass(frozen=True, eq=False)
-class FailureTable(Drawn, InNotebook):
+class FailureTable(Drawn, Reported, Tabular):
     """Faults and their effects, the most probable failure first; made by `fmea`.
 
     - `name`: the name of the problem.
@@ -129,25 +128,17 @@ class FailureTable(Drawn, InNotebook):
 
         **Raises:** `UnknownNameError` for a fault that has none.
         """
-        check_names("row of the failure table", [name], [each.name for each in self.effects])
-        return next(each for each in self.effects if each.name == name)
+        rows = {each.name: each for each in self.effects}
+        check_names("row of the failure table", [name], rows)
+        return rows[name]
 
     @property
     def table(self) -> "pd.DataFrame":
         """A row for each effect, by name."""
         import pandas as pd
 
-        rows = [[getattr(each, name) for name in COLUMNS.values()] for each in self.effects]
-        names = pd.Index([each.name for each in self.effects], name="fault")
-        return pd.DataFrame(rows, index=names, columns=list(COLUMNS))
-
-    def to_csv(self, path: str | Path) -> None:
-        """Write the table to a file.
-
-        **Raises:** `OSError` that names the file, for whatever the file system refuses.
-        """
-        with replacing(path) as partial:
-            self.table.to_csv(partial)
+        columns = {name: [getattr(each, of) for each in self] for name, of in COLUMNS.items()}
+        return pd.DataFrame(columns, pd.Index([each.name for each in self], name="fault"))
 
     def replay(self, name: str) -> Any:
         """Simulate the counterexample of a row again, and keep the trace.
@@ -158,15 +149,6 @@ class FailureTable(Drawn, InNotebook):
         if effect.row is None or self.run is None:
             raise ValueError(f"{name} has no counterexample: nothing failed with it")
         return self.run.replay(effect.row)
-
-    def report(self, path: str | Path, **options: Any) -> Path:
-        """Write the evidence report on the table as HTML, and its claims as JSON.
-
-        **Arguments:**
-        - `path`: the path of the HTML file, which is returned.
-        - `options`: the options of `reports.write_report`: `problem`, `units`, `reasons`.
-        """
-        return lazy_import("verifai_jax.reports", "write_report")(self, path, **options)
 
     def __str__(self) -> str:
         failing = [each for each in self.effects if each.fails]
@@ -183,6 +165,3 @@ class FailureTable(Drawn, InNotebook):
         return "\n".join(lines)
 
     __repr__ = __str__
-
-    def _notebook_parts(self) -> Iterator[str]:
-        yield frame_html(self.table)

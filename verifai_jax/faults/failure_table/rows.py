@@ -1,7 +1,8 @@
-"""Simulations for a failure table: samples of faults, searches, and the least that still fails."""
+"""Simulations for a failure table: samples of faults, searches, and the weakest failures."""
 
 import zlib
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -12,7 +13,7 @@ from verifai_jax.core.store.cache import Cache
 from verifai_jax.estimation import estimate
 from verifai_jax.evaluation.evaluator import Evaluator
 from verifai_jax.falsification import falsify
-from verifai_jax.faults.failure_table.effects import Found
+from verifai_jax.faults.failure_table.result import Effect
 from verifai_jax.faults.fault import Fault
 from verifai_jax.problem.dependence import depends_on_key
 from verifai_jax.problem.problem import Problem
@@ -21,35 +22,33 @@ from verifai_jax.statistics.binomial import clopper_pearson
 if TYPE_CHECKING:
     from verifai_jax.core.compute.executors import Executor
 LEVELS = 33
-"""Severities of one line at once; two lines, one within the other, tell a thousandth apart."""
+"""Severities on one line at once; two lines, one within the other, resolve a thousandth."""
 FOLLOWED = 6
 """Failing samples of a fault whose severity is lowered."""
 FEW = 10
 """Failing samples below which a search looks for others, and importance sampling or splitting
 estimates the probability."""
 TRIED = 32
-"""Failing samples that are simulated again beside the lowered ones: at the edge of failure another
+"""Failing samples that are simulated again with the lowered ones: at the edge of failure another
 step, or another random key, may decide otherwise."""
 Points = Float[np.ndarray, "n d"]
 
 
+@dataclass(eq=False)
 class Rows:
     """Simulations of one problem with all faults; what was simulated before is remembered."""
 
-    def __init__(
-        self,
-        problem: Problem,
-        faults: Mapping[str, Fault],
-        cache: Cache,
-        seed: int,
-        executor: "Executor | None",
-    ) -> None:
-        self.problem, self.faults, self.cache = problem, faults, cache
-        self.rng, self.seed, self.executor = np.random.default_rng(seed), seed, executor
-        self.nominal = Nominal.of(problem)
+    problem: Problem
+    faults: Mapping[str, Fault]
+    cache: Cache
+    seed: int
+    executor: "Executor | None"
+
+    def __post_init__(self) -> None:
+        self.rng, self.nominal = np.random.default_rng(self.seed), Nominal.of(self.problem)
         self.groups: dict[str, Int[np.ndarray, " k"]] = dict(self.nominal.groups)
-        self.draws = depends_on_key(problem)
-        self._evaluate = Evaluator(problem, 512, seed=seed, executor=executor)
+        self.draws = depends_on_key(self.problem)
+        self._evaluate = Evaluator(self.problem, 512, seed=self.seed, executor=self.executor)
         self._count = 0
 
     def coordinate(self, fault: str, number: str) -> int:
@@ -68,37 +67,40 @@ class Rows:
         known = self.cache.remember(f"{what}/{zlib.crc32(points.tobytes())}", simulated)
         return known["violated"], known["proper"]
 
-    def try_out(self, names: tuple[str, ...], samples: int, budget: int) -> Found:
-        """Sample a fault or a pair, search where few samples fail, and lower what fails."""
+    def try_out(self, names: tuple[str, ...], samples: int, budget: int) -> tuple[Effect, Points]:
+        """Sample a fault or a pair, search where few samples fail, and lower what fails.
+
+        **Returns:** the effect as far as it is known, and failing points, the least severe first.
+        """
         points = np.repeat(self.nominal.u[None], samples, axis=0)
         for name in names:
             points[:, self.groups[name]] = self.rng.random((samples, len(self.groups[name])))
         violated, proper = self(f"samples/{'+'.join(names)}", points)
         failing = points[violated]
         if len(failing) < FEW and budget:
-            # A few failures by chance may all be refuted: the worst of a search are less so.
+            # A few failures by chance may all be refuted; the worst of a search seldom are.
             failing = np.concatenate([failing, self._searched(names, budget)])
         if len(failing):
             failing = self._lowered(names, failing)
-        return Found(names, failing, int(violated.sum()), int((~proper).sum()), samples)
+        failures, undecided = int(violated.sum()), int((~proper).sum())
+        return Effect(names, len(failing) > 0, failures, samples, undecided), failing
 
-    def probability(self, found: Found, confidence: float, budget: int) -> Float[np.ndarray, "3"]:
+    def probability(self, effect: Effect, confidence: float, budget: int) -> Float[np.ndarray, "3"]:
         """Return the interval and the probability of a failure, given that the faults happen."""
-        rate = clopper_pearson(found.failures, found.simulations, confidence, found.without)
-        enough = not len(found.candidates) or found.failures >= FEW
-        if enough or not budget or len(found.faults) > 1:
+        rate = clopper_pearson(effect.failures, effect.simulations, confidence, effect.undecided)
+        enough = not effect.fails or effect.failures >= FEW
+        if enough or not budget or len(effect.faults) > 1:
             return np.array([rate.low, rate.high, rate.estimate])
 
         def estimated() -> dict[str, np.ndarray]:
             seen = estimate(
-                self.problem.only(*found.faults), budget=2 * budget, confidence=confidence,
+                self.problem.only(*effect.faults), budget=2 * budget, confidence=confidence,
                 seed=self.seed, progress=False, executor=self.executor,
             )  # fmt: skip
             chance = rate.estimate if seen.probability is None else seen.probability
             return {"interval": np.array([seen.low, seen.high, chance])}
 
-        name = f"estimate/{'+'.join(found.faults)}/{confidence}"
-        return self.cache.remember(name, estimated)["interval"]
+        return self.cache.remember(f"estimate/{effect.name}/{confidence}", estimated)["interval"]
 
     def _searched(self, names: Sequence[str], budget: int) -> Points:
         """Return the worst failing points that a search finds."""

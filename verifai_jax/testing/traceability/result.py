@@ -5,14 +5,12 @@ matrix.complete; matrix.missing; matrix.suspect
 matrix.table; matrix.to_csv("trace.csv"); matrix.report("trace.html")
 """
 
-from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, NamedTuple
 
-from verifai_jax.core.display.notebook import InNotebook, frame_html
+from verifai_jax.core.display.notebook import Tabular
 from verifai_jax.core.messages.text import counted, listed, shorten
-from verifai_jax.core.store.atomic_files import replacing
 from verifai_jax.reports.markup import Child, element, paragraph, table
 from verifai_jax.reports.page import Page, Section, write_page
 
@@ -56,7 +54,7 @@ class TraceRow(NamedTuple):
 
 
 @dataclass(frozen=True)
-class TraceMatrix(InNotebook):
+class TraceMatrix(Tabular):
     """The chain requirement, formula, problem, tests, runs, claims, report.
 
     **Fields:** `rows`, one for each requirement and problem; `gaps`; `asked`, the requested kinds
@@ -99,12 +97,6 @@ class TraceMatrix(InNotebook):
             rows.append([*row[:4], *links, "; ".join(gaps)])
         return rows
 
-    def to_csv(self, path: str | Path) -> Path:
-        """Write the table as CSV; return the path."""
-        with replacing(path) as partial:
-            self.table.to_csv(partial, index=False)
-        return Path(path)
-
     def summary(self) -> str:
         """Return the matrix as text: what each requirement has, and every gap in a sentence."""
         known = {row.requirement for row in self.rows if row.requirement}
@@ -129,9 +121,6 @@ class TraceMatrix(InNotebook):
 
     def __str__(self) -> str:
         return self.summary()
-
-    def _notebook_parts(self) -> Iterable[str]:
-        yield frame_html(self.table)
 
     def report(self, path: str | Path) -> Path:
         """Write the matrix as one HTML file; return its path."""

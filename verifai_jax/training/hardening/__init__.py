@@ -2,14 +2,9 @@
 
 result = vj.harden(study)
 print(result)                           # failure probability before and after, return lost, cost
+result.table, result.policy, result.plot("hardening.png")
 """
 
-from verifai_jax.training.hardening._harden import harden
-from verifai_jax.training.hardening.mixture import HardeningError
-from verifai_jax.training.hardening.result import Hardening
-
-__all__ = ["Hardening", "HardeningError", "harden"]
-
-
-def __dir__() -> list[str]:
-    return list(__all__)
+from verifai_jax.training.hardening._harden import harden as harden
+from verifai_jax.training.hardening.mixture import HardeningError as HardeningError
+from verifai_jax.training.hardening.result import Hardening as Hardening

@@ -55,10 +55,10 @@ CERTIFIED = ("failures", "simulations", "failure_rate", "failure_low", "failure_
              "attack_failures", "cost")  # fmt: skip
 """Columns of a certificate that the table has."""
 OWN_STEP, OWN_LIMIT = 0.25, 0.75
-"""Share of episodes that become the task's own after a round that does not keep the return, and
-cease to be after one that does; and how many are its own at most."""
+"""The task's own share of the episodes grows by the first after a round that loses return, at most
+to the second, and falls again after a round that keeps the return."""
 TABLE, SHRUNK = 512, 4
-"""Uniform samples beside the counterexamples of a round, and counterexamples that are shrunk."""
+"""Samples of the prior in the table of a round, and counterexamples that are shrunk."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,17 +131,18 @@ def harden(
 ) -> Hardening:
     """Train a policy, and go on training where it fails until it is certified.
 
-    The policy is trained on the task's own episodes first. Then each round attacks it, confirms
-    and shrinks what fails, and goes on training with a mixture of episodes: the task's own, the
-    prior of the problem's features, and neighbourhoods of failing samples of it, of counterexamples
-    of the attack, of shrunk ones, and of samples within the rules of the error table; those that
-    the policy has mastered make room for new ones. Each round's policy is certified. Of the
-    policies whose return is within `tolerance` of the first one's, the one that fails least is
-    returned, and never one that a paired comparison shows to be worse than the first.
+    The policy is trained on the task's own episodes first. Then each round attacks it, confirms and
+    shrinks the failures, and goes on training with a mixture of episodes: the task's own, the prior
+    of the problem's features, and neighbourhoods of failures. These are failing samples of the
+    prior, counterexamples of the attack, shrunk ones, and samples within the rules of the error
+    table; points that the policy has mastered make room for new ones. Each round's policy is
+    certified. Of the policies whose return is within `tolerance` of the first one's, the one that
+    fails least is returned, and never one that a paired comparison shows to be worse than the
+    first.
 
-    All samples of a certificate are fresh: counterexamples of one round enter the training, and the
-    next certificate has another seed. The last certificate, of the policies before and after
-    together, is made after the choice, from samples that decided nothing.
+    No certificate uses a sample that was trained on: counterexamples of one round enter the
+    training, and the next certificate has another seed. The last one, of the policies before and
+    after together, is made after the choice.
 
     **Arguments:**
     - `study`: a `Study`, a `Trainer`, or a task. A task says by `start(key, features) -> state` how
@@ -154,19 +155,18 @@ def harden(
     - `hyperparameters`: values of the trainer's hyper-parameters.
     - `rounds`: the maximum number of rounds of attack and further training.
     - `steps`: environment steps of the first training; those of the trainer when left out.
-    - `further_steps`: the number of further steps in each round; by default an eighth of `steps`.
+    - `further_steps`: steps of each round; an eighth of `steps` when left out.
     - `p`: failure probability below which the policy is safe; that of the study, or 0.01.
     - `confidence`: with which the intervals before and after hold together.
     - `samples`, `attack`, `attack_simulations`: of each certificate, as in `certify`.
-    - `added`: points to train around that a round adds at most.
+    - `added`: the maximum number of points to train around that a round adds.
     - `own`, `failing`: shares of episodes that are the task's own, and that begin near failures,
       those of the prior included that fail anyway; the others are of the prior. After a
       round that loses return, more are the task's own, and fewer again after one that does not.
     - `tolerance`: share of the first policy's return that may be lost.
-    - `episodes`: the number of episodes of the task itself, the same for all policies, that measure
-      returns.
-    - `baseline`: whether an arm with plain domain randomisation is trained beside it: the same
-      seed, own episodes and environment steps, and the prior in place of what fails.
+    - `episodes`: episodes of the task itself, the same for all policies, that measure returns.
+    - `baseline`: whether an arm with plain domain randomisation is trained as well: the same seed,
+      own episodes and environment steps, and the prior instead of failures.
     - `seed`: the seed of training, attacks and samples.
     - `max_seconds`: after which no other round begins.
     - `folder`: keeps finished work: the same call goes on where it was interrupted.
@@ -349,24 +349,17 @@ class Work:
             tie=plan.p, progress=False, remember=self.cache.remember,
         )  # fmt: skip
         end_if_interrupted(final.stopped)
+        returns = {arm: self.returns[arm, at] for arm, at in chosen.items()}
         return Hardening(
-            problem=self.untrained.name,
-            table=pd.DataFrame(self.rows),
+            problem=self.untrained.name, table=pd.DataFrame(self.rows),
             added=pd.concat(self.added, ignore_index=True) if self.added else pd.DataFrame(),
-            start=start,
-            policy=finalists[1],
-            policies=self.policies,
-            chosen=chosen,
-            certificates=final,
-            comparison=comparison,
-            returns={"start": self.returns[HARDENED, 0]}
-            | {arm: self.returns[arm, at] for arm, at in chosen.items()},
-            stopped=stopped,
-            seconds=time.perf_counter() - began,
+            start=start, policy=finalists[1], policies=self.policies, chosen=chosen,
+            certificates=final, comparison=comparison,
+            returns={"start": self.returns[HARDENED, 0], **returns},
+            stopped=stopped, seconds=time.perf_counter() - began,
             options={**vars(plan), "attack": stable_text(plan.attack)},
-            notes=tuple(notes),
-            version=__version__,
-        )
+            notes=tuple(notes), version=__version__,
+        )  # fmt: skip
 
 
 def _as_study(

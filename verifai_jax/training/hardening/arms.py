@@ -1,7 +1,6 @@
 """The policies of hardening, stage by stage: one arm with counterexamples, one with the prior.
 
-arms = TaskArms(study, values, stages, seed, cache, ("hardened", "randomised"), configured, mixture)
-arms.mix(1, [mixture, prior])
+arms.mix(1, [mixture, prior])                       # what the episodes up to stage 1 are drawn from
 arms.policies(1)                                    # trained up to the second stage, or cached
 
 Arms share the training seed, so that up to the first stage they are one training, and afterwards
@@ -57,7 +56,7 @@ class TaskArms(Arms):
         self.configured.check()
         trainer = self.study.trainer
         untrained = trainer.untrained_policy(trainer.algorithm_name(self.values))
-        self._form = jax.tree.structure(untrained)
+        self._form = jax.tree.structure([untrained] * len(self.names))
         one = replace(self.configured, task=self.mixture, steps=self.stages[-1])
         self._batch = BatchedTraining([one] * len(self.names))
         self._mixes: dict[int, Sequence[Mixture]] = {}
@@ -69,35 +68,28 @@ class TaskArms(Arms):
 
     def policies(self, stage: int) -> list[Any]:
         """Return the policy of each arm at a stage, trained if it is not cached."""
-        names = [f"training/{stage}/{arm}" for arm in self.names]
-        stored = [self.cache.get(name) for name in names]
-        if any(arrays is None for arrays in stored):
-            # A training that was cut off is repeated from its beginning, with the same numbers.
-            leaves = [self._train(at) for at in range(self._reached + 1, stage + 1)][-1]
-            self.cache.put(
-                {
-                    name: {f"{i:03d}": np.asarray(leaf) for i, leaf in enumerate(each)}
-                    for name, each in zip(names, leaves, strict=True)
-                }
-            )
-            stored = [self.cache.get(name) for name in names]
-        known = cast("list[dict[str, np.ndarray]]", stored)
-        return [jax.tree.unflatten(self._form, [a[n] for n in sorted(a)]) for a in known]
 
-    def _train(self, stage: int) -> list[list[np.ndarray]]:
-        """Train up to a stage; return the weights of each arm, averaged from the first round on."""
+        def trained() -> dict[str, np.ndarray]:
+            # A training that was cut off is repeated from its beginning, with the same numbers.
+            policies = [self._train(at) for at in range(self._reached + 1, stage + 1)][-1]
+            return {f"{i:04d}": leaf for i, leaf in enumerate(jax.tree.leaves(policies))}
+
+        arrays = self.cache.remember(f"training/{stage}", trained)
+        return jax.tree.unflatten(self._form, [arrays[name] for name in sorted(arrays)])
+
+    def _train(self, stage: int) -> list[Any]:
+        """Train up to a stage; return the policies, averaged from the first round on."""
         for number, mixture in enumerate(self._mixes.get(stage, ())):
             self._batch.change_task(number, replace(self.mixture, mixture=mixture))
         numbers, end = range(len(self.names)), self.stages[stage]
         middle = (self.stages[stage - 1] + end) / 2
-        policies = []
+        reached = []
         for steps in np.linspace(end, middle, AVERAGED, endpoint=False)[::-1] if stage else [end]:
             for _ in self._batch.advance(dict.fromkeys(numbers, int(steps))):
                 pass
-            policies.append([jax.tree.leaves(self._batch.policy(number)) for number in numbers])
+            reached.append([self._batch.policy(number) for number in numbers])
         self._reached = stage
-        by_arm = zip(*policies, strict=True)
-        return [[np.mean(each, axis=0) for each in zip(*arm, strict=True)] for arm in by_arm]
+        return jax.tree.map(lambda *leaves: np.mean(leaves, axis=0), *reached)
 
 
 @dataclass(eq=False)

@@ -134,6 +134,6 @@ def _radii(
 
 
 def end_if_interrupted(stopped: str | None) -> None:
-    """Raise again the Ctrl-C that a result ended early by: part of it is no round's number."""
+    """Raise `KeyboardInterrupt` for a result that Ctrl-C cut short, which is no whole round's."""
     if stopped == "interrupted":
         raise KeyboardInterrupt

@@ -112,6 +112,8 @@ class Mixture:
 class MixtureTask:
     """A task that draws the features of an episode from a mixture; made by `mixture_of`.
 
+    All else is as in the task itself.
+
     - `own`: the point of the unit cube of the task's own episodes; None if `reset` starts them.
     """
 
@@ -129,12 +131,10 @@ class MixtureTask:
 
     @property
     def action(self) -> Action:
-        """The kind of action that `step` takes."""
         return self.task.action
 
     @property
     def time_limit(self) -> int:
-        """Steps after which an episode is cut off."""
         return self.task.time_limit
 
     def reset(self, key: Key[Array, ""]) -> State:
@@ -158,11 +158,9 @@ class MixtureTask:
     def step(
         self, key: Key[Array, ""], state: State, action: Shaped[Array, "..."]
     ) -> tuple[State, Float[Array, ""], Bool[Array, ""]]:
-        """Take one step of the task."""
         return self.task.step(key, state, action)
 
     def observe(self, state: State) -> Float[Array, " k"]:
-        """Return what the policy is given."""
         return self.task.observe(state)
 
 

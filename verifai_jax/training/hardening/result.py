@@ -1,9 +1,4 @@
-"""The result of a hardening: failure probability and return before and after, round by round.
-
-result.table                            a row for each round and arm
-print(result)                           before, after, what it cost
-result.plot("hardening.png"); result.policy
-"""
+"""The result of a hardening: failure probability and return before and after, round by round."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -15,13 +10,12 @@ import pandas as pd
 from jaxtyping import Float
 
 from verifai_jax.core.display.figure import Drawn
-from verifai_jax.core.display.notebook import InNotebook, frame_html
-from verifai_jax.core.messages.text import format_percent
+from verifai_jax.core.display.notebook import Tabular
+from verifai_jax.core.messages.text import counted, format_percent
 from verifai_jax.core.store.files import replacing_all
 from verifai_jax.core.store.locks import write_lock
 from verifai_jax.estimation.certification import Certificate, Certificates
 from verifai_jax.estimation.comparison import Comparison
-from verifai_jax.rl.policy import Policy, save_policy
 from verifai_jax.statistics.confidence_sequences import safe_at
 from verifai_jax.statistics.paired import PairedDifference, paired_difference
 
@@ -32,23 +26,21 @@ FILES = ("added.parquet", "summary.txt", "start.npz", "policy.npz", "table.parqu
 
 
 @dataclass(frozen=True, eq=False)
-class Hardening(Drawn, InNotebook):
+class Hardening(Drawn, Tabular):
     """The result of `harden`.
 
-    - `problem`: name of the problem.
+    - `problem`: the name of the problem.
     - `table`: a row for each round and arm: `steps` of training so far, `failures` among
       `simulations` with the interval of that round's certificate by itself, its `verdict`,
-      `attack_failures`, the mean `return`, points `added` afterwards, `cost` in simulations, and
-      `seconds`.
+      `attack_failures`, the mean `return`, the number of points `added` afterwards, `cost` in
+      simulations, and `seconds`.
     - `added`: features of all points that were trained around, with `round` and `source`.
     - `start`, `policy`: before and after.
     - `policies`: the policies of each arm and round; `chosen`: the round of each arm.
-    - `certificates`: the certificates of the policies before, after, and of the baseline's, if
-      there is one, from samples that nothing was trained on or chosen by. Their intervals hold
-      together.
-    - `comparison`: the comparison of before and after in pairs; None if the first policy is
-      returned.
-    - `returns`: of `"start"` and the arms' chosen policies, episode by episode in pairs.
+    - `certificates`: of the policies before and after, and of the baseline's, if there is one, from
+      samples that no training and no choice has used. Their intervals hold together.
+    - `comparison`: the paired comparison of before and after; None if the first policy is returned.
+    - `returns`: of `"start"` and of each arm's chosen policy, on the same episodes.
     - `stopped`: `"certified"`, `"budget"` or `"max_seconds"`.
     - `options`: numbers that it was called with; `notes` for people; `seconds`; `version`.
     """
@@ -108,8 +100,8 @@ class Hardening(Drawn, InNotebook):
         """Write what was gained, what was lost and what it cost."""
         rounds, sure = max(self.table["round"]), format_percent(self.options["confidence"])
         lines = [
-            f"{self.problem}: hardened in {rounds} round{'s' * (rounds != 1)} "
-            f"({self.stopped}); the policy of round {self.chosen[HARDENED]} is returned"
+            f"{self.problem}: hardened in {counted(rounds, 'round')} ({self.stopped}); the policy "
+            f"of round {self.chosen[HARDENED]} is returned"
         ]
         named = ("before", "after", f"randomised (round {self.chosen.get(BASELINE)})")
         arms = zip(named, self.certificates.rows, self.returns.values(), strict=False)
@@ -140,6 +132,8 @@ class Hardening(Drawn, InNotebook):
         )
         return "\n".join([*lines, *(f"  note: {note}" for note in self.notes)])
 
+    __str__ = __repr__ = summary
+
     def save(self, folder: str | Path) -> Path:
         """Write table, added features, summary and policies to a folder, which is returned.
 
@@ -147,28 +141,17 @@ class Hardening(Drawn, InNotebook):
         """
         path = Path(folder)
         with write_lock(path), replacing_all(path, FILES) as made:
-            for name, frame in (("table", self.table), ("added", self.added)):
-                frame.to_parquet(made / f"{name}.parquet")
+            self.table.to_parquet(made / "table.parquet")
+            self.added.to_parquet(made / "added.parquet")
             (made / "summary.txt").write_text(f"{self.summary()}\n", encoding="utf-8")
-            for name, policy in (("start", self.start), ("policy", self.policy)):
-                if isinstance(policy, Policy):
-                    save_policy(policy, made / f"{name}.npz", problem=self.problem)
-                else:
-                    policy.save(made / f"{name}.npz")
+            self.start.save(made / "start.npz")
+            self.policy.save(made / "policy.npz")
         return path
-
-    def _notebook_parts(self) -> list[str]:
-        return [frame_html(self.table)]
-
-    def __str__(self) -> str:
-        return self.summary()
-
-    __repr__ = __str__
 
 
 def _chance(one: Certificate) -> str:
     if one.rate is None:
         return "not simulated"
     chance, low, high = map(format_percent, (one.rate.estimate, one.rate.low, one.rate.high))
-    counted = f"{one.failures + one.not_finite:,} of {one.simulations:,}"
-    return f"fails with {chance} ({low} to {high}; {counted}), {one.verdict}"
+    failing = f"{one.failures + one.not_finite:,} of {one.simulations:,}"
+    return f"fails with {chance} ({low} to {high}; {failing}), {one.verdict}"
