@@ -342,7 +342,7 @@ class _Connection:
                     self.welcome = True
                     self._points.extend(_points_of(message))
                     if len(self._points) > self.capacity:
-                        raise _no_run(f"it hands out more than {self.capacity} points")
+                        raise _no_run(f"it sends more than {self.capacity} points")
                 case "bye":
                     raise EOFError("the run has ended")
                 case "error":

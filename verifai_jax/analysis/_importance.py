@@ -82,8 +82,8 @@ class Importance(Drawn, InNotebook):
                 lines.append(f"{what} depends on {listed}; {self.score_words(target)}")
             else:
                 lines.append(
-                    f"{what}: importances mean nothing, a model from these rows does not predict "
-                    f"others ({self.score_words(target)})"
+                    f"{what}: importances are meaningless, because a model from these rows does "
+                    f"not predict others ({self.score_words(target)})"
                 )
         return "\n".join(lines)
 

@@ -79,7 +79,7 @@ def odd_of(
     taxonomy: dict[str, Any] = {}
     include: dict[str, Any] = {}
     if space.where is not None:
-        raise ValueError("a constraint is code, which a file of OpenODD does not hold")
+        raise ValueError("a constraint is code, which an OpenODD file cannot contain")
     for feature, domain in space.domains.items():
         found, unit = domain.tuning, (units or {}).get(feature, "")
         if found is not None and found.choices:

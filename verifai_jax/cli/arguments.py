@@ -50,25 +50,25 @@ RUN_FOLDER = option(
 PICTURES = option("--pictures/--no-pictures", default=True, help="Draw pictures.")
 """Pictures can be left out."""
 KEEP_GOING = option(
-    "--keep-going", is_flag=True, help="Simulate on where all of the first simulations raise."
+    "--keep-going", is_flag=True, help="Simulate on even if all of the first simulations raise."
 )
 PROGRESS = click.option(
     "--progress/--no-progress", default=None, help="Show a progress bar  [default: on a terminal]"
 )
 """The progress bar can be forced or left out."""
-SEED = option("--seed", default=0, help="Seed of all chance.")
+SEED = option("--seed", default=0, help="Seed of all random numbers.")
 """The seed of everything random in a command."""
 ONLY = option(
     "--only",
     metavar="NAMES",
-    help="Features to vary, comma-separated; the others stay at their nominal values.",
+    help="Features to vary, comma-separated; the others keep their nominal values.",
 )
 """Features that vary."""
 BATCH = option("--batch", type=int, help="Simulations per call  [default: chosen]")
 """Simulations per call of the simulator."""
-MAX_SECONDS = option("--max-seconds", type=float, help="Seconds at most, compilation included.")
+MAX_SECONDS = option("--max-seconds", type=float, help="Maximum seconds, including compilation.")
 """A limit of time."""
-STOP_AFTER = option("--stop-after", type=int, help="Stop at that many counterexamples.")
+STOP_AFTER = option("--stop-after", type=int, help="Stop at this many counterexamples.")
 """A number of failures that ends a run."""
 PRECISION = option("--precision", type=click.Choice(["float32", "float64"]), default="float32")
 """Floating-point numbers of the simulations."""
@@ -93,7 +93,7 @@ PROVED = option(
     "--proved",
     type=PATH,
     metavar="JSON",
-    help="What verify wrote with --into: spend nothing on what it proved.",
+    help="Result of verify --into: simulate nothing that it proved.",
 )
 """File of a verification."""
 REPORT = option(
@@ -104,20 +104,20 @@ ERRORS = option(
     "--errors",
     type=click.IntRange(1),
     metavar="PAIRS",
-    help="Say how wrong the number can be, by so many pairs of simulations for each part.",
+    help="Add how wrong the number can be, with this many pairs of simulations for each part.",
 )
 """Simulations by which the parts of an error are measured."""
 ODD = option(
     "--odd",
     type=PATH,
     metavar="YAML",
-    help="The operational design domain, a file of OpenODD: say what is covered of it.",
+    help="Operational design domain, an OpenODD file: report how much of it is covered.",
 )
 """The file of a domain."""
 EVEN_IF_CHANGED = option(
     "--even-if-changed",
     is_flag=True,
-    help="The model was changed on purpose: go on with it, and note what differs.",
+    help="Accept that the model was changed, and note the differences.",
 )
 """For commands that go on with what another model may have simulated."""
 SET = option("--set", "options", multiple=True, metavar="NAME=VALUE", help="Option of the search.")
@@ -140,20 +140,20 @@ PARAMETER_CHOICE = all_of(
         "--aim",
         type=click.Choice(("robustness", "probability")),
         default="robustness",
-        help="Robustness against an attack, or the least failure probability.",
+        help="Robustness against an attack, or the lowest failure probability.",
     ),
     option("--margin", default=0.0, help="Robustness wanted."),
-    option("--attack", default="cross_entropy", help="Search that attacks."),
-    option("--held-out", default=2000, help="Simulations of the result."),
+    option("--attack", default="cross_entropy", help="Search used for attacks."),
+    option("--held-out", default=2000, help="Fresh simulations to check the result."),
     option(
         "--mass",
         default=0.999,
-        help="Probability of the part of the prior that is attacked; 1 for all of it.",
+        help="Probability of the central part of the prior that is attacked; 1 for all of it.",
     ),
     click.option(
         "--gradient/--no-gradient",
         default=None,
-        help="Improve by gradients  [default: where the system has them]",
+        help="Use gradients  [default: if the system has them]",
     ),
     SEED,
     MAX_SECONDS,
@@ -212,7 +212,7 @@ def load_judged_run(folder: Path, target: str | None) -> "Run":
     if len(run.table.failed) == run.simulations:
         raise CommandError(
             f"no simulation of the run in {folder} had a verdict, of {run.simulations:,}; "
-            f"verifai-jax replay {shlex.quote(str(folder))} ROW simulates one again",
+            f"verifai-jax replay {shlex.quote(str(folder))} ROW repeats one",
             BROKEN,
         )
     return run
@@ -263,7 +263,7 @@ def read_record(folder: Path) -> dict[str, Any]:
 def _describe_folder(folder: Path, record: str, missing: str) -> str:
     """Say what a folder without a run is; `missing` says that its record is."""
     if folder.is_file():
-        what = "it is a file; give the folder that verifai-jax falsify has written"
+        what = "it is a file; give the folder that verifai-jax falsify wrote"
         return f"no run in {folder}: {what}"
     if not folder.exists():
         parent = folder.parent
@@ -276,7 +276,7 @@ def _describe_folder(folder: Path, record: str, missing: str) -> str:
     runs = sorted(path.name for path in folder.glob("*") if (path / record).is_file())
     if runs:
         return f"{missing}; but its folders {', '.join(runs)} are runs"
-    return f"{missing}; give a folder that verifai-jax falsify has written"
+    return f"{missing}; give a folder that verifai-jax falsify wrote"
 
 
 def is_sweep(folder: Path) -> bool:

@@ -49,7 +49,7 @@ if TYPE_CHECKING:
     "--end",
     type=click.Choice(["hold", "truncate", "strict"]),
     default="hold",
-    help="Semantics after the last sample.",
+    help="How a trace continues after the last sample.",
 )
 @option("--compat", type=click.Choice(["pymtl"]), help="Right-open windows, as in py-mtl.")
 @NAMES

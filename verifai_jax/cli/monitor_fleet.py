@@ -23,7 +23,7 @@ def fleet_options(command: Command) -> Command:
     """Add the options for judging many requirements on many recordings."""
     files = click.Path(path_type=Path, dir_okay=False)
     for each in (
-        click.option("--jobs", type=click.IntRange(1), default=1, help="Processes that judge."),
+        click.option("--jobs", type=click.IntRange(1), default=1, help="Number of processes."),
         option("--junit", type=files, help="File of the verdicts as JUnit XML."),
         option("--report", type=files, help="HTML file of the report."),
     ):

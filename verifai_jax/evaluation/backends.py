@@ -104,7 +104,7 @@ def _fastest(
         likely = problem.system.likely == traced
         if budget / speed < (WORTH_TRYING if likely else WORTH_MEASURING):
             seconds = f"{budget / speed:z.1f} s for all simulations"
-            return Choice(host, on_host, f"{seconds}, less than compiling for {traced} takes")
+            return Choice(host, on_host, f"{seconds}, less than compiling for {traced}")
         try:
             engine = engine_for(compiled, batch, precision=precision)
             engine.compile()

@@ -33,8 +33,8 @@ if TYPE_CHECKING:
     from verifai_jax.evaluation.native_engine import NativeEngine
     from verifai_jax.evaluation.unfinished import Part
 NOT_NATIVE = (
-    "simulated without native code, which is made of systems that JAX traces, in single precision "
-    "and in this process"
+    "simulated without native code, which supports only systems that JAX traces, in single "
+    "precision and in this process"
 )
 """Note of a run for which native code was asked for in vain."""
 

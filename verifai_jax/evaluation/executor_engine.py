@@ -181,9 +181,8 @@ class ExecutorEngine:
         self._dropped += 1
         if self._dropped > MAX_DROPPED:
             raise executors.WorkerError(
-                f"{self._dropped} answers of the executor belonged to other calls than the one "
-                "whose future they came by; what was finished before is kept: resume with another "
-                "executor"
+                f"{self._dropped} answers of the executor belonged to other calls than their "
+                "futures; finished work is kept: resume with another executor"
             )
         return False
 

@@ -64,8 +64,8 @@ class Raising:
         """
         if (said := self.reason) is not None:
             raise AlwaysRaises(
-                f"each of the first {self._count} simulations of problem {name!r} raised"
-                f"{f' {one_line(said)}' if said else ' an error'}, so the others are not made; "
+                f"each of the first {self._count} simulations of problem {name!r} "
+                f"raised{f' {one_line(said)}' if said else ' an error'}, so no more are made; "
                 "falsify(problem, 'uniform', 20, keep_going=True).table.all shows them"
             )
 

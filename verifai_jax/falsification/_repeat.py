@@ -187,7 +187,7 @@ def repeat(
     ):
         if there:
             raise ValueError(
-                f"problem {problem.name!r} has {what}, which is dealt with between rounds; use "
+                f"problem {problem.name!r} has {what}, which needs work between rounds; use "
                 "falsify with one seed after the other"
             )
     if search.wants.traces is not None:

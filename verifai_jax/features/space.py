@@ -303,10 +303,10 @@ class FeatureSpace(PointMaps, ForUsers):
         **Raises:** `ValueError` for data that describes no space, or missing code.
         """
         if not isinstance(data, Mapping) or "features" not in data:
-            raise ValueError(f"this describes no feature space: {data!r}")
+            raise ValueError(f"this does not describe a feature space: {data!r}")
         if data.get("where") is not None and where is None:
             raise ValueError(
-                f"the constraint {data['where']} of this space is code, which JSON does not hold; "
+                f"the constraint {data['where']} of this space is code, which JSON cannot contain; "
                 "give it: from_json(data, where=...)"
             )
         root = from_plain({"kind": "Struct", "fields": data["features"]}, distributions)

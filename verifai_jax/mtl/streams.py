@@ -228,8 +228,8 @@ class _Layout:
     def refuse_endless(self, f: Formula, b: float) -> None:
         if math.isinf(b):
             raise ValueError(
-                f"{f} looks ahead without end within another operator, which no bounded "
-                "memory can follow: give it an end, or monitor the recorded trace"
+                f"{f} looks ahead without end within another operator, which would need unbounded "
+                "memory: give it an end, or monitor the recorded trace"
             )
 
     def delay(self, slot: int, n: int, number: float) -> int:

@@ -77,7 +77,7 @@ def mujoco_scene(
         if kind not in (SPHERE, CAPSULE, CYLINDER, BOX):
             name = getattr(model.geom(number), "name", "") or f"geom {number}"
             raise ValueError(
-                f"{name!r} is a geom of kind {NAMES.get(kind, kind)}; the camera draws plane, "
+                f"{name!r} is a geom of kind {NAMES.get(kind, kind)}; the camera draws only plane, "
                 "sphere, capsule, cylinder, box"
             )
         solids += _solids(kind, positions[number], axes[number], size, colour)

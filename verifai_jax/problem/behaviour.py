@@ -73,8 +73,8 @@ class Behaviour:
         total = math.prod(axis.cells for axis in axes)
         if total > MAX_CELLS:
             raise ValueError(
-                f"the signals {', '.join(cells)} have {total} cells together, and at most "
-                f"{MAX_CELLS} can be told apart; give fewer cells or fewer signals"
+                f"the signals {', '.join(cells)} give {total} combinations of cells, and at most "
+                f"{MAX_CELLS} are allowed; give fewer cells or fewer signals"
             )
         object.__setattr__(self, "axes", tuple(axes))
         object.__setattr__(self, "formulas", tuple(formulas))

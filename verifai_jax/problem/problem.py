@@ -414,8 +414,7 @@ def _requirements(given: str | Path | Iterable[Requirement] | None) -> tuple[Req
     found = tuple(given or ())
     if other := next((each for each in found if not isinstance(each, Requirement)), None):
         raise ProblemError(
-            f"requirements must be a file or Requirements, as mtl.read_requirements gives; got "
-            f"{other!r}"
+            f"requirements must be a file or Requirements from mtl.read_requirements; got {other!r}"
         )
     return found
 

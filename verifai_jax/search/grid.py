@@ -48,7 +48,7 @@ class Grid(PointSequence[GridState]):
     """
 
     points: int | tuple[int, ...] = 21
-    sequence: ClassVar[tuple[str, str]] = "grid", "in a random order over the whole of it"
+    sequence: ClassVar[tuple[str, str]] = "grid", "in a random order over the whole grid"
 
     def __post_init__(self) -> None:
         if isinstance(self.points, tuple):

@@ -400,7 +400,7 @@ class Proposals:
 
     def _give_up(self) -> NoReturn:
         raise ConstraintError(
-            f"where refused all that search {self.search!r} has proposed for {MAX_REFUSED} "
-            f"rounds; it accepted {self.accepted} of {self.proposed} points in all. Make the space "
-            "narrower, so that more of it is allowed, or use another search"
+            f"where refused all proposals of search {self.search!r} for {MAX_REFUSED} rounds; it "
+            f"accepted {self.accepted} of {self.proposed} points in all. Make the space narrower, "
+            "so that more of it is allowed, or use another search"
         )

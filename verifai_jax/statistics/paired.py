@@ -76,8 +76,8 @@ def paired_difference(
     one, other = np.asarray(values, np.float64), np.asarray(reference, np.float64)
     if one.shape != other.shape or one.ndim != 1:
         raise ValueError(
-            "paired values are two lists of one length; "
-            f"got shapes {list(one.shape)} and {list(other.shape)}"
+            f"paired values must be two lists of the same length; got shapes {list(one.shape)} and "
+            f"{list(other.shape)}"
         )
     differences = one - other
     differences = differences[np.isfinite(differences)]

@@ -84,8 +84,8 @@ def paired_rates(
     counts = (only_first, only_second, undecided)
     if pairs < 1 or min(counts) < 0 or sum(counts) > pairs:
         raise ValueError(
-            "counts of pairs must be at least 0, and together at most the pairs, of which there is "
-            f"at least one; got {only_first}, {only_second} and {undecided} of {pairs}"
+            "counts of pairs must be at least 0 and add up to at most the number of pairs, which "
+            f"must be at least 1; got {only_first}, {only_second} and {undecided} of {pairs}"
         )
     check_fraction("confidence", confidence)
     interval = anytime_interval if at_any_time else clopper_pearson

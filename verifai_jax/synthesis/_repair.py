@@ -343,7 +343,9 @@ class _Repair:
             return False
         self.stopped = "no parameters"
         if not self.loop.bounded:
-            self.notes.append("gradients led no further; nothing else is tried on arrays")
+            self.notes.append(
+                "gradients found no further improvement; nothing else is tried for arrays"
+            )
         return False
 
     @property

@@ -147,14 +147,14 @@ def repaired_features(
     )
     if not named or not len(names):
         raise ValueError(
-            "parameters must be names of features, at least one; arrays need "
-            f"system_of=function that makes the system of them; got {names!r}"
+            "parameters must be names of features, at least one; arrays need system_of=, a "
+            f"function that makes the system from them; got {names!r}"
         )
     loop = feature_parameters(problem, names, gradient, batch, budget, precision, backend, seed)
     if loop.environment is None:
         raise ValueError(
-            "all features are parameters, so that nothing can vary to find counterexamples in; "
-            "use synthesize"
+            "all features are parameters, so no environment is left in which to find "
+            "counterexamples; use synthesize"
         )
     check_names("parameter of nominal", nominal or {}, loop.names)
     given = {**(problem.nominal or {}), **(nominal or {})}

@@ -224,7 +224,7 @@ class ArrayParameters:
                 )
         flat, self._restore = ravel_pytree(parameters)
         if not flat.size:
-            raise ValueError("parameters hold no number to change")
+            raise ValueError("parameters contain no number to change")
         self.problem, self.environment = problem, problem.space
         self.start, self.dim = np.asarray(flat, np.float64), int(flat.size)
         self.free = np.ones(self.dim, bool)

@@ -116,7 +116,7 @@ class Synthesis(InNotebook):
             over = f"over {len(self.environments)} environments"
             lines.append(f"  {found} of the best {of} candidates keep it {over} (.candidates)")
         else:
-            lines.append(f"  {found} of the points simulated keep it (.robust)")
+            lines.append(f"  {found} of the simulated points keep the margin (.robust)")
         lines.append(f"  {self._costs()}")
         return "\n".join(lines)
 
@@ -314,7 +314,8 @@ class Repair(Drawn, InNotebook):
             lines.append("  not checked in held-out environments")
         if self.found and self.held_out_after is not None and not self.held_out_after.passed:
             lines.append(
-                "  the check found what the attacks did not: try a larger budget, margin or mass"
+                "  the check found failures that the attacks missed: try a larger budget, "
+                "margin or mass"
             )
         checks = (self.held_out_before, self.held_out_after)
         if all(check is not None and check.simulations and not check.failures for check in checks):

@@ -144,7 +144,7 @@ def check_signals(signals: object) -> None:
         if not hasattr(value, "shape") or len(value.shape) > 1:
             raise ValueError(
                 f"signal {name!r} must be a scalar or a vector at each sample; got "
-                f"{outline(value)}; the option signals= says what the trace has"
+                f"{outline(value)}; choose the signals of the trace with signals="
             )
 
 

@@ -68,8 +68,8 @@ class Boxes:
         count = math.prod(map(len, sides))
         if count > CHOICES:
             raise ValueError(
-                f"the choices of this feature space have {count:,} combinations, and verify looks "
-                f"at {CHOICES:,} one by one at most; hold some with problem.only(...)"
+                f"the choices of this feature space have {count:,} combinations, and verify "
+                f"examines at most {CHOICES:,}; fix some with problem.only(...)"
             )
         ends = np.array(list(itertools.product(*sides))).reshape(count, space.dim, 2)
         return cls.between(ends[..., 0].copy(), ends[..., 1].copy())

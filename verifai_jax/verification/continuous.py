@@ -39,13 +39,13 @@ def between_samples(problem: Problem) -> Problem:
     ):  # fmt: skip
         if given:
             raise ProblemError(
-                f"continuous=True needs a plant that moves continuously for the whole duration; "
-                f"the system of problem {problem.name!r} has {name}=. Leave one of both out"
+                "continuous=True needs a plant that moves continuously for the whole duration; "
+                f"the system of problem {problem.name!r} has {name}=. Leave one of the two out"
             )
     for part in about_single_samples(*problem.formulas.values()):
         raise ProblemError(
-            f"continuous=True knows formulas of comparisons, not, and, or, always, eventually, "
-            f"historically and once; {part} is about single samples"
+            "continuous=True supports formulas with comparisons, not, and, or, always, "
+            f"eventually, historically and once; {part} is about single samples"
         )
 
     def during(time: Any, state: PyTree, control: Any, features: Any) -> Any:

@@ -168,13 +168,13 @@ def enclosable(problem: Problem, precision: str) -> Problem:
     problem.check()
     if problem.black_box:
         raise ProblemError(
-            f"problem {problem.name!r} has a system that JAX does not trace, and verify evaluates "
-            "the traced program with sets; vj.estimate bounds how probable its failures are"
+            f"problem {problem.name!r} has a system that JAX does not trace, but verify evaluates "
+            "the traced program with sets; vj.estimate bounds the probability of its failures"
         )
     if problem.draws():
         raise ProblemError(
-            f"the system of problem {problem.name!r} draws random numbers, and verify needs one "
-            "that depends on its features alone; make what it draws a feature"
+            f"the system of problem {problem.name!r} draws random numbers, but verify needs a "
+            "system that depends only on its features; make these numbers features"
         )
     return problem
 

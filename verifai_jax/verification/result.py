@@ -181,12 +181,15 @@ class Verification(Drawn, Reported, InNotebook):
             "undecided",
             line("proved", proved, "no point of it fails"),
             line(
-                "broken", broken, "boxes with a point that fails for certain; in "
+                "broken",
+                broken,
+                "boxes with a point that fails for certain; in "
                 f"{format_percent(self.throughout.mass)} of the prior every point does",
             ),
             line(
-                "undecided", undecided, f"at most {format_percent(self.failure_bound)} of it "
-                f"fails, at {sure} by {count}",
+                "undecided",
+                undecided,
+                f"at most {format_percent(self.failure_bound)} of it fails, at {sure} by {count}",
             ),
             f"  failing      {format_percent(low)} of the prior at least, "
             f"{format_percent(high)} at most{f' at {sure}' if undecided.mass > 0 else ''}",
@@ -310,7 +313,7 @@ def load_verification(path: str | Path) -> Verification:
     """
     record = read_record(Path(path))
     if record.pop("kind", None) != KIND:
-        raise DamagedError(f"{path} is no result of verify")
+        raise DamagedError(f"{path} is not a result of verify")
     dim = len(record["columns"])
     types = {"state": int, "failures": int, "samples": int, "confirmed": bool}
     arrays = {

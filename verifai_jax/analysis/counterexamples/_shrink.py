@@ -132,7 +132,7 @@ def shrink(
         search.search(points)
     except KeyboardInterrupt:
         stopped = "interrupted"
-        notes.append("interrupted: the least so far")
+        notes.append("interrupted: the smallest departure so far")
     verified = _verified(problem, search, key, number, run.precision)
     u = start[0] if verified is None else verified[0]
     replayed = original if verified is None else verified[1]
@@ -169,7 +169,9 @@ def _origin(problem: Problem, by: str, nominal: Mapping[str, Any] | None) -> Nom
     if by != "likelihood":
         return Nominal.of(problem, nominal)
     if nominal is not None:
-        raise ValueError("by='likelihood' departs from the likeliest features; leave out nominal=")
+        raise ValueError(
+            "by='likelihood' measures departures from the likeliest features; leave out nominal="
+        )
     return Likeliest.in_space(problem.space)
 
 

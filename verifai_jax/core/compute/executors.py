@@ -81,8 +81,8 @@ def check_executor(executor: object) -> None:
     method = getattr(context, "get_start_method", lambda: "")()
     if isinstance(executor, concurrent.futures.ProcessPoolExecutor) and method == "fork":
         raise ValueError(
-            "the process pool forks this process, and JAX does not work in a copy of it; make it "
-            "with ProcessPoolExecutor(mp_context=multiprocessing.get_context('spawn'))"
+            "the process pool forks this process, and JAX does not work in a forked process; make "
+            "it with ProcessPoolExecutor(mp_context=multiprocessing.get_context('spawn'))"
         )
 
 
@@ -167,7 +167,7 @@ def _explained(error: Exception) -> Exception:
     names = {kind.__name__ for kind in type(error).__mro__}
     if names & {"KilledWorker", "WorkerCrashedError", "NodeDiedError"}:
         return WorkerError(
-            "workers died again and again on the same block, so that the cluster gave it up: "
+            "workers died repeatedly on the same block, so the cluster gave up on it: "
             f"{one_line(format_error(error))}"
         )
     return error
@@ -271,7 +271,7 @@ def ship(
             f"{type(executor).__name__} cannot send the {type(thing).__name__.lower()} to its "
             f"workers ({one_line(format_error(error))[:200]}); name it, "
             "target='specs/FILE.py:NAME', so that they load it themselves, or use Dask or Ray, "
-            "which send functions that are in no module"
+            "which can send functions that are not in a module"
         ) from error
     return shipment
 

@@ -89,4 +89,4 @@ def require(module: str, extra: str) -> Any:
             f"{module} {lacks} not installed: pip install 'verifai_jax[{extra}]'"
         ) from error
     except ImportError as error:
-        raise MissingExtra(f"{module} is installed and cannot be imported: {error}") from error
+        raise MissingExtra(f"{module} is installed but cannot be imported: {error}") from error

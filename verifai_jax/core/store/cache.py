@@ -177,7 +177,7 @@ class Cache:
             where = self.path if path is None else path
             raise CacheError(
                 f"{where} cannot be written: {reason(error)}; what was finished is in "
-                f"{'it' if path is None else self.path}: make room if the disk is full, and begin "
+                f"{'it' if path is None else self.path}: make room if the disk is full, and run it "
                 "again"
             ) from error
 

@@ -27,9 +27,7 @@ def check_callbacks(callbacks: Iterable[Callback]) -> tuple[Callback, ...]:
     **Raises:** `TypeError` for an object that cannot be called.
     """
     if callable(callbacks):
-        raise TypeError(
-            f"callbacks must be a list of functions; got {callbacks!r}, so [it] will do"
-        )
+        raise TypeError(f"callbacks must be a list of functions; got {callbacks!r}, so write [it]")
     result = tuple(callbacks)
     for callback in result:
         if not callable(callback):

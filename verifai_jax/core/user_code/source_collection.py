@@ -270,7 +270,7 @@ class _Collector:
         try:
             self.data[file] = Source(shown_path(file), role, sha256 or file_hash(Path(file)))
         except OSError:
-            self.without_file.append(f"{shown_path(file)} cannot be read, and is not recorded")
+            self.without_file.append(f"{shown_path(file)} cannot be read, and was not recorded")
 
     def add_function(self, function: Function) -> None:
         where = "notebook" if is_notebook_cell(function.file) else "no file"

@@ -61,19 +61,19 @@ TRACING: tuple[tuple[type[Exception], str], ...] = (
     ),
     (
         jax.errors.NonConcreteBooleanIndexError,
-        f"it selects entries by a condition, and {ONCE_FOR_ALL}, so neither is their number. Use "
+        f"it selects entries by a condition, and {ONCE_FOR_ALL}, nor is the number of entries. Use "
         "jnp.where(condition, values, other)",
     ),
     (
         jax.errors.UnexpectedTracerError,
-        "it uses a value that was kept from another call, in a variable outside the function or "
-        "an attribute. Return such values, and hand them on as state or memory",
+        "it uses a value from another call, stored in a variable outside the function or in an "
+        "attribute. Return such values, and pass them on as state or memory",
     ),
     (
         jax.errors.ConcretizationTypeError,
-        f"it needs a plain number, as float(), int(), .item(), range() and the math module do, and "
-        f"{ONCE_FOR_ALL}. Leave out float() and .item(), use jnp in place of math, and "
-        "jax.lax.fori_loop for a number of turns",
+        "it needs a plain number, as float(), int(), .item(), range() and the math module do, and "
+        f"{ONCE_FOR_ALL}. Leave out float() and .item(), use jnp instead of math, and "
+        "jax.lax.fori_loop for loops",
     ),
 )
 """Errors of JAX about values that it traces, each with what to do; the special before the general.
@@ -84,13 +84,13 @@ WRITES = (
 )
 TRACING_BY_WORDS = {
     "Shapes must be 1D sequences of concrete": (
-        f"it makes an array of a length that is a value, and {ONCE_FOR_ALL}. Take the greatest "
-        "length there can be, and jnp.where(jnp.arange(most) < length, values, other)"
+        f"it makes an array whose length is a value, and {ONCE_FOR_ALL}. Use the greatest possible "
+        "length, and jnp.where(jnp.arange(maximum) < length, values, other)"
     ),
     # The first are the words of JAX 0.10, the second of 0.12.
     "Slice entries must be static|Array slice indices must have static": (
-        f"it cuts out a piece whose ends are values, and {ONCE_FOR_ALL}. Use "
-        "jax.lax.dynamic_slice for a piece of one length, or jnp.where over all entries"
+        f"it slices with values as ends, and {ONCE_FOR_ALL}. Use jax.lax.dynamic_slice for a slice "
+        "of fixed length, or jnp.where over all entries"
     ),
     r"Tracer\.__format__": (
         f"it writes a value into a text, and {ONCE_FOR_ALL}. Use jax.debug.print to see values"

@@ -382,7 +382,7 @@ def _shape(name: str, signal: Samples) -> tuple[int, ...]:
     except TracerArrayConversionError:
         raise ValueError(
             f"signal {name!r} must be an array; got a {type(signal).__name__} of values: join them "
-            "by jnp.stack"
+            "with jnp.stack"
         ) from None
 
 

@@ -297,8 +297,8 @@ def check_refinable(hold: str) -> None:
     """
     if hold in ("pchip", "pulse"):
         raise ValueError(
-            f"a Signal with hold={hold!r} has no refinement: through more control points it would "
-            "be another function of time; a search from coarse to fine needs 'linear' or 'constant'"
+            f"a Signal with hold={hold!r} has no refinement: with more control points it would be "
+            "another function of time; a search from coarse to fine needs 'linear' or 'constant'"
         )
 
 

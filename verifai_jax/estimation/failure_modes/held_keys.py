@@ -75,9 +75,9 @@ class Divided:
         which = "one random key" if self.held == 1 else f"{self.held} random keys"
         return (
             "the system draws random numbers, so that a point fails with a probability: the modes "
-            f"are regions that fail under {which}, held, under which {self.under:.0%} of the "
-            "failures fail; each of the others counts for the mode nearest to it. The likeliest "
-            "failure of a mode fails under its own key, mode.random_key"
+            f"are regions that fail under {which}, which is fixed. {self.under:.0%} of the "
+            "failures fail under it; each of the others counts for the mode nearest to it. The "
+            "likeliest failure of a mode fails under its own key, mode.random_key"
         )
 
 

@@ -86,7 +86,7 @@ def library_name(fingerprint: str | None) -> str:
     which = (str(tool), about.st_size, about.st_mtime_ns, _processor(), FLAGS, PRELUDE)
     name = remembered_as("native", fingerprint, which)
     if name is None:
-        raise machine_code.Unavailable("a part of the program cannot be identified")
+        raise machine_code.Unavailable("a part of the program cannot be hashed")
     return name
 
 

@@ -171,8 +171,8 @@ def _images(problem: Problem) -> int:
     form = problem.form()
     if form is None:
         raise ValueError(
-            f"how many images a simulation of {problem.name!r} takes is not known before it runs: "
-            "give images_per_simulation"
+            f"the number of images that a simulation of {problem.name!r} takes is not known in "
+            "advance: give images_per_simulation"
         )
     return form.length
 

@@ -140,9 +140,9 @@ class Policy:
         (remembered,) = memory or (None,)
         if (self.initial_memory is None) != (remembered is None):
             form = (
-                "remembers nothing: act(observation)"
+                "has no memory: call act(observation)"
                 if self.initial_memory is None
-                else "remembers: act(observation, memory) returns (action, memory), and "
+                else "has a memory: act(observation, memory) returns (action, memory), and "
                 "policy.initial_memory is the first"
             )
             raise TypeError(f"this policy {form}")
@@ -275,9 +275,7 @@ def write(
     if path.suffix != ".onnx":
         arrays = {**arrays, **named}
     elif any(np.any(first) for first in start):
-        raise PolicyError(
-            "ONNX has no place for a memory that does not start at zero: save it as .npz"
-        )
+        raise PolicyError("ONNX cannot store a memory that does not start at zero: save it as .npz")
     # In the order of their names, so that equal policies are equal bytes.
     arrays = {name: np.ascontiguousarray(arrays[name]) for name in sorted(arrays)}
     with replacing(path) as partial:

@@ -98,7 +98,8 @@ def policy(
     if isinstance(loaded, OwnPolicy):
         if normalise is not None or stated or stack > 1:
             raise PolicyError(
-                "the policy's own file says its scale and actions: leave these options out"
+                "the policy's own file defines its normalisation and actions: leave these "
+                "options out"
             )
         return loaded
     changes: dict[str, Any] = {}
@@ -133,14 +134,16 @@ def _of_file(
         raise PolicyError(f"{path} has to be one of {', '.join(FORMATS)}, or a folder of Brax")
     if path.stat().st_size > MAX_BYTES:
         raise PolicyError(
-            f"{path} has {path.stat().st_size / 1e6:z.0f} MB, and a policy may have "
+            f"{path} has {path.stat().st_size / 1e6:z.0f} MB, and a policy may have at most "
             f"{MAX_BYTES / 1e6:z.0f} MB"
         )
     data = path.read_bytes()
     stored = _stored_graph(data, path)
     weights_alone = kind in (".safetensors", ".pt", ".pth") and stored is None
     if not weights_alone and (activation or network or layers):
-        raise PolicyError(f"{path} says its network: leave out activation=, network= and layers=")
+        raise PolicyError(
+            f"{path} defines its network: leave out activation=, network= and layers="
+        )
     if stored is not None:
         graph, weights, first = read_graph(*stored, str(path))
         return Policy(weights, graph, first)
@@ -210,7 +213,7 @@ def _of_weights(
     """Return the policy of weights whose network is stated."""
     if (activation is None) == (network is None):
         raise PolicyError(
-            f"{what} holds weights and no network: give activation= for an MLP, or "
+            f"{what} contains weights but no network: give activation= for an MLP, or "
             f"network=function(weights, observation); it has {', '.join(sorted(arrays)[:8])}"
         )
     if network is not None:
@@ -223,7 +226,7 @@ def _of_weights(
     try:
         return Policy(linear_layers(arrays, names, what), Mlp(activation_name(activation)))
     except PolicyError as error:
-        raise PolicyError(f"{error}; say the layers of the policy in order by layers=") from None
+        raise PolicyError(f"{error}; give the layers of the policy in order with layers=") from None
 
 
 def _normaliser(given: str | Path | tuple[ArrayLike, ArrayLike] | Normaliser) -> Normaliser:

@@ -59,7 +59,7 @@ def from_object(source: object, observation: ArrayLike | None, batched: bool) ->
     if not callable(source):
         raise PolicyError(
             "a policy is a file, a model or a function of the observation; got "
-            f"{type(source).__name__}. Of a flax module give (module, variables)"
+            f"{type(source).__name__}. For a flax module give (module, variables)"
         )
     leaves, structure = jax.tree.flatten(source)
     if leaves and leaves != [source]:
@@ -83,7 +83,7 @@ class RandomPolicy(Policy):
 
     def as_graph(self, observation: PyTree = None) -> Any:
         """Raise an error, because a graph of ONNX operators cannot draw random numbers."""
-        raise PolicyError("a policy that draws cannot be saved: give its deterministic function")
+        raise PolicyError("a random policy cannot be saved: give its deterministic function")
 
     def act(self, observation: PyTree, key: Key[Array, ""]) -> Any:
         """Return an action drawn with the random key of the step."""
@@ -202,7 +202,7 @@ def _of_sb3(model: Any) -> Policy:
 def _of_torch(module: Any, observation: ArrayLike | None, batched: bool) -> Policy:
     """Return a module of PyTorch by way of ONNX, or as a function of the host."""
     if observation is None:
-        raise PolicyError("of a torch module give observation=, an example of what it takes, too")
+        raise PolicyError("for a torch module give observation= as well, an example of its input")
     torch = require("torch", extra="policies")
     require("onnx", extra="policies")
     example = np.asarray(observation, np.float32)
@@ -247,7 +247,9 @@ def _translated(
         for seen, scale in zip(draws, np.resize(scales, len(draws)), strict=True):
             one, other = np.asarray(policy.act(seen * scale)), _plain(on_host(seen * scale))
             if one.shape != other.shape or not np.allclose(one, other, rtol=1e-3, atol=1e-4):
-                raise ValueError("its translation gives other actions, as one that decides does")
+                raise ValueError(
+                    "its translation gives other actions, as for a module with branches"
+                )
     return policy
 
 

@@ -157,7 +157,7 @@ def _branch(node: Node, condition: Any, values: Values) -> tuple[Any, ...]:
     """Compute the branch of an `If` whose condition is a constant."""
     if not isinstance(condition, np.ndarray | np.generic):
         raise PolicyError(
-            f"{node} decides by a value of the observation, which is not supported: export the "
+            f"{node} branches on a value of the observation, which is not supported: export the "
             "model with torch.where instead"
         )
     inner, outputs = node.attributes["then_branch" if np.all(condition) else "else_branch"]

@@ -172,8 +172,8 @@ def _network(
     image = len(space.get("_shape") or ()) == 3 and options.get("normalize_images", True) is True
     if kind != "Box" or not image or not all(f"{n}.weight" in weights for n in convolutions):
         raise PolicyError(
-            f"{what} reads observations of {kind} by a features extractor that is not supported: "
-            "export it as ONNX, and load that"
+            f"{what} reads observations of {kind} with an unsupported features extractor: export "
+            "it as ONNX, and load that"
         )
     kernels = tuple(
         tuple(jnp.asarray(weights[f"{name}.{part}"], np.float32) for part in ("weight", "bias"))

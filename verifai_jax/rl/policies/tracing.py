@@ -176,7 +176,7 @@ class _Translation:
         except NotImplementedError:
             raise PolicyError(
                 f"the policy computes {kind}, which cannot be saved as a graph: save its weights "
-                "by the means of its own framework"
+                "with its own framework"
             ) from None
 
     def scan(self, given: list[Value], options: Mapping[str, Any]) -> list[Value]:

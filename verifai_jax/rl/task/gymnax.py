@@ -141,7 +141,7 @@ def _action_adapter(env: "Environment", params: PyTree) -> stepping.ActionAdapte
             space.low, space.high, tuple(space.shape), space.dtype, env.name
         )
     raise ValueError(
-        f"the actions of {env.name} are {space!r}; a task takes a choice of several, or a box"
+        f"the actions of {env.name} are {space!r}; a task supports one choice of several, or a box"
     )
 
 

@@ -192,7 +192,8 @@ def mjx_task(
     if control is None:
         if not isinstance(kind, Continuous) or kind.size != compiled.nu:
             raise ValueError(
-                f"{kind} needs control=..., a function to the signals of {compiled.nu} actuators"
+                f"{kind} needs control=..., a function that returns the signals of "
+                f"{compiled.nu} actuators"
             )
         control = _over_control_range(compiled) if action is None else _identity
     task = MjxTask(

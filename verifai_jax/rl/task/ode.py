@@ -157,7 +157,8 @@ def ode_task(
     if control is None:
         if isinstance(action, Discrete):
             raise ValueError(
-                f"{action} needs control=..., a function from the index to what the dynamics take"
+                f"{action} needs control=..., a function from the index to the input of the "
+                "dynamics"
             )
         control = _action_itself
     limit = max(1, loop.steps // loop.steps_per_control) if time_limit is None else time_limit

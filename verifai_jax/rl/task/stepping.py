@@ -87,7 +87,7 @@ def flat_observation(observation: object, name: str) -> Float[Array, " k"]:
     """
     if not hasattr(observation, "shape") or not hasattr(observation, "dtype"):
         raise ValueError(
-            f"a policy is given one array of numbers; an observation of {name} is "
+            f"a policy receives one array of numbers; an observation of {name} is "
             f"{outline(observation)}: use an environment whose observation is one array"
         )
     return jnp.ravel(jnp.asarray(observation)).astype(jnp.float32)

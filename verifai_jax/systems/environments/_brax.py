@@ -72,7 +72,7 @@ class Brax(PolicyLoop):
         if self.exact_step:
             raise ValueError(
                 f"the step belongs to {self.name} (exact_step=True), so a finer one would simulate "
-                "another environment; to take its step for an approximation, give exact_step=False"
+                "another environment; if its step is an approximation, give exact_step=False"
             )
         if not isinstance(factor, jax.Array):
             check_factor(factor)

@@ -171,7 +171,8 @@ class Bindings:
                 shape = np.shape(value.knots)[1:]
             elif isinstance(value, Mapping | list | tuple):
                 raise ValueError(
-                    f"feature {binding.feature!r} has parts; bind needs a number or an array"
+                    f"feature {binding.feature!r} has several parts; bind needs a number or an "
+                    "array"
                 )
             else:
                 shape = np.shape(value)

@@ -72,7 +72,7 @@ class Ode(System):
         if self.exact_step:
             raise ValueError(
                 "the step belongs to this system (exact_step=True), so a finer one would simulate "
-                "another; a plant whose step is an approximation has exact_step=False"
+                "another; for a plant whose step is an approximation, give exact_step=False"
             )
         if not isinstance(factor, jax.Array):
             check_factor(factor)
@@ -103,7 +103,7 @@ class Ode(System):
         """
         if self.controller is None:
             raise ValueError(
-                "faults lie between a plant and its controller; this system has no controller"
+                "faults act between a plant and its controller; this system has no controller"
             )
 
         def first(features: Features, key: Seed) -> Any:
@@ -381,8 +381,8 @@ class _Rollout:
         for line in filter(is_line, jax.tree.leaves(tree, is_leaf=is_line)):
             if not fed:
                 raise ValueError(
-                    "a delay_line in the state needs update=, which pushes it at each sample; "
-                    "got none"
+                    "a delay_line in the state needs update=, which pushes it at each sample; got "
+                    "none"
                 )
             count = round(line.period / beat)
             if count < 1 or abs(count * beat - line.period) > 1e-6 * beat:

@@ -72,8 +72,8 @@ class Check:
         if self.budget < minimum:
             raise ValueError(
                 f"a budget of {self.budget:,} simulations cannot show a failure probability of at "
-                f"most {format_percent(self.max_failure_probability)}: if none fails, {minimum:,} "
-                "do"
+                f"most {format_percent(self.max_failure_probability)}: it needs {minimum:,}, if "
+                "none fails"
             )
 
     def run(
@@ -198,9 +198,8 @@ class CheckOutcome(InNotebook):
         if self.run is None:
             assert self.replayed is not None
             return printable(
-                f"{self.replayed}\n"
-                "  saved counterexamples are replayed first, and not all of these are fixed; "
-                "delete the file of a failure that is accepted"
+                f"{self.replayed}\n  saved counterexamples are replayed first, and some of these "
+                "are not fixed; to accept a failure, delete its file"
             )
         parts = [self.run.summary()]
         if self.rate is not None:

@@ -295,7 +295,7 @@ class Evidence:
             yield f"{name}: the model has changed since {self.name}: {list_changes(changes)}"
         if self.kind == "claims":
             if self.result == "run" and self.chain not in model.chains:
-                yield f"{name}: the run has changed since {self.name}, or is not among those named"
+                yield f"{name}: the run has changed since {self.name}, or was not given"
             elif self.result != "run" and not self.model and self.chain != model.chain:
                 yield f"{name}: the model has changed since {self.name}"
             if not self.page.is_file():

@@ -211,8 +211,8 @@ class SupervisedTask:
         except Exception as error:
             why = explain_user_error(error, system=False)
             raise TaskError(
-                f"predict or wrongness of task {self.name!r} fails: {why}. predict gets a batch "
-                "of inputs, wrongness one prediction and one label"
+                f"predict or wrongness of task {self.name!r} fails: {why}. predict receives a "
+                "batch of inputs, wrongness one prediction and one label"
             ) from error
         shape = getattr(form, "shape", None)
         if shape is None or len(shape) != 1:

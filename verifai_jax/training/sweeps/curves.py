@@ -58,8 +58,8 @@ def curve_trace(
     steps, known = np.asarray(steps, np.float64), np.asarray(mean_return, np.float64)
     if steps.shape != known.shape or steps.ndim != 1:
         raise ValueError(
-            "steps and mean_return must have one entry an update; "
-            f"got shapes {list(steps.shape)} and {list(known.shape)}"
+            "steps and mean_return must have one entry for each update; got shapes "
+            f"{list(steps.shape)} and {list(known.shape)}"
         )
     present = np.isfinite(known)
     if not present.any():

@@ -274,9 +274,9 @@ class Sweep(Drawn, Reported):
             if changes := self.changes():
                 raise ValueError(
                     f"the model has changed since the sweep of {self.name!r}: "
-                    f"{list_changes(changes)}. Failures of two models are not put into one table: "
+                    f"{list_changes(changes)}. Failures of two models are not mixed in one table: "
                     f"counterexamples({i}) has those of the sweep, falsify(sweep.problem({i})) "
-                    "looks for those of the model of now"
+                    "searches the present model"
                 )
             run = falsify(problem, search, budget=simulations, seed=seed, progress=False)
             parts.append(run.table.counterexamples.loc[:, [*problem.space.columns, "rho"]])

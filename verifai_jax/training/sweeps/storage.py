@@ -173,7 +173,7 @@ def read_sweep(description: Mapping[str, Any], folder: Path) -> StoredSweep:
         record, space = _read_record(folder, description), _space_from_json(description["space"])
         return StoredSweep(record, space, used, pd.read_parquet(folder / FAILING))
     except FileNotFoundError as error:
-        raise SweepFileError(f"the sweep in {folder} is not whole: {error}") from error
+        raise SweepFileError(f"the sweep in {folder} is incomplete: {error}") from error
     except (KeyError, TypeError, ValueError, OSError, zipfile.BadZipFile) as error:
         reason = one_line(str(error))
         raise SweepFileError(f"the sweep in {folder} is damaged: {reason}") from error

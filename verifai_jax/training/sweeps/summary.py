@@ -60,7 +60,7 @@ def format_summary(findings: Findings) -> str:
     margins: Any = table.get("curve_robustness")
     lines = [f"{record.study}: {format_headline(findings)}"]
     if len(record.sources) > 1:
-        lines.append("  OF SEVERAL MODELS: it went on although the study had changed")
+        lines.append("  SEVERAL MODELS: the sweep went on although the study had changed")
     if not record.complete:
         lines.append("  NOT FINISHED: interrupted or out of time; the finished part is here")
     if len(groups):

@@ -229,7 +229,7 @@ class Trainer:
             owners = [o for o in self.by_name.values() if name in _fields(o)]
             if owners and name in _fields(self.task):
                 raise StudyError(
-                    f"both {type(owners[0]).__name__} and the task have a {name}: it is not clear "
+                    f"both {type(owners[0]).__name__} and the task have a {name}: it is unclear "
                     "which one to sweep"
                 )
         for name in self._checked_algorithms(space):
@@ -304,8 +304,8 @@ class FunctionTrainer(Trainer):
             raise StudyError(f"steps must be at least 1; got {self.steps}")
         if self.example is None:
             raise StudyError(
-                f"{self.name} trains by itself: give example=, a policy with actions of the form "
-                "that it returns, such as lambda observation: jnp.zeros(2)"
+                f"{self.name} is a training function: give example=, a policy with actions of the "
+                "form that it returns, such as lambda observation: jnp.zeros(2)"
             )
         if self.nominal is not None and not isinstance(self.nominal, Task):
             raise StudyError(f"nominal must be a task; got {type(self.nominal).__name__}")

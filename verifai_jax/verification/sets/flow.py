@@ -116,7 +116,7 @@ def _varying(program: Program, inputs: Sequence[bool]) -> list[bool]:
             raise MissingRule(
                 f"the dynamics apply {name} to the state or the time{f' ({line})' * bool(line)}, "
                 "which is not smooth, or has no Taylor series here: continuous=True needs smooth "
-                "dynamics; put what switches or saturates into the controller"
+                "dynamics; move switching and saturation into the controller"
             )
         return [any(operands)] * len(each.outvars)
 

@@ -125,7 +125,7 @@ def constant(value: ArrayLike, dtype: np.dtype) -> Value:
         return Form.constant(np.asarray(value), np.dtype(dtype))
     if jnp.issubdtype(dtype, jnp.integer) or dtype == jnp.bool_:
         return Whole.constant(np.asarray(value), np.dtype(dtype))
-    raise MissingRule(f"sets have no numbers of type {dtype}")
+    raise MissingRule(f"sets do not support numbers of type {dtype}")
 
 
 def _where(step: Equation) -> str:
