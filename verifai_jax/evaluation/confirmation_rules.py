@@ -107,7 +107,7 @@ def hold_to_run(
 
 
 def lowest_failing(again: Verdicts, more: Verdicts, at: np.ndarray) -> Verdicts:
-    """Return the repetitions, using a further one for rows in which it fails by less.
+    """Return the repetitions; of two, the one that fails by less.
 
     **Arguments:**
     - `again`: the repetitions of all rows.

@@ -357,7 +357,7 @@ class Packing:
         self._form: Any = None
 
     def pack(self, row: PyTree) -> dict[str, Array]:
-        """Concatenate one row's leaves bitwise: all of four bytes, all of eight."""
+        """Concatenate the bits of one row's leaves, in one vector for each width."""
         leaves, self._form = jax.tree.flatten(row)
         self._slots, parts, filled = [], {}, {}
         for leaf in map(jnp.asarray, leaves):

@@ -290,7 +290,7 @@ class _StoredRows:
         self._blocks = sorted(blocks, key=lambda block: (block[0].start, block[0].stop))
 
     def submit(self, function: Callable[..., Any], /, *arguments: Any) -> "Future[dict[str, Any]]":
-        """Return a future with the stored rows in path of those that `function` would simulate.
+        """Return a future with the stored rows, instead of simulating them with `function`.
 
         Rows that are replayed before they are claimed are simulated here.
         """

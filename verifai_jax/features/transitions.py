@@ -156,8 +156,8 @@ def check_states(start: str, transitions: tuple[Transition, ...]) -> None:
         if each.source not in reached:
             raise ValueError(
                 f"no sequence of events leads from {start!r} to the state {each.source!r} of "
-                f"{each.label}; it leads to {', '.join(sorted(reached))}: correct its name, or add "
-                f"an event with to={each.source!r}"
+                f"{each.label}, only to {', '.join(sorted(reached))}: correct its name, or add an "
+                f"event with to={each.source!r}"
             )
 
 

@@ -240,7 +240,7 @@ class _Layout:
         return self.op("window", (slot,), n, sign, number) if n > 1 else slot
 
     def align(self, parts: Sequence[tuple[int, int]]) -> tuple[list[int], int]:
-        """Return streams of one delay, that of the slowest."""
+        """Delay all streams as much as the slowest; return them and the delay."""
         slowest = max(delay for _, delay in parts)
         return [self.delay(slot, slowest - delay, 0.0) for slot, delay in parts], slowest
 

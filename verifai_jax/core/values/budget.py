@@ -26,7 +26,7 @@ class Budget:
 
     @property
     def exhausted(self) -> bool:
-        """True where nothing is left."""
+        """True if nothing is left."""
         return self.left == 0
 
     @property

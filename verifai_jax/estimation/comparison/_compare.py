@@ -230,7 +230,7 @@ class _Prior:
         self._draw = jax.jit(lambda i: jax.random.uniform(jax.random.fold_in(key, i), shape))
 
     def take(self, count: int) -> Float[np.ndarray, "n d"]:
-        """Return the next so many points that the constraint accepts."""
+        """Return the next `count` points that the constraint accepts."""
         while len(self._left) < count:
             u = np.asarray(self._draw(self._block), np.float32)
             if self.space.constraint is not None:

@@ -204,7 +204,7 @@ def brax(
         name = type(getattr(env, "unwrapped", env)).__name__
         if backend is not None or options:
             raise ValueError(
-                f"backend and options are for an environment by its name; got {name} itself"
+                f"backend and options need the name of an environment; got the object {name}"
             )
     _check_env(env, name)
     if dt is None:

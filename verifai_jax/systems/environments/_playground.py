@@ -171,7 +171,7 @@ def loaded(env: Env, options: Mapping[str, object] | None = None) -> tuple[Any, 
     if not isinstance(env, str):
         name = type(getattr(env, "unwrapped", env)).__name__
         if options:
-            raise ValueError(f"options are for an environment by its name; got {name} itself")
+            raise ValueError(f"options need the name of an environment; got the object {name}")
         if not isinstance(env, package.MjxEnv) or env.unwrapped is not env:
             raise ValueError(
                 f"env must be the name of an environment or an MjxEnv without wrappers; got {name}"

@@ -218,7 +218,7 @@ class _Step:
         return [*now, *during]
 
     def unbounded(self, state: list[Form]) -> np.ndarray:
-        """Return in which boxes of the batch nothing is known any more."""
+        """Return for which boxes of the batch the state is unbounded."""
         lost = np.zeros(self.boxes, bool)
         for form in state:
             low, high = form.bounds()
@@ -226,7 +226,7 @@ class _Step:
         return lost
 
     def box(self, span: Form, state: list[Form], length: float) -> tuple[list[Form], np.ndarray]:
-        """Return a box that no solution leaves, and in which boxes of the batch it is one."""
+        """Return a box that no solution leaves, and for which boxes of the batch it is valid."""
         begins = [form.bounds() for form in state]
         ends, lost, stays = begins, self.unbounded(state), np.zeros(self.boxes, bool)
         for _ in range(TRIES):
