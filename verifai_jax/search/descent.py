@@ -309,7 +309,8 @@ def waits(state: InteriorState) -> bool:
     """Return whether the descents take no part in the next round."""
     # As numbers: each operation of JAX outside of a program would compile one.
     cost, theirs, credit = (float(each) for each in (state.cost, state.theirs, state.credit))
-    tried = cost < BEGINS and bool(_tried(state))
+    since, spent = np.asarray(state.since), np.asarray(state.spent)
+    tried = cost < BEGINS and bool(_tried(state._replace(since=since, spent=spent)))
     return cost < EARLY or ((theirs <= 0 or tried) and credit < _max_credit(state) / 2)
 
 

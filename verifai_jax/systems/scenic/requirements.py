@@ -142,9 +142,9 @@ class Constraint:
     def _decided(self, holds: Any, features: Mapping[str, Any]) -> np.ndarray:
         """Let Scenic decide about the points that the compiled requirements accept."""
         holds = np.asarray(holds)
+        features = {name: np.asarray(column) for name, column in features.items()}
         if holds.ndim == 0:
             return np.asarray(bool(holds) and self._accepts(features))
-        features = {name: np.asarray(column) for name, column in features.items()}
         verdicts = holds.copy()
         asked = np.flatnonzero(holds)
         for number, row in enumerate(asked):
