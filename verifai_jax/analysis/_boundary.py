@@ -54,11 +54,9 @@ class Boundary(InNotebook):
 
     - `brier`: mean squared difference of predicted probability and verdict, on held-out rows.
     - `base`: the same for a constant prediction, the share of failures.
-    - `calibration`: for each tenth of the predicted probability, how many rows failed, and of how
-      many.
+    - `calibration`: for each tenth of the predicted probability, the failed rows and all rows.
     - `reach`: distance up to which a row tells something about a point (`Samples.points`).
-    - `share`: mean probability over the prior; it is neither a bound nor an estimate with an
-      interval.
+    - `share`: mean probability over the prior; neither a bound nor an estimate with an interval.
     - `unsampled`: share of the prior beyond the reach of all rows. Both are NaN without a space.
     - `samples`: the rows.
     """

@@ -113,8 +113,7 @@ def importance(
     Sources: trees of Geurts, Ernst and Wehenkel, Extremely randomized trees, Machine Learning 63
     (2006); permutation importance of Breiman, Random forests, Machine Learning 45 (2001).
 
-    **Raises:** `ValueError` if there are no rows, or if neither failing nor the robustness can be
-    learned.
+    **Raises:** `ValueError` without rows, or if neither failing nor the robustness can be learned.
     """
     repeats = check_count("repeats", repeats, 2)
     samples = Samples.of(source, "all")

@@ -46,8 +46,7 @@ def compare(
 ) -> None:
     """Compare failure rates of CANDIDATES (specs/FILE.py:NAME) with that of TARGET, in pairs.
 
-    specs/FILE.py:NAME@REVISION is the problem as it was at a revision of git; the checkout is not
-    touched.
+    specs/FILE.py:NAME@REVISION is the problem at a revision of git; the checkout is not touched.
     """
     from verifai_jax import Problem
     from verifai_jax import compare as run_compare

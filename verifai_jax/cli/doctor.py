@@ -58,8 +58,7 @@ class BadPair(NamedTuple):
     """Versions of two packages that do not work together, or of one package with a defect.
 
     - `package`, `versions`: a package, and its versions `[least, below)`; None means no bound.
-    - `other`, `others`: the other package and its versions; the same package again for a defect of
-      one.
+    - `other`, `others`: the other package and its versions; the same again for a defect of one.
     - `problem`: a sentence on what goes wrong, its effect on verdicts, and the remedy.
     """
 

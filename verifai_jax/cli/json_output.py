@@ -92,8 +92,8 @@ def draw(found: Any, path: Path) -> None:
 def as_plain(value: object) -> Any:
     """Convert a value to JSON types: tables to lists of rows, dataclasses to objects.
 
-    Fields of a dataclass that are not part of its `repr` are left out, and so are values without a
-    plain form.
+    Fields of a dataclass that are not part of its `repr` and values without a plain form are left
+    out.
     """
     if value is None or isinstance(value, bool | int | str):
         return value

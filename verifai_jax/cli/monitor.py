@@ -92,8 +92,7 @@ def monitor(
     With - as RECORDING, lines of CSV are read from the standard input as they come, until the
     verdict is certain whatever follows: tail -f log.csv | verifai-jax monitor FORMULA -
 
-    With --export-c FILE.h nothing is judged: FORMULA becomes a monitor in C, and with FILE.fmu one
-    as an FMU.
+    With --export-c FILE.h, FORMULA becomes a monitor in C, and with FILE.fmu an FMU.
     """
     import jax
 

@@ -16,8 +16,7 @@ def given_or_next(
     """Return the given folder, or else the next one, made by `next_folder`.
 
     **Arguments:**
-    - `goes_on`: returns the command that resumes the folder, which is printed in case this process
-      is killed.
+    - `goes_on`: returns the command that resumes the folder; it is printed in case of a kill.
     - `record`: the file from whose existence on that is possible.
     """
     from verifai_jax.core.display.progress import goes_on_with

@@ -57,8 +57,7 @@ class Engine:
     - `devices`: JAX devices over which the batch is split; all of this process when left out.
     - `precision`: the precision of simulation, monitor and gradient, `"float32"` or `"float64"`.
     - `clauses`: whether it evaluates and differentiates each clause instead.
-    - `inputs`: how rows are converted to features and a system; by default they are points of the
-      unit cube.
+    - `inputs`: how rows become features and a system; by default they are points of the unit cube.
     - `own_keys`: whether each row has its own random key, instead of one derived from the run's key
       and the row number.
     - `alone`: whether the engine takes one row at a time, without `jax.vmap`, which compiles

@@ -54,8 +54,7 @@ class ExecutorEngine:
 
     **Arguments:**
     - `problem`: a checked problem, on the backend on which it should run.
-    - `batch`: number of rows of a batch on one machine, which determines how many lanes run
-      together.
+    - `batch`: number of rows of a batch on one machine, for the number of parallel lanes.
     - `executor`: an executor with `submit`.
     - `gradient`, `clauses`, `precision`, `guidance`: as in `engine.Engine`.
     - `given`: whether points are rows of given features, as in `CubePoints`.

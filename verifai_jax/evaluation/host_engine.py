@@ -49,8 +49,7 @@ class HostEngine:
     **Arguments:**
     - `problem`: a checked `Problem`.
     - `precision`: the precision of features and monitor, `"float32"` or `"float64"`.
-    - `journal`: a journal that stores rows as soon as they have a verdict, until their batch is
-      finished.
+    - `journal`: a journal that stores rows with a verdict until their batch is finished.
     - `system`: a system that replaces the problem's own, such as one with a finer step.
     - `monitor`: a compiled monitor of the same formulas.
     - `guidance`: additional results for a search; by default those of the given monitor.
@@ -131,8 +130,7 @@ class HostEngine:
 
         **Arguments:**
         - `features`: the features, `[n, ...]` each.
-        - `keys`: the keys from which the seeds were made; needed by a system that simulates
-          batches.
+        - `keys`: the keys of the seeds; needed by a system that simulates batches.
         """
         with in_precision(self.precision):
             return self._verdicts(features, keys, seeds, None, 0, self.keep_traces)

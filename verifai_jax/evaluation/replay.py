@@ -137,7 +137,7 @@ class Replay(InNotebook):
 
         **Arguments:**
         - `path`: a file to write as well; none when left out.
-        - `camera`: the name of a camera of a MuJoCo model; by default the one that shows the motion
+        - `camera`: name of a camera of a MuJoCo model; by default the one that shows the motion
           best.
         - `size`: width and height of a frame in pixels.
         - `fps`: frames per second; chosen automatically when left out.

@@ -217,8 +217,7 @@ class RowFunction(NamedTuple):
     ) -> tuple[Float[Array, "*clauses"], PyTree]:
         """Return the differentiated objective, and the results computed with it.
 
-        The objective is the least smooth robustness, or the clauses of the goal nearest to being
-        broken.
+        The objective is the least smooth robustness, or the clauses of the goal nearest to failing.
         """
         features, system = self.inputs.simulated(coordinates, row, shared)
         trace = system(features, key).hold()

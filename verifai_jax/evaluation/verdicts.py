@@ -30,12 +30,10 @@ class Verdicts(NamedTuple):
     - `status`: `[n]`, codes of `Status`.
     - `violated`: `[n]`, whether the simulation ended properly and breaks a formula.
     - `features`: the simulated values, `[n, ...]` each; None if the caller has them already.
-    - `gradient`: `[n, d]`, the gradient of the least smooth robustness by the coordinates; None
-      unless wanted.
+    - `gradient`: `[n, d]`, gradient of the least smooth robustness by the coordinates, or None.
     - `clauses`: `[n, clauses]`, scaled values of the clauses of the goal that is nearest to being
       broken (`mtl.clauses`); None unless wanted.
-    - `clause_gradients`: `[n, clauses, d]`, the gradients of the clauses by the coordinates; None
-      unless wanted.
+    - `clause_gradients`: `[n, clauses, d]`, gradients of the clauses by the coordinates, or None.
     - `messages`: the error of each row of a host system, empty if there was none; None for systems
       that JAX traces.
     - `coverage_ids`: the ids of the items that each trace covers (`problem.behaviour`), -1 for

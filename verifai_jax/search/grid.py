@@ -92,8 +92,7 @@ class Grid(PointSequence[GridState]):
     def points_at(self, rest: UInt32[Array, " n"], cube: Cube) -> Float[Array, "n d"]:
         """Return the points of the grid with these numbers, in the order of its rows.
 
-        Discrete coordinates change faster than continuous ones; among each kind the first is
-        fastest.
+        Discrete coordinates change faster than continuous ones; of each kind the first is fastest.
         """
         figures, batch = [], len(rest)
         for size in self._sizes(cube):

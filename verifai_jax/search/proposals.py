@@ -108,8 +108,7 @@ class Proposals:
     def temperature(self) -> Float[Array, ""] | Float[np.ndarray, " m"] | float:
         """Temperature of the smooth robustness; only for searches with gradients.
 
-        It is one number for the next points, or one for each of the last points if the search wants
-        clauses.
+        It is one number, or one for each of the last points if the search wants clauses.
         """
         if self._plan is None:
             return self._program.temperature(self._state)

@@ -63,10 +63,8 @@ def paired_difference(
     """Compute the mean of `values - reference` and its Student's t interval.
 
     **Arguments:**
-    - `values`, `reference`: the two values of each pair; pairs with a value that is not finite are
-      left out.
-    - `confidence`: the probability that the interval holds, if the differences are independent and
-      normal.
+    - `values`, `reference`: the two values of each pair; pairs without finite values are left out.
+    - `confidence`: probability that the interval holds, if differences are independent and normal.
     **Returns:** the `PairedDifference`.
     **Raises:** `ValueError` for lists of different lengths, or a confidence out of range.
 

@@ -75,8 +75,7 @@ def paired_rates(
     - `pairs`: number of all pairs, which may depend on their outcomes.
     - `confidence`: the probability that the interval holds at all times.
     - `undecided`: further pairs that lack a verdict.
-    - `at_any_time`: False for a number of pairs that was fixed beforehand, which gives a narrower
-      interval.
+    - `at_any_time`: False for a number of pairs fixed beforehand, which gives a narrower interval.
     **Returns:** the `PairedRates`.
     **Raises:** `ValueError` for counts below zero or above `pairs`, and unless `pairs >= 1` and
     `0 < confidence < 1`.

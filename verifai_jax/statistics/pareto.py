@@ -19,8 +19,8 @@ def fronts(points: ArrayLike) -> Int[np.ndarray, " n"]:
     """Return each point's Pareto front: 0 if none dominates it, 1 if only front 0 does, ...
 
     **Arguments:**
-    - `points`: `[n, objectives]`, all objectives to be minimised. Infinite entries compare as
-      numbers do.
+    - `points`: `[n, objectives]`, all objectives, to be minimised. Infinite entries are compared
+      too.
     **Returns:** the numbers of the fronts; -1 for a point with a NaN, which is ignored.
     **Raises:** `ValueError` for points that are not a matrix.
     """

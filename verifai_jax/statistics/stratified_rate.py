@@ -93,7 +93,7 @@ def stratified_rate(
 
     **Arguments:**
     - `first`, `second`: failures and trials of each stratum.
-    - `share`: probability of the second stratum: a number, or counts of independent samples in it
+    - `share`: probability of the second stratum: a number, or counts of independent samples, in it
       and in all.
     - `confidence`: the probability that the interval holds.
     - `undecided`: further trials of each stratum that may have failed.

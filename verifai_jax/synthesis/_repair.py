@@ -83,8 +83,7 @@ def repair(
     - `attack`: the search over the environment that looks for failures of the parameters.
     - `margin`: the required robustness.
     - `rounds`: maximum number of rounds, each an attack and a repair.
-    - `held_out`: number of fresh environments for the failure rates before and after; 0 for no
-      check.
+    - `held_out`: number of fresh environments for the rates before and after; 0 for no check.
     - `mass`: probability of the central part of the prior, around its medians, in which the
       environment is attacked; environments farther out in the tails are ignored. With 1 the attack
       reaches the ends of all tails at once.

@@ -78,8 +78,7 @@ def feature_parameters(
 def attack_search(problem: Problem, search: str | Search, loop: Parametric) -> Search:
     """Return the search over the environment, if it can work on this problem.
 
-    **Raises:** `ValueError` for a search that needs clauses, or gradients that the system does not
-    have.
+    **Raises:** `ValueError` for a search that needs clauses, or gradients that the system lacks.
     """
     if isinstance(search, str):
         search = searches.named(search)

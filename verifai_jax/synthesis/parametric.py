@@ -190,7 +190,7 @@ class ArrayParameters:
     """Arrays as parameters, such as the weights of a network; all features are the environment.
 
     **Arguments:**
-    - `problem`: the problem; its space, formulas and `end` are used, with the system from
+    - `problem`: the problem, whose space, formulas and `end` are used with the system of
       `system_of`.
     - `parameters`: a pytree of arrays of real numbers.
     - `system_of(parameters) -> system`: a pure function, traced by JAX.

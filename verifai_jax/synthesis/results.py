@@ -155,8 +155,7 @@ class Round(NamedTuple):
     """One round of a repair, starting with the attack on its parameters.
 
     **Fields:**
-    - `attacked`: number of environments simulated; `counterexamples` among them; `worst`
-      robustness.
+    - `attacked`: number of simulated environments; their `counterexamples`; `worst` robustness.
     - `change`: distance of the parameters from the nominal ones, Euclidean in unit coordinates (or
       in the arrays' own).
     """

@@ -27,8 +27,7 @@ def strategy(space: FeatureSpace, nominal: Mapping[str, Any] | None = None) -> A
     - `nominal`: nominal features, towards which examples shrink; by default the middles of the
       domains, and the minimum lengths.
     **Returns:** a `hypothesis.strategies.SearchStrategy` of dictionaries of features.
-    **Raises:** `ImportError` without Hypothesis; `ValueError` for nominal features outside the
-    space.
+    **Raises:** `ImportError` without Hypothesis; `ValueError` for nominal features outside it.
     """
     try:
         from hypothesis import strategies

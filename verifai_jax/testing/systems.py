@@ -23,8 +23,8 @@ def check_system(
     - `space`: the feature space of the system.
     - `samples`: number of random features.
     - `seed`: the seed of features and keys.
-    - `tolerance`: maximum difference of signals between the ways to simulate, relative to their
-      largest value.
+    - `tolerance`: maximum difference of signals between simulations, relative to their largest
+      value.
     **Raises:** `AssertionError` naming the broken law.
     """
     points = jax.random.uniform(jax.random.key(seed), (samples, space.dim), jnp.float32)

@@ -48,11 +48,9 @@ def verify(
 
     **Arguments:**
     - `problem`: a problem whose system JAX traces, without random numbers of its own.
-    - `budget`: approximate time in seconds; 60 if `boxes` is left out too. Ctrl-C stops it at any
-      time.
+    - `budget`: approximate seconds; 60 if `boxes` is left out too. Ctrl-C stops it at any time.
     - `boxes`: maximum number of boxes to examine.
-    - `samples`: number of simulations from the prior of the undecided part, which bound how often
-      it fails.
+    - `samples`: simulations from the prior of the undecided part, to bound how often it fails.
     - `confidence`: the confidence of that bound, which holds whenever one stops.
     - `seed`: the seed of the samples.
     - `precision`: the precision of the simulations that are verified, `"float32"` or `"float64"`.

@@ -124,8 +124,7 @@ class Undecided:
 class RestSpace(FeatureSpace):
     """A feature space whose constraint also refuses decided boxes.
 
-    The constraint uses points, since features may have lost coordinates, such as those of absent
-    items.
+    The constraint uses points, since features may lack coordinates, as of absent items.
     """
 
     def __init__(self, space: FeatureSpace, rest: Rest) -> None:

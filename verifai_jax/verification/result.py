@@ -56,10 +56,8 @@ class Verification(Drawn, Reported, InNotebook):
       given by a hash.
     - `confidence`: the confidence of bounds from samples.
     - `continuous`: whether it is about the differential equation.
-    - `looked_at`: number of boxes examined; `simulations`; `seconds`; `stopped`: the reason why it
-      ended.
-    - `notes`: notes for the user; `version`; `sources`: the files of the model, as a run records
-      them.
+    - `looked_at`: number of examined boxes; `simulations`; `seconds`; `stopped`: why it ended.
+    - `notes`: notes for the user; `version`; `sources`: the model's files, as a run records them.
     """
 
     _picture = "verification", "plot_verification"
@@ -308,8 +306,7 @@ def described(problem: Problem) -> dict[str, Any]:
 def load_verification(path: str | Path) -> Verification:
     """Read a result written by `Verification.save`.
 
-    **Raises:** `FileNotFoundError`; `DamagedError` for a file whose content has changed, or that is
-    not a result.
+    **Raises:** `FileNotFoundError`; `DamagedError` for a changed file, or one that is not a result.
     """
     record = read_record(Path(path))
     if record.pop("kind", None) != KIND:

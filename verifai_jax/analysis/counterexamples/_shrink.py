@@ -89,9 +89,8 @@ def shrink(
     box. It is 0.2 % farther away than the nearest failing point, as a margin for rounding. Ctrl-C
     ends the search and returns the best result so far.
 
-    **Raises:** `ValueError` for a run without its problem or without a counterexample, a row that
-    is not a counterexample or does not fail when simulated again, and a feature without a nominal
-    value.
+    **Raises:** `ValueError` for a run without a problem or a counterexample, a row that is not a
+    counterexample or does not fail when simulated again, and a feature without a nominal value.
     """
     problem = selection.problem_of(run)
     if by not in ORDERS:

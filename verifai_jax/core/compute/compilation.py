@@ -192,8 +192,7 @@ def compile_soon(
     - `name`: the name of the program in messages, such as "the search".
     - `lowered`: the program, lowered by JAX.
     - `effort`: how strongly XLA optimises it; accelerators always use the maximum.
-    - `splits`: whether its loops may be split over cores; False for a program that already uses all
-      of them.
+    - `splits`: whether its loops may be split over cores; False if it already uses all of them.
     - `wide`: whether it may use the processor's widest vectors; only for a program without XLA's
       own math functions, one of which is wrong with these.
     """

@@ -31,7 +31,7 @@ def spread_over_devices(
     **Arguments:**
     - `function`: a function of arrays whose leading axes are one device's share.
     - `split`: for each argument, whether its leading axis is split; the others are passed whole.
-    - `devices`: JAX devices; all of this process when left out. Leading axes must be multiples of
+    - `devices`: JAX devices; by default all of this process. Leading axes must be multiples of
       their number.
     **Returns:** a function of the whole arrays, to be traced by `jax.jit`; `function` itself if
     there is only one device.

@@ -112,8 +112,7 @@ def gather(
     If one fails, or the user interrupts, queued calls are cancelled; results that exist by then are
     still reported.
 
-    **Raises:** `WorkerError` if a worker died and was not replaced; otherwise the error of the
-    call.
+    **Raises:** `WorkerError` if a worker died and was not replaced; the error of the call.
     """
     waiting = dict(enumerate(futures))
     count = len(waiting)

@@ -49,8 +49,7 @@ def remembered_as(kind: str, *values: object) -> str | None:
 
     **Arguments:**
     - `kind`: the kind of program, readable in the folder.
-    - `values`: all values that determine the program, apart from this package and JAX; see
-      `identity`.
+    - `values`: all values that determine the program, except this package and JAX; see `identity`.
     **Returns:** the name; None if a value has no identity, or if nothing is stored on disk.
     """
     if cache_folder() is None or None in values:

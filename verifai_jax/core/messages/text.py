@@ -203,8 +203,7 @@ def one_line(text: str, maximum: int = MAX_MESSAGE_LENGTH) -> str:
 def folder_name(text: str) -> str:
     """Return a folder name made from any text: `a_b` from `../a/b`.
 
-    Letters, digits and a few signs stay; other characters become `_`, and the name has at most 100
-    characters.
+    Letters, digits and a few signs stay, others become `_`; at most 100 characters remain.
     """
     kept = "".join(c if c.isalnum() or c in " ._-+=,()" else "_" for c in shorten(text, 100))
     return kept.strip(" ._") or "unnamed"

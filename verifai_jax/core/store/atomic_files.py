@@ -92,8 +92,7 @@ def unwritable(path: str | Path, error: OSError, more: str = "") -> OSError:
     **Arguments:**
     - `error`: the error of the file system; one that this function made is accepted, too.
     - `more`: a sentence on what happens to the results.
-    **Returns:** an error of the same kind and `errno`, whose message names the path, the reason
-    and a remedy.
+    **Returns:** an error of the same kind and `errno` that names the path, the reason and a remedy.
     """
     rest = f"{_REMEDIES.get(error.errno or 0, _ELSE)}{f'. {more}' if more else ''}"
     kind = type(error) if type(error).__module__ == "builtins" else OSError

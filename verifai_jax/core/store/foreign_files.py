@@ -10,7 +10,7 @@ from verifai_jax.core.messages.errors import require
 def read_xml(data: bytes, name: str) -> Element:
     """Read XML from an untrusted source.
 
-    **Raises:** `ValueError` for a text that is not XML, and for a document type, which can declare
+    **Raises:** `ValueError` for a text that is not XML, and a document type, which can declare
     entities.
     """
 

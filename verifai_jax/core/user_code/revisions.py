@@ -57,7 +57,7 @@ def load_at_revision(target: str, kind: type[Kind]) -> Iterator[Kind]:
     - `target`: `FILE.py:NAME`, or `FILE.py:NAME@REVISION` with any revision that git knows.
     - `kind`: class of the object.
     **Returns:** a context with the object; at its end the files of the revision are removed.
-    **Raises:** `TargetError` for an unknown revision, or outside a repository; the errors of
+    **Raises:** `TargetError` for an unknown revision, or without a repository; the errors of
     `load_target`.
     """
     plain, revision = split_revision(target)

@@ -71,8 +71,8 @@ class Waveform:
     def over(self, duration: float) -> "Waveform":
         """Return the same control points with this duration in seconds.
 
-        **Raises:** `ValueError` for a duration that is not positive, or that ends before the last
-        given time.
+        **Raises:** `ValueError` for a duration that is not positive, or ends before the last given
+        time.
         """
         duration = check_duration(duration)
         if self.times is not None and self.times[-1] > duration * (1 + 1e-6):
@@ -124,8 +124,7 @@ class Waveform:
     def _held(self, knots: Any, time: Any, sign: Any, xp: Any) -> Any:
         """Return the value at a time; `sign` is -1 where a piece that just begins counts not yet.
 
-        An instant at which a piece begins or a pulse ends belongs to what follows, whatever its
-        rounding.
+        An instant at which a piece begins or a pulse ends belongs to the next piece.
         """
         count = knots.shape[0]
         if self.times is not None:

@@ -67,8 +67,8 @@ def error_budget(
     """Bound the error of a probability, part by part, and how wrong the prior may be.
 
     **Arguments:**
-    - `problem`: the simulated problem; for a comparison the candidate, for a certificate that of
-      the policy.
+    - `problem`: the simulated problem: of a comparison the candidate, of a certificate the
+      policy's.
     - `result`: an estimate, a rate (`run.failure_rate`), a certificate, or a candidate of a
       comparison, `comparison["NAME"]`.
     - `baseline`: the baseline of a comparison.

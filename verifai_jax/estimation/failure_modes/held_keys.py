@@ -48,8 +48,7 @@ class Divided:
     - `joined`, `tried`: the number of failures that a path joins to a region, and of those tried.
     - `under`: share of the failures that fail under one of the keys.
     - `held`: number of keys.
-    - `design`: row of the likeliest failure of each region; by default the one nearest to the
-      origin.
+    - `design`: row of the likeliest failure of each region; by default the nearest to the origin.
     - `failing`: for a system with its own random numbers, how many of `times` simulations of each
       likeliest failure fail.
     """

@@ -33,8 +33,8 @@ CHOSEN = 6
 class Carry:
     """The values that a loop or a branch changes: variables, or arrays in memory.
 
-    A branch changes its initial values in place if nothing else uses them, so that unchanged values
-    need no copy.
+    A branch changes its initial values in place if nothing else uses them, so unchanged values need
+    no copy.
     """
 
     def __init__(

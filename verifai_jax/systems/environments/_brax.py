@@ -62,8 +62,7 @@ class Brax(PolicyLoop):
     def refined(self, factor: int | Int[Array, ""]) -> "Brax":
         """Return the same episode with a step divided by `factor`; samples and decisions stay.
 
-        The factor may be traced if `traced_factor` is true: one program then replays with every
-        step.
+        If `traced_factor` is true the factor may be traced: one program then serves all steps.
 
         **Raises:** `ValueError` for a factor that is not a positive integer, for an environment
         whose step belongs to it, and for the backends spring and positional, whose model changes

@@ -140,8 +140,7 @@ def gymnax(
       `action` and `reward` are added. Or a function `(state, observation, action, reward, features)
       -> dict`. By default: the parts of the state (except `time`), `observation`, `action` and
       `reward`, if they are scalars or vectors. An action of one number is a scalar signal.
-    - `dt`: duration of a step in seconds; by default the environment's parameter `dt` or `tau`, or
-      1.
+    - `dt`: seconds of a step; by default the environment's parameter `dt` or `tau`, or 1.
     - `params`: the parameters to which features are applied; by default the environment's own.
     - `policy_memory`: the initial memory of a policy with memory. It is then called as
       `(observation, memory)` or `(observation, memory, key)` and returns `(action, memory)`.

@@ -130,10 +130,8 @@ def playground(
       -> dict`, with Playground's state. By default: `qpos`, `qvel`, the metrics, `observation`,
       `action` and `reward`, if they are scalars or vectors.
     - `dt`: duration of a step in seconds; `env.dt` when left out.
-    - `policy_memory`: the initial memory of a policy with memory; by default that of `policy`
-      itself.
-    - `options`: overrides of an environment's configuration by name; `impl` is `"jax"` when left
-      out.
+    - `policy_memory`: the initial memory of a policy with memory; by default its own.
+    - `options`: overrides of an environment's configuration by name; `impl` is by default `"jax"`.
     - `observation_delay`, `action_delay`: number of steps after which an observation reaches the
       policy, and an action takes effect: a number, or `{feature: maximum}`.
     **Returns:** a `Playground` system; one episode is one simulation.

@@ -64,8 +64,7 @@ class FMUSimulation:
     def check(self, features: Features) -> None:
         """Check that there is a variable for every feature.
 
-        **Raises:** `ValueError` that names the first feature without one, and the existing
-        variables.
+        **Raises:** `ValueError` with the first feature without one, and the existing variables.
         """
         for name in features:
             variable = self._variable(name)
@@ -200,8 +199,7 @@ def fmu(
       names may not have.
     - `controller`: a function `(time, outputs, features)` that returns inputs by the variables'
       names, called once a step; features that are not variables are passed only to it.
-    - `workers`: number of processes that simulate; None for this process, which a crash of the FMU
-      would end.
+    - `workers`: number of processes; None for this process, which a crash of the FMU would end.
     - `timeout`: seconds after which a simulation is aborted.
     - `reuse`: whether a process reuses its instance for the next simulation, which saves loading
       it. The instance is set back to its initial state, or reset if the FMU cannot save its state.

@@ -38,8 +38,7 @@ class Variable:
     """A scalar variable of an FMU.
 
     - `name`, `reference`, `description`: as in the FMU.
-    - `type`: the type in the names of the functions that set and read it, such as `Real` or
-      `Float64`.
+    - `type`: the type in the names of its set and get functions, such as `Real` or `Float64`.
     - `causality`: `parameter`, `input`, `output`, `local` ...
     - `variability`: `constant`, `fixed`, `tunable`, `discrete` or `continuous`.
     - `unit`: its unit; empty if there is none.

@@ -97,8 +97,7 @@ class Bindings:
     def leaves(self, features: Mapping[str, Any]) -> dict[str, Float[Array, "..."]]:
         """Return the model's arrays for this row of features, in the model's shapes.
 
-        Geometry is computed first, then masses with their inertia, then the bound values
-        themselves.
+        Geometry is computed first, then masses with inertia, then the bound values.
         """
         ordered = ("geom_size", "geom_pos", "geom_quat", GEOM_MASS)
         groups = [

@@ -33,8 +33,7 @@ from verifai_jax.systems.pytree_checks import (
 class Ode(System):
     """A closed loop `(features, key) -> Trace`; made by `ode`, which documents its parts.
 
-    - `substeps`: number of integration steps between two samples; more than one in a `refined`
-      loop.
+    - `substeps`: integration steps between two samples; more than one in a `refined` loop.
     - `exact_step`: whether the step is part of the plant, so that the loop has no finer one.
     """
 
@@ -66,7 +65,7 @@ class Ode(System):
 
         JAX may trace the factor; the loop then has no reverse-mode derivative.
 
-        **Raises:** `ValueError` for a factor that is not a positive integer, and for a loop with
+        **Raises:** `ValueError` for a factor that is no positive integer, and a loop with
         `exact_step`.
         """
         if self.exact_step:

@@ -70,8 +70,7 @@ class Frames:
     def feed(self, data: bytes) -> Iterator[Message]:
         """Yield the complete messages among the bytes received so far.
 
-        **Raises:** `WireError` for an invalid message, after which later bytes cannot be read
-        either.
+        **Raises:** `WireError` for an invalid message; later bytes cannot be read either.
         """
         self._bytes += data
         at = 0

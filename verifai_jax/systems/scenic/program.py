@@ -138,8 +138,8 @@ class ScenicProgram:
         - `steps`: the maximum number of steps of a simulation.
         - `records`: names of `record` statements, which become signals; all when left out.
         - `dt`: duration of a step in seconds; the simulator's own when left out.
-        - `workers`: number of processes, each of which compiles the program once; in this process
-          when left out.
+        - `workers`: number of processes, each of which compiles the program; by default this
+          process.
         - `timeout`: wall-clock seconds for one simulation; needs `workers`. Compiling the program
           in a worker's first simulation counts.
         - `options`: further options of `verifai_jax.blackbox`.

@@ -50,8 +50,7 @@ class Check:
     - `confidence`: the confidence of statements about the failure probability.
     - `rename`: new names of features, for older files of the corpus.
 
-    **Raises:** `ValueError` for numbers out of range, and for a budget with which no test could
-    pass.
+    **Raises:** `ValueError` for numbers out of range, and a budget with which no test could pass.
     """
 
     budget: int = BUDGET

@@ -243,8 +243,8 @@ class Evidence:
     - `model`: hash of the simulated model; empty if not recorded.
     - `backend`: the backend that simulated it.
     - `sources`: the sources of a run, as it recorded them.
-    - `chain`: last hash of the chain of its inputs: for a run the present one, for claims the
-      recorded one.
+    - `chain`: last hash of the chain of its inputs: the present one of a run, the recorded one of
+      claims.
     """
 
     kind: str

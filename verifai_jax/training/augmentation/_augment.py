@@ -69,8 +69,7 @@ def augment(
     - `random`: new inputs from the prior.
     - `standard`: initial inputs, transformed by the task's `transform`.
     - `counterexamples`: rows of the error table, in the order in which the search found them.
-    - `table_random`, `table_closest`: counterexamples drawn at random, or those closest to each
-      other.
+    - `table_random`, `table_closest`: counterexamples at random, or those closest to each other.
     - `table_pca`, `rules`: new inputs along the principal components of the counterexamples, or
       inside the rules of the table, even if the network is right on them.
     - `pca_kept`, `rules_kept`: the same, but only inputs on which the network errs are added.

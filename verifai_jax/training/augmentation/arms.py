@@ -62,10 +62,8 @@ class Base:
 class Addition:
     """Features of the inputs that an arm adds.
 
-    - `rows`: a DataFrame with the columns of the space; for transformed inputs, the features of the
-      originals.
-    - `rendered`: number of inputs that had to be rendered for the choice, including the chosen
-      ones.
+    - `rows`: a DataFrame with the columns of the space; of the originals for transformed inputs.
+    - `rendered`: number of inputs rendered for the choice, including the chosen ones.
     - `why`: the reason if there are fewer than requested; otherwise empty.
     - `transformed`: True for inputs of the initial set that are to be transformed.
     """

@@ -118,8 +118,7 @@ class Workshop:
     def render(self, rows: pd.DataFrame) -> Examples:
         """Render the inputs of features, and compute their labels.
 
-        The rows of the examples are those that were rendered: with the types and the precision of
-        features.
+        The rows are those that were rendered: with the types and precision of features.
         """
         # One row too many where there is none: it tells the shapes.
         some = rows if len(rows) else self.draw(self.task.space, jax.random.key(0), 1)

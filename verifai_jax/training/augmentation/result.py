@@ -119,8 +119,8 @@ class Augmentation(InNotebook):
         **Arguments:**
         - `arm`: name of the arm.
         - `seed`: number of the seed.
-        **Raises:** `UnknownNameError` for an arm that the table does not have; `ValueError` for
-        such a seed.
+        **Raises:** `UnknownNameError` for an arm that is not in the table; `ValueError` for such a
+        seed.
         """
         check_names("arm", [arm], self.arms)
         known = sorted({int(number) for number in self.table["seed"]})

@@ -52,7 +52,7 @@ class SupervisedTask:
 
     **Arguments:**
     - `name`: the name in results.
-    - `space`: a `FeatureSpace`, or a dictionary of domains, for all inputs that the network should
+    - `space`: a `FeatureSpace` or dictionary of domains of all inputs that the network should
       handle.
     - `render`: a function from features to one input.
     - `label`: a function from features to the input's label, which needs no manual labelling.

@@ -64,8 +64,8 @@ def sweep(
     - `search`: the search over the hyper-parameters: a name, a `Search`, `"optuna:tpe"`, or an
       `OptunaSampler`. A search that learns proposes in rounds and minimises the failure rate, then
       the worst robustness, then the return.
-    - `configurations`: maximum number of configurations; each is trained once with each of the
-      study's seeds.
+    - `configurations`: maximum number of configurations; each is trained with each of the study's
+      seeds.
     - `seed`: the seed of the search and of the samples; training seeds belong to the study.
     - `samples`: minimum number of samples of each policy in its certification.
     - `confidence`: the confidence of all verdicts together, between 0 and 1.
@@ -77,8 +77,7 @@ def sweep(
     - `episodes`: number of episodes over which the nominal return is averaged.
     - `folder`: the folder that caches finished work; passing it again resumes an interrupted sweep.
     - `max_seconds`: wall-clock limit; no training begins after two thirds of it.
-    - `progress`: True draws progress bars, False none; None draws them on a terminal and in a
-      notebook.
+    - `progress`: True draws bars, False none; None draws them on a terminal and in a notebook.
     - `note`: plain data that is stored in the folder next to the work.
     - `callbacks`: functions called for each policy when its return is known, and again when its
       safety is, with the number of calls so far and a dictionary of plain numbers; cached work

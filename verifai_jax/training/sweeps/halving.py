@@ -47,10 +47,9 @@ class Halving:
         """Choose the configurations that continue.
 
         **Arguments:**
-        - `objective`: the objective of each configuration, by its number; the smallest is best, and
-          NaN is worst.
-        **Returns:** numbers of the configurations, in ascending order; among equal ones the first
-        continue.
+        - `objective`: objective of each configuration, by number; the smallest is best, NaN is
+          worst.
+        **Returns:** ascending numbers of the configurations; among equal ones the first continue.
         """
         count = self.survivors(len(objective))
         values = {n: math.inf if math.isnan(value) else value for n, value in objective.items()}

@@ -73,8 +73,8 @@ class HyperparameterImportance(InNotebook):
     - `chance`: limit that the largest trend of unrelated hyper-parameters stays below in 95 % of
       cases, by target.
     - `missing`: reasons for a missing model, by target.
-    - `unsafe`, `safe`: principal components of the unsafe and safe configurations; None for fewer
-      than five.
+    - `unsafe`, `safe`: principal components of unsafe and safe configurations; None for fewer than
+      five.
     - `configurations`: their number.
     - `name`: the name of the study.
     """
@@ -198,8 +198,8 @@ def hyperparameter_importance(
     **Arguments:**
     - `table`: a table with columns `configuration`, `steps`, `verdict`, `failure_rate`,
       `nominal_return` and the hyper-parameters.
-    - `hyperparameters`: names of their columns; constant ones are left out. `steps` is included if
-      it varies.
+    - `hyperparameters`: names of their columns, without constant ones, and with `steps` if it
+      varies.
     - `space`: the space of the study; if None, columns are scaled by their minimum and maximum.
     - `repeats`: how often folds are drawn and each column is shuffled.
     - `seed`: the seed of folds, shuffles and forests.

@@ -56,8 +56,7 @@ def export_to_optuna(
     - `configurations`: one row for each, as in `Sweep.configurations`.
     - `hyperparameters`: names of their columns.
     - `space`: the space of the hyper-parameters, if known.
-    - `used`: names of the hyper-parameters of each algorithm; empty if all algorithms have all of
-      them.
+    - `used`: hyper-parameters of each algorithm, by name; empty if all algorithms have all.
     - `storage`: the storage of the study; in memory when left out.
     **Raises:** `MissingExtra` without Optuna.
     """

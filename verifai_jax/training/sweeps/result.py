@@ -68,8 +68,7 @@ class Sweep(Drawn, Reported):
     - `folder`: the folder of a loaded sweep.
     - `failing`: counterexamples of each row of a loaded sweep, by its number; otherwise the
       certificates have them.
-    - `used`: names of the hyper-parameters of each algorithm; empty if all algorithms have all of
-      them.
+    - `used`: hyper-parameters of each algorithm, by name; empty if all algorithms have all.
     - `reuse`: by kind of work (`"train"`, `"return"`, `"certify"`), the number of entries that were
       cached before, and of all; empty for a loaded sweep.
     """
@@ -189,8 +188,7 @@ class Sweep(Drawn, Reported):
         It can be passed to `falsify`, `estimate`, `synthesize`. Each call returns the same object,
         so that its compiled programs are reused.
 
-        **Raises:** the errors of `policy`; `ValueError` for a sweep that was loaded without its
-        study.
+        **Raises:** the errors of `policy`; `ValueError` for a sweep loaded without its study.
         """
         policy = self.policy(i)
         if self.study is None:
@@ -254,8 +252,7 @@ class Sweep(Drawn, Reported):
     ) -> "pd.DataFrame":
         """Return features with which the policy of a row fails, the worst first.
 
-        An empty table does not prove that there is no failure: the certificate bounds its
-        probability.
+        An empty table does not prove the absence of failures; see the certificate.
 
         **Arguments:**
         - `i`: number of the row; the best one when left out.
@@ -342,8 +339,7 @@ class Sweep(Drawn, Reported):
     def summary(self) -> str:
         """Write the findings of the sweep, the most important first.
 
-        The summary of a loaded sweep begins with a line if the model of its study has changed
-        since.
+        The summary of a loaded sweep begins with a note if its study's model has changed.
         """
         text = format_summary(self.findings)
         if self.study is None or self.folder is None:
@@ -363,8 +359,7 @@ class Sweep(Drawn, Reported):
     def save(self, folder: str | Path) -> Path:
         """Write the sweep to a folder: table, policies, curves, record.
 
-        The files contain only numbers and text; `load_sweep` reads them, and `rl.load_policy` the
-        policies.
+        The files contain numbers and text; `load_sweep` reads them, `rl.load_policy` the policies.
 
         **Returns:** the folder.
         """

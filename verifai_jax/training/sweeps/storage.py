@@ -54,8 +54,7 @@ class StoredSweep(NamedTuple):
 
     - `record`: table, policies, curves and options; without certificates after reading.
     - `space`: the space of the hyper-parameters, if known.
-    - `used`: names of the hyper-parameters of each algorithm; empty if all algorithms have all of
-      them.
+    - `used`: hyper-parameters of each algorithm, by name; empty if all algorithms have all.
     - `failing`: counterexamples of all rows, with a column `row`.
     """
 
@@ -128,8 +127,7 @@ def _files(folder: Path, rows: int) -> list[Path]:
 def read_description(folder: Path) -> dict[str, Any]:
     """Read the file that describes the sweep in a folder.
 
-    **Raises:** `FileNotFoundError` for a folder without a sweep; `SweepFileError` for a damaged
-    file.
+    **Raises:** `FileNotFoundError` for a folder without one; `SweepFileError` for a damaged file.
     """
     file = folder / RECORD
     if not file.exists():

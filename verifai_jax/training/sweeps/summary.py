@@ -39,8 +39,7 @@ class Findings(NamedTuple):
     - `record`: the record of the sweep.
     - `table`: one row for each policy.
     - `configurations`: one row for each configuration.
-    - `used`: names of the hyper-parameters of each algorithm; empty if all algorithms have all of
-      them.
+    - `used`: hyper-parameters of each algorithm, by name; empty if all algorithms have all.
     - `p`: failure probability below which a policy is called safe, if known.
     - `reuse`: number of entries cached before, and of all, by kind of work.
     """

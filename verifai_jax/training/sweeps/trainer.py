@@ -148,8 +148,7 @@ class Trainer:
         """Return the training with these hyper-parameters.
 
         **Arguments:**
-        - `values`: plain Python values; other hyper-parameters come from the fields of algorithm
-          and task.
+        - `values`: plain Python values; others come from the fields of algorithm and task.
         - `seed`: training seed.
         **Raises:** `ValueError` for a value that the algorithm or the task refuses.
         """

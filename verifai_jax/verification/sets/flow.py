@@ -171,8 +171,7 @@ class _Step:
     """One step of a differential equation, on sets.
 
     **Arguments:**
-    - `program`: the derivatives of all orders of a state, of the shared operands, a time and a
-      state.
+    - `program`: derivatives of all orders of a state, from shared operands, a time and a state.
     - `shared`: operands that do not change during the step.
     - `count`: arrays of the state.
     """

@@ -50,8 +50,7 @@ class Interpreter:
     **Arguments:**
     - `boxes`: size of the batch.
     - `features`: number of symbols that stand for features.
-    - `known`: a function that returns the rule for a custom-derivative function, given its program;
-      or None.
+    - `known`: returns the rule for a custom-derivative function, given its program, or None.
     """
 
     def __init__(self, boxes: int, features: int, known: Known | None = None) -> None:
