@@ -52,10 +52,8 @@ class Mined(Drawn, InNotebook):
     - `front`: the corners for two parameters: neither can be tighter unless the other gets looser.
       One entry for one parameter.
     - `formula`: the formula with `values`, which the recordings satisfy.
-    - `tightest`: for each name `"least"` or `"greatest"`, the direction in which the formula is
-      tighter.
-    - `sampled`: parameters in which the formula was found monotone by trying values, not from its
-      form.
+    - `tightest`: for each name `"least"` or `"greatest"`, the direction of a tighter formula.
+    - `sampled`: parameters in which the formula was found monotone by trying values.
     - `recordings`, `satisfied`: number of recordings, and of those that satisfy `formula`.
     - `broken`: the rate of recordings that break it, with its interval.
     - `searched`: number of simulations that did not break it, if a problem was searched; else None.

@@ -29,8 +29,7 @@ class Conditions:
     - `rain`: opacity in [0, 1] of streaks, whose positions differ in each frame.
     - `glare`: strength of a bright spot at `glare_at`, `(across, down)` in [0, 1], whose size is
       `glare_size` of the image's height.
-    - `dirt`: opacity in [0, 1] of spots on the lens, at the same positions in all frames with a
-      lens.
+    - `dirt`: opacity in [0, 1] of spots on the lens, at the same positions in all frames.
     - `blur`: standard deviation in pixels.
     - `brightness`, `contrast`, `saturation`: factors; 1 has no effect.
     - `noise`: standard deviation of each channel of each pixel.

@@ -194,8 +194,7 @@ SOLIDS = (Box, Cone, Cylinder, Sphere)
 def check_scene(scene: Any, camera: Camera, conditions: Conditions | None) -> Conditions:
     """Check a scene, a camera and conditions; None stands for a clear day.
 
-    **Raises:** `ValueError` or `TypeError` that names the description, its field and the allowed
-    values.
+    **Raises:** `ValueError` or `TypeError` with the description, its field and the allowed values.
     """
     conditions = Conditions() if conditions is None else conditions
     if not isinstance(camera, Camera):

@@ -56,8 +56,7 @@ def train_detector(
     **Arguments:**
     - `images`: colours in [0, 1].
     - `labels`: the labels of each image.
-    - `network`: a detector to train further; None for a new one, with the default layers of
-      `detector`.
+    - `network`: a detector to train further; None for a new one with default layers.
     - `steps`, `batch`: number of steps, and images in each.
     - `learning_rate`: the learning rate of the first step.
     - `noise`: standard deviation of noise added to each pixel in each step.

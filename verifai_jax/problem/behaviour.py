@@ -49,8 +49,7 @@ class Behaviour:
     - `cells`: signal -> `(low, high, cells)`: the range and the number of equally wide cells of the
       signal. A cell of the behaviour is one combination of cells of all these signals.
     - `formulas`: the formulas whose clause nearest to breaking also counts; none when left out.
-    **Raises:** `ValueError` for a signal without a range, or if the cells of all signals are too
-    many.
+    **Raises:** `ValueError` for a signal without a range, or too many cells of all signals.
     """
 
     axes: tuple[Axis, ...]

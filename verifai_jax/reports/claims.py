@@ -37,8 +37,7 @@ def claims_json(
 
     **Arguments:**
     - `chain`: last hash of the chain over all inputs of the report.
-    - `about`: the subject of the claims, which `vj.trace_matrix` compares with later states; see
-      `about_json`.
+    - `about`: the subject of the claims, for comparison in `vj.trace_matrix`; see `about_json`.
     """
     return {
         "format": FORMAT,

@@ -16,8 +16,7 @@ from verifai_jax.search import named
 def run_command(run: Run) -> str | None:
     """Return the command that repeats a run; None if there is none.
 
-    A run of a problem without a file name, or with a search without a name, can only be repeated in
-    Python.
+    A run of a problem without a file, or a search without a name, is repeated in Python.
     """
     search = run.search_data or {}
     objective = ["--objective", "likelihood"] if "likeliest" in search else []

@@ -71,8 +71,8 @@ def write_report(
       in `vj.modes`; none when left out.
     - `problem`: the problem of an estimate, of a verification, or of a failure table without a
       failure, or the baseline of a comparison; the report shows its property and prior.
-    - `errors`: a result of `vj.error_budget` on how wrong the number can be; adds a section and a
-      claim.
+    - `errors`: a result of `vj.error_budget`, for a section and a claim on how wrong the number can
+      be.
     - `odd`: the operational design domain, from `vj.read_odd`; adds a section on how much of it a
       run covers. Features without their own units and reasons take those of the domain.
     - `assessment`: whether to add sections for an assessor: the claims as a tree, the nine steps of

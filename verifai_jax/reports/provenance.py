@@ -42,8 +42,7 @@ def folder_inputs(folder: Path, roles: Sequence[tuple[str, str]]) -> list[Input]
     """Hash files of a folder of results.
 
     **Arguments:**
-    - `roles`: patterns of file names with a description of these files; their order is that of the
-      chain.
+    - `roles`: patterns of file names with their description, in the order of the chain.
     """
     return [
         Input(file.relative_to(folder).as_posix(), role, file_hash(file))
@@ -56,8 +55,7 @@ def folder_inputs(folder: Path, roles: Sequence[tuple[str, str]]) -> list[Input]
 class Model(NamedTuple):
     """The files from which a result was made, and those that have changed since.
 
-    - `parts`: the recorded files, once for each part of a run with its own model; none if not
-      recorded.
+    - `parts`: the recorded files, for each part of a run with its own model; none if not recorded.
     - `changes`: the changes since then.
     """
 

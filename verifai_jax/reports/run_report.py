@@ -89,8 +89,7 @@ def run_page(
 
     **Arguments:**
     - `traces`, `studies`, `modes`: as in `write_report`.
-    - `words`: further words of the command that builds the report again; None if there is no such
-      command.
+    - `words`: further words of the command that builds the report again; None without a command.
     """
     found = study(run, traces, studies, modes)
     now = None if run.problem is None else run.problem.sources()

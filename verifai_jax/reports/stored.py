@@ -34,8 +34,7 @@ def read_result(
       file of `verifai-jax verify --into`.
     - `space`: the space of the compared problems, which the JSON does not contain.
     **Returns:** the result; a comparison does not have its single pairs.
-    **Raises:** `FileNotFoundError` if there is no such file; `ValueError` for anything but such a
-    result.
+    **Raises:** `FileNotFoundError` if there is no such file; `ValueError` for other content.
     """
     try:
         data = json.loads(file.read_text(encoding="utf-8"))

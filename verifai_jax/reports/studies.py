@@ -91,8 +91,7 @@ def study(
     - `traces`: maximum number of rows to simulate; a default when left out.
     - `studies`: whether to explain and shrink the worst failure, with up to 2000 simulations; by
       default unless the system is a slow black box.
-    - `modes`: number of simulations for the modes of failure and their probabilities; none when
-      left out.
+    - `modes`: number of simulations for the modes of failure and their probabilities; or none.
     """
     left_out: list[str] = []
     found = analyze(run)

@@ -113,8 +113,7 @@ class BatchedTraining:
     - `configurations`: the runs; methods refer to them by index.
     - `devices`: JAX devices to spread them over; all of this process when left out.
     - `per_device`: number of runs under one `vmap` on a device; by default 1 on CPUs, else 64.
-    - `watch`: a function called every few seconds with the number of each run and its learning
-      curve so far.
+    - `watch`: a function called every few seconds with each run's number and learning curve so far.
     **Raises:** `ValueError` for a configuration that cannot be trained.
     """
 

@@ -59,7 +59,7 @@ class Policy:
     - `action`: the kind of action.
     - `activation`: name of the activation, one of `ACTIVATIONS`. All are 0 at 0, so that units with
       weights 0 have no effect.
-    - `squash`: whether the outputs of a continuous policy are squashed by tanh; otherwise they are
+    - `squash`: whether a continuous policy's outputs are squashed by tanh; otherwise they are
       clipped.
 
     **Raises:** `UnknownNameError` for an unknown activation; `ValueError` for squashed logits.
@@ -333,8 +333,7 @@ def policy_notes(path: str | Path) -> dict[str, Any]:
 def policy_sources(path: str | Path) -> dict[str, Any]:
     """Read the files and versions with which a policy was made, as a run records them.
 
-    **Returns:** plain data with the hashes of `files` and the `versions`; empty if the file has
-    none.
+    **Returns:** plain data with hashes of `files` and the `versions`; empty if the file has none.
     **Raises:** `FileNotFoundError`; `PolicyFileError` for a file of another kind.
     """
     return _plain_data(path, "sources")

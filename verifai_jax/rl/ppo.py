@@ -139,8 +139,7 @@ class Weights:
     """The learnt numbers.
 
     - `policy`, `critic`: layers of the two networks.
-    - `log_std`: `[size]`, logarithm of the standard deviation for exploration; None for discrete
-      actions.
+    - `log_std`: `[size]`, logarithm of the deviation for exploration; None for discrete actions.
     """
 
     # JAX rebuilds the class with stacked arrays and placeholders, which have other shapes.

@@ -333,7 +333,7 @@ def repeat_failures(
 ) -> Repetitions:
     """Simulate the worst failures of a policy again, and remove those that do not fail again.
 
-    It repeats a failure in 25 simulations or 32, and up to 1024 if one did not fail again.
+    It repeats 32 failures, or 4 % of the simulations; 1024 if one did not fail again.
 
     **Arguments:**
     - `blocks`: the blocks that simulate the policies.

@@ -98,8 +98,8 @@ def abstract(
     - `samples`: number of samples of the prior, to sample the region of uncertainty.
     - `batch`: number of images in a round.
     - `seed`: the same seed gives the same result, bit for bit, on the same machine.
-    - `images_per_simulation`: number of images in a simulation, if it is not one for each sample of
-      a trace.
+    - `images_per_simulation`: number of images in a simulation; by default one for each sample of a
+      trace.
     - `progress`: whether to show a progress bar; by default on a terminal or in a notebook.
     **Returns:** the region, the images, the candidates and which of them fail in the loop, with the
     number of rendered images of each stage.

@@ -62,8 +62,7 @@ def animate(
     **Arguments:**
     - `replay`: the result of `run.replay`.
     - `path`: a file to write as well; missing folders are made.
-    - `camera`: the name of a camera of a MuJoCo model; by default the one that shows the motion
-      best.
+    - `camera`: name of a camera of a MuJoCo model; by default the one that shows the motion best.
     - `size`: width and height of a frame in pixels.
     - `fps`: frames per second; chosen automatically when left out.
     **Raises:** `ValueError` for any other problem without `draw`, for a path that does not end in

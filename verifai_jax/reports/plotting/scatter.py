@@ -28,8 +28,7 @@ def plot_features(
     grey crosses.
 
     **Arguments:**
-    - `features`: names; by default the `maximum` features that separate failing from safe samples
-      best.
+    - `features`: names; by default the `maximum` features that best separate failures.
     - `maximum`: maximum number of features, if they are not named.
     **Raises:** `UnknownNameError` for a feature that is not in the table.
     """

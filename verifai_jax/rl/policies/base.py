@@ -47,8 +47,8 @@ class Actions:
     - `counts`: the number of options of each choice, in the order of the outputs; for `argmax`.
     - `shape`: the shape of an action with bounds; a vector when left out.
 
-    **Raises:** `UnknownNameError` for an unknown kind; `PolicyError` for bounds that are missing or
-    do not fit.
+    **Raises:** `UnknownNameError` for an unknown kind; `PolicyError` for missing or unsuitable
+    bounds.
     """
 
     kind: str = "outputs"
@@ -171,7 +171,7 @@ class Policy:
         becomes inputs and outputs `memory.0`, `memory.0.next` and so on.
 
         **Arguments:**
-        - `path`: a path that ends in `.onnx`, in `.safetensors`, or in `.npz`, which needs no other
+        - `path`: a path that ends in `.onnx`, `.safetensors`, or `.npz`, which needs no other
           package.
         - `observation`: an example observation, if the network does not determine its size.
         **Returns:** the path.

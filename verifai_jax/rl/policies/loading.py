@@ -74,12 +74,10 @@ def policy(
       `"scale"` or `"tanh"` with `low=` and `high=`; `"positive"`; `"outputs"` (default).
     - `low`, `high`: bounds of the action.
     - `activation`: the activation of an MLP, after every layer except the last.
-    - `network(weights, observation) -> outputs`: the network of other weights, which it receives by
-      name.
+    - `network(weights, observation) -> outputs`: the network for other weights, given by name.
     - `layers`: names of the layers of an MLP, in order; by default sorted by name.
     - `output`: the output that is the action, for an ONNX graph with several.
-    - `memory`: the recurrent values of an ONNX graph, `{input: output}`; by default found by their
-      shapes.
+    - `memory`: recurrent values of an ONNX graph, `{input: output}`; by default found by shape.
     - `stack`: number of observations that the policy receives at once, the newest last.
     - `batched`: whether a Python function takes a batch of observations.
     **Returns:** a `Policy`, which any system accepts as its policy or controller (`policy.act`), or

@@ -45,8 +45,7 @@ class Mlp:
     """A multilayer perceptron, with an activation after each layer except the last.
 
     - `activation`: a name of `ACTIVATIONS`.
-    - `categories`: if given, observations are integers, which become one-hot vectors of these
-      lengths.
+    - `categories`: if given, integer observations become one-hot vectors of these lengths.
     - `pixels`: whether observations are images `[channels, height, width]` from 0 to 255, which
       first pass through the three convolutions of Mnih et al. (2015).
     """

@@ -34,8 +34,7 @@ OPSET = 18
 class Graph:
     """The function of a graph: `(weights, observation, memory) -> (outputs, memory)`.
 
-    Graphs with equal content are equal, so that policies that differ only in their weights share a
-    program.
+    Graphs with equal content are equal, so policies that only differ in weights share a program.
 
     - `nodes`: the nodes in the order of computation.
     - `constants`: arrays that are not weights: shapes, indices, flags.
@@ -177,8 +176,7 @@ def read_onnx(
     """Read an ONNX model.
 
     **Arguments:**
-    - `path`: the path of the file, next to which tensors may be stored; None if there are only
-      bytes.
+    - `path`: path of the file, next to which tensors may be stored; None for bytes.
     - `what`: its name in errors.
     - `output`: name of the output to use, if there are several.
     - `memory`: the recurrent values `{input: output}`; found by their shapes if None.

@@ -53,8 +53,7 @@ def open_archive(data: bytes, what: str) -> zipfile.ZipFile:
 def read_member(archive: zipfile.ZipFile, name: str, what: str) -> bytes:
     """Return the bytes of a member of an archive.
 
-    **Raises:** `PolicyError` for a member that is missing, damaged, or larger than the archive
-    says.
+    **Raises:** `PolicyError` for a member that is missing, damaged, or larger than stated.
     """
     try:
         entry = archive.getinfo(name)
