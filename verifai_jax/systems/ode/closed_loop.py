@@ -65,7 +65,7 @@ class Ode(System):
 
         JAX may trace the factor; the loop then has no reverse-mode derivative.
 
-        **Raises:** `ValueError` for a factor that is no positive integer, and a loop with
+        **Raises:** `ValueError` unless the factor is a positive integer, and for a loop with
         `exact_step`.
         """
         if self.exact_step:
