@@ -36,7 +36,7 @@ def conformal_threshold(scores: ArrayLike, alpha: float) -> float:
 
 
 def conformal_p_value(scores: ArrayLike, score: ArrayLike) -> np.ndarray:
-    """Return the share of scores, including a further one, that are at least as large as that one.
+    """Return the share of all scores, a further one included, not below the further one.
 
     It is at most `alpha` with probability at most `alpha`.
     """

@@ -278,12 +278,12 @@ def as_function(program: Any, step: Any) -> tuple[Callable[..., list[Any]], list
 def of_some(
     call: Callable[..., list[Any]], values: Sequence[Any], indices: Sequence[int]
 ) -> Callable[..., list[Any]]:
-    """Return a function of some arguments of another, for differentiation.
+    """Fix all other arguments of a function, to differentiate it by these.
 
     **Arguments:**
     - `call`: the other function of arrays.
     - `values`: all its arguments.
-    - `indices`: indices of the arguments of the new function; the others are fixed.
+    - `indices`: indices of the arguments that stay; the others are fixed.
     **Returns:** the function, which returns only results that can have a derivative.
     """
 
