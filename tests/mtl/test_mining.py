@@ -147,7 +147,7 @@ def test_fronts_are_those_of_all_pairs(text, seed):
         ("always (x > ?d & x < ?d + 6)", r"not monotone in \?d"),
         ("always x > ?a * y + ?b", "occur in one comparison"),
         ("(eventually x > 20) & always x > ?d", "no value of [?]d satisfies"),
-        ("always (x > 0 | x > ?d)", "nothing bounds it"),
+        ("always (x > 0 | x > ?d)", "the data do not bound it"),
         ("always (x > 2 & y > ?q)", "signal 'y'"),
     ],
 )
