@@ -6,10 +6,12 @@ import re
 
 import jax.numpy as jnp
 import numpy as np
+import pandas as pd
 import pytest
 from PIL import Image
 
 import verifai_jax as vj
+from verifai_jax.core.display.notebook import Tabular
 
 
 @pytest.fixture(scope="module")
@@ -126,6 +128,17 @@ def test_no_zero_has_a_sign(problem):
     texts = [str(run), str(run.replay(0)), run._repr_html_(), str(run.replay(0).trace)]
     texts += [str(vj.Box(-0.0, 1)), str(vj.parse("x > -0.0"))]
     assert not [text for text in texts if re.search(r"-0(?![.\d])|-0\.0+(?!\d)", text)]
+
+
+@pytest.mark.parametrize("index", [None, "fault"])
+def test_a_table_is_shown_and_written(tmp_path, index):
+    class Found(Tabular):
+        table = pd.DataFrame({"low": [0.5, 1.0]}, pd.Index(["a", "b"], name=index))
+
+    assert "<td>0.5</td>" in Found()._repr_html_()
+    path = Found().to_csv(tmp_path / "found.csv")
+    # Names of rows are written where they mean something.
+    assert list(pd.read_csv(path)) == [*filter(None, [index]), "low"]
 
 
 @pytest.mark.thorough

@@ -10,6 +10,7 @@ moment, unnoticed.
 """
 
 import re
+import shlex
 from collections.abc import Mapping
 from dataclasses import fields
 from pathlib import Path
@@ -208,6 +209,23 @@ def check_not_continued(run: Run, folder: Path) -> None:
             f"somebody has gone on with the run in {folder}: it has {rows} simulations by now, "
             f"this one {run.simulations}; {remedy}"
         )
+
+
+def shown_folder(folder: Path) -> str:
+    """Return the path of a folder as a command names it: relative to the current one, if below."""
+    here, folder = Path.cwd().resolve(), folder.resolve()
+    return folder.relative_to(here).as_posix() if folder.is_relative_to(here) else folder.as_posix()
+
+
+def replay_command(run: Run, row: int | None = None) -> str:
+    """Return what simulates a row again; without a row, what goes before its number."""
+    number = "" if row is None else str(row)
+    if run.folder is None:
+        return f"run.replay({number})"
+    if run.target is None:
+        return f"vj.load({shown_folder(run.folder)!r}, problem).replay({number})"
+    words = ["verifai-jax", "replay", shown_folder(run.folder), number]
+    return shlex.join(words if number else words[:-1])
 
 
 def write_record(run: Run, folder: Path) -> int:

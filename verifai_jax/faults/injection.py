@@ -11,13 +11,12 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Key, PyTree
+from jaxtyping import Array, Bool, Float, Key, PyTree
 
+from verifai_jax.core.compute.keys import mixed_bits
 from verifai_jax.core.messages.errors import check_names
-from verifai_jax.faults.chance import uniform
 from verifai_jax.faults.fault import AtMost, Fault, FaultFeatures, Moment
 from verifai_jax.faults.kinds import WrongChannel
-from verifai_jax.faults.smoothing import blend
 from verifai_jax.features import FeatureSpace
 from verifai_jax.problem.problem import Problem
 from verifai_jax.systems.any_lane import changed_if_needed
@@ -120,7 +119,7 @@ class Injected(Link):
         on = live & self._severe(number)
         at = Moment(
             xp, number, live, xp.maximum(since, 0.0), time, now.period, now.step == 0,
-            self.side == "action", other, lambda count: uniform(seed, now.step, count, xp),
+            self.side == "action", other, lambda count: _uniform(seed, now.step, count, xp),
         )  # fmt: skip
         bad, after = self.fault.corrupt(good, memory, at)
         if xp is not np:
@@ -130,7 +129,7 @@ class Injected(Link):
             faulty = xp.where(on, bad, good)
         else:
             edges = (jnp.asarray(edge, good.dtype) for edge in (lead, trail))
-            faulty = blend(on, live, jnp.asarray(possible), *edges, bad, good)
+            faulty = _blend(on, live, jnp.asarray(possible), *edges, bad, good)
         return within.put(parts, faulty, xp), now.kept(memory, after)
 
     def _happens(self, features: PyTree) -> Any:
@@ -144,6 +143,54 @@ def _can_be(name: str, number: Any) -> Any:
     """Return whether a number of a fault is finite, and a duration not negative."""
     finite = abs(number) < np.inf
     return finite & (number >= 0) if name == "duration" else finite
+
+
+@jax.custom_jvp
+def _blend(
+    on: Bool[Array, ""],
+    live: Bool[Array, ""],
+    possible: Bool[Array, ""],
+    lead: Float[Array, ""],
+    trail: Float[Array, ""],
+    bad: Float[Array, " n"],
+    good: Float[Array, " n"],
+) -> Float[Array, " n"]:
+    """Return `bad` where `on` and `good` elsewhere, with derivatives by the edges.
+
+    A fault that begins a little earlier, between two samples, changes no value. The derivative is
+    therefore that of the line between the values at both samples: the sum over the samples grows by
+    one difference for each period by which the fault is longer.
+
+    **Arguments:**
+    - `on`: whether the fault acts; `live`: whether the instant lies in its time, so that it would
+      act if it were a little severer; `possible`: whether it happens at all.
+    - `lead`, `trail`: periods since its onset, and since its end.
+    """
+    return jnp.where(on, bad, good)
+
+
+@_blend.defjvp
+def _(primals: tuple[Any, ...], tangents: tuple[Any, ...]) -> tuple[Array, Array]:
+    _, live, possible, lead, trail, bad, good = primals
+    *_, dlead, dtrail, dbad, dgood = tangents
+    gap = jnp.where(possible, bad - good, 0.0)
+    begins = jnp.where(jnp.abs(lead) < 1, gap * (1 - jnp.abs(lead)), 0.0)
+    ends = jnp.where(jnp.abs(trail) < 1, gap * (1 - jnp.abs(trail)), 0.0)
+    edges = begins * dlead - ends * dtrail
+    return _blend(*primals), jnp.where(live, dbad, dgood) + edges
+
+
+def _uniform(seed: Any, step: Any, count: int, xp: Any) -> Float[Any, " count"]:
+    """Return numbers between 0 and 1, the same for the same seed (two words) and step.
+
+    JAX's generator would cost more than a step of a small plant, even for a fault that is off. Two
+    rounds of a hash over 32 bits suffice for noise, and NumPy gives the same numbers.
+    """
+    entry = xp.arange(count, dtype=np.uint32) * xp.uint32(0x9E3779B9)
+    word = mixed_bits(entry + xp.asarray(step).astype(np.uint32) ^ seed[0])
+    word = mixed_bits(word + seed[1])
+    # Of 24 bits, which float32 holds; never 0 nor 1.
+    return ((word >> 8).astype(np.float32) + xp.float32(0.5)) * xp.float32(2**-24)
 
 
 def inject(fault: Fault, passing: Passing, choice: tuple[str, int] | None = None) -> Injected:

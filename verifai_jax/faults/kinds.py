@@ -6,11 +6,11 @@ from typing import Any
 
 import jax
 import numpy as np
+from jax.lax import erf_inv
 from jaxtyping import PyTree
 
-from verifai_jax.faults.chance import normal
+from verifai_jax.core.compute.derivatives import with_derivative_of
 from verifai_jax.faults.fault import Fault, Moment, Number, Vector, number
-from verifai_jax.faults.smoothing import straight
 from verifai_jax.systems.delays import entry, moved_up
 
 
@@ -89,7 +89,7 @@ class PacketLoss(Fault, severity="loss", draws=True, holds=True):
         # The derivative of the mean: the older value is used with probability `loss`.
         expected = held + (memory - good) * at.number["loss"]
         constant = (memory - good) * jax.lax.stop_gradient(at.number["loss"])
-        return straight(held, expected - constant), held
+        return with_derivative_of(held, expected - constant), held
 
 
 class Bias(Fault, severity="offset", choices=False):
@@ -116,8 +116,8 @@ class Noise(Fault, severity="std", choices=False, draws=True):
     std: Number = number(0)
 
     def corrupt(self, good: Vector, memory: PyTree, at: Moment) -> tuple[Vector, PyTree]:
-        noise = normal(at.uniform(len(good)), at.xp)
-        return good + at.number["std"] * noise, memory
+        normal = at.xp.asarray(erf_inv(2 * at.uniform(len(good)) - 1)) * np.float32(2**0.5)
+        return good + at.number["std"] * normal, memory
 
 
 class Spikes(Fault, severity="height", choices=False, draws=True):
@@ -146,7 +146,7 @@ class Quantisation(Fault, severity="step", choices=False):
             return rounded, memory
         # Rounding has no slope: it is 1 by the value, and the remainder's by the step.
         left = jax.lax.stop_gradient(at.xp.round(exact) - exact)
-        return straight(rounded, good + left * step), memory
+        return with_derivative_of(rounded, good + left * step), memory
 
 
 class Saturation(Fault, severity="limit", off=math.inf, choices=False):
@@ -199,4 +199,4 @@ def _late(good: Vector, line: Any, seconds: Any, at: Moment) -> tuple[Vector, An
     left = xp.clip(xp.floor(periods).astype(np.int32), 0, latest - 1)
     share = periods - left
     smooth = entry(line, left, xp) * (1 - share) + entry(line, left + 1, xp) * share
-    return straight(whole, smooth), line
+    return with_derivative_of(whole, smooth), line

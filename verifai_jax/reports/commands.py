@@ -9,7 +9,7 @@ from typing import Any
 
 from verifai_jax.falsification.fuzzing.run import FuzzRun
 from verifai_jax.falsification.run import Run
-from verifai_jax.reports.provenance import shown_folder
+from verifai_jax.falsification.run_folder import shown_folder
 from verifai_jax.search import named
 
 
@@ -67,16 +67,6 @@ def run_python(run: Run) -> str:
     if isinstance(run, FuzzRun):
         lines[2:] = [f"run = vj.fuzz(problem, budget={run.budget}, seed={run.seed})"]
     return "\n".join(lines)
-
-
-def replay_command(run: Run, row: int | None = None) -> str:
-    """Return the command that simulates a row again; without a row, its part before the number."""
-    if run.folder is None or run.target is None:
-        number = "" if row is None else row
-        folder = "problem" if run.folder is None else f"{shown_folder(run.folder)!r}, problem"
-        return f"vj.load({folder}).replay({number})" if run.folder else f"run.replay({number})"
-    words = ["verifai-jax", "replay", shown_folder(run.folder)]
-    return shlex.join(words if row is None else [*words, str(row)])
 
 
 def report_command(

@@ -100,9 +100,3 @@ def versions() -> list[tuple[str, str]]:
         except metadata.PackageNotFoundError:
             continue
     return [*found, ("machine", f"{platform.system()} {platform.machine()}")]
-
-
-def shown_folder(folder: Path) -> str:
-    """Return the path of a folder as in a command: relative if it lies below the current folder."""
-    here, folder = Path.cwd().resolve(), folder.resolve()
-    return folder.relative_to(here).as_posix() if folder.is_relative_to(here) else folder.as_posix()

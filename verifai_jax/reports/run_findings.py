@@ -8,10 +8,10 @@ from verifai_jax.core.messages.text import format_percent
 from verifai_jax.evaluation.confirmations import MEANING, NOT_CLAIMED, VERDICTS
 from verifai_jax.falsification.no_rate import what_lies_between, why_no_rate
 from verifai_jax.falsification.run import Run
+from verifai_jax.falsification.run_folder import replay_command
 from verifai_jax.falsification.summary import first_message
 from verifai_jax.features.density import tails
 from verifai_jax.features.english import number
-from verifai_jax.reports.commands import replay_command
 from verifai_jax.reports.markup import (
     Child,
     Markup,

@@ -8,13 +8,13 @@ from verifai_jax.core.messages.text import format_features
 from verifai_jax.evaluation.confirmations import UNDECIDED, describe_checks
 from verifai_jax.falsification.no_rate import why_no_rate
 from verifai_jax.falsification.run import Run
-from verifai_jax.falsification.run_folder import RECORD, STATE
+from verifai_jax.falsification.run_folder import RECORD, STATE, replay_command
 from verifai_jax.falsification.table import FINISHED
 from verifai_jax.falsification.tail import TAIL
 from verifai_jax.mtl import parse
 from verifai_jax.mtl.english import formula_words
 from verifai_jax.reports.claims import Claim, about_json, claims_json
-from verifai_jax.reports.commands import replay_command, report_command, run_command, run_python
+from verifai_jax.reports.commands import report_command, run_command, run_python
 from verifai_jax.reports.markup import element, paragraph, preformatted
 from verifai_jax.reports.optional_sections import mode_claims, modes_section
 from verifai_jax.reports.page import Page, Section

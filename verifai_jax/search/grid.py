@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Key, UInt32
 
+from verifai_jax.core.compute.keys import mixed_bits
 from verifai_jax.core.messages.checks import check_count
 from verifai_jax.core.values.cube import Cube
 from verifai_jax.search.base import Asked, PointSequence
@@ -132,17 +133,10 @@ def permuted(
         one, two, sizes = number // np.uint32(low), number % np.uint32(low), (high, low)
         for step in range(STEPS):
             size = np.uint32(sizes[step % 2])
-            one, two = two, (one + _hash(two ^ keys[step]) % size) % size
+            one, two = two, (one + mixed_bits(two ^ keys[step]) % size) % size
         return one * np.uint32(low) + two
 
     def again(found: UInt32[Array, " n"]) -> UInt32[Array, " n"]:
         return jnp.where(found < total, found, once(found))
 
     return jax.lax.while_loop(lambda found: jnp.any(found >= total), again, once(number))
-
-
-def _hash(value: UInt32[Array, "*shape"]) -> UInt32[Array, "*shape"]:
-    """Mix the bits of numbers, as a hash does: the finalizer of MurmurHash3."""
-    for shift, factor in ((16, 0x85EBCA6B), (13, 0xC2B2AE35)):
-        value = (value ^ (value >> shift)) * np.uint32(factor)
-    return value ^ (value >> 16)

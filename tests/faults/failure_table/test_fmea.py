@@ -1,6 +1,7 @@
 """The failure table against closed forms: redundant sensors, a voter, a single channel."""
 
 import json
+from dataclasses import replace
 
 import jax.numpy as jnp
 import numpy as np
@@ -9,7 +10,7 @@ import pytest
 
 import verifai_jax as vj
 from verifai_jax import faults
-from verifai_jax.faults.failure_table import Effect, FailureTable
+from verifai_jax.faults.failure_table import Effect, FailureTable, rows
 
 END = 1.0
 """Seconds of a simulation: ten samples, so that a duration counts in tenths."""
@@ -105,6 +106,22 @@ def test_it_goes_on_where_it_was_cut_off(tmp_path):
     pd.testing.assert_frame_equal(again.table, first.table)
     with pytest.raises(ValueError, match="holds a different fmea: samples is 50, in the cache 100"):
         vj.fmea(one, dropouts("a", "b"), **{**options, "samples": 50})
+
+
+@pytest.mark.slow
+def test_work_that_ctrl_c_cuts_short_is_not_kept(tmp_path, monkeypatch):
+    one = problem(lambda s: jnp.maximum(s["a"], s["b"]), "always voted >= 0.5")
+    options = {"samples": 50, "budget": 64, "pairs": False, "progress": False}
+    with monkeypatch.context() as patch:
+        cut = lambda *a, **k: replace(vj.falsify(*a, **k), stopped="interrupted")  # noqa: E731
+        patch.setattr(rows, "falsify", cut)
+        with pytest.raises(KeyboardInterrupt):
+            vj.fmea(one, dropouts("a"), **options, folder=tmp_path)
+    searches = []
+    watched = lambda *a, **k: searches.append(a) or vj.falsify(*a, **k)  # noqa: E731
+    monkeypatch.setattr(rows, "falsify", watched)
+    vj.fmea(one, dropouts("a"), **options, folder=tmp_path)
+    assert len(searches) == 1
 
 
 @pytest.mark.proves

@@ -202,6 +202,7 @@ def test_a_function_that_trains_gets_where_its_episodes_begin(tmp_path):
     assert own["failures"][0] > 0 == own["failures"][1]
     assert result.chosen == {"hardened": 1}
     assert "return 0;" not in str(result)
+    assert "by the intervals (no sample fails after)" in str(result)
     again = harden(trainer, staying_below(1.5), **options)
     assert str(again.table.drop(columns="seconds")) == str(result.table.drop(columns="seconds"))
 
@@ -215,6 +216,7 @@ def test_where_nothing_fails_it_is_certified_at_once():
     assert not len(result.added)
     assert result.comparison is None
     assert "hardened in 0 rounds (certified)" in str(result)
+    assert "times that after" not in str(result)
 
 
 @pytest.mark.slow

@@ -32,6 +32,15 @@ def simulation_key(key: Key[Array, ""], row: Int[Array, ""] | int) -> Key[Array,
     return jax.random.fold_in(key, row)
 
 
+def mixed_bits(
+    value: UInt32[Array | np.ndarray, "*shape"],
+) -> UInt32[Array | np.ndarray, "*shape"]:
+    """Mix the bits of numbers, as a hash does: the finalizer of MurmurHash3."""
+    for shift, factor in ((16, 0x85EBCA6B), (13, 0xC2B2AE35)):
+        value = (value ^ (value >> shift)) * np.uint32(factor)
+    return value ^ (value >> 16)
+
+
 def _threefry(
     key: UInt32[np.ndarray, "2"], high: UInt32[np.ndarray, " n"], low: UInt32[np.ndarray, " n"]
 ) -> tuple[UInt32[np.ndarray, " n"], UInt32[np.ndarray, " n"]]:

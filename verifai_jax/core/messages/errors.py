@@ -71,6 +71,16 @@ def _plain_number(value: object) -> object:
     return value.item() if is_numpy else value  # pyright: ignore[reportAttributeAccessIssue]
 
 
+def end_if_interrupted(stopped: str | None) -> None:
+    """Raise `KeyboardInterrupt` for a result that Ctrl-C cut short: a part is no finished work.
+
+    **Arguments:**
+    - `stopped`: the reason why the verb ended that returned the result.
+    """
+    if stopped == "interrupted":
+        raise KeyboardInterrupt
+
+
 class MissingExtra(ImportError):
     """An optional package that is not installed, with the command that installs it."""
 

@@ -21,7 +21,7 @@ import pandas as pd
 from verifai_jax.analysis.counterexamples import confirm
 from verifai_jax.core.display.progress import shows_progress
 from verifai_jax.core.messages.checks import check_count, check_fraction, is_number
-from verifai_jax.core.messages.errors import check_names, suggests_options
+from verifai_jax.core.messages.errors import check_names, end_if_interrupted, suggests_options
 from verifai_jax.core.store.cache import locked_cache
 from verifai_jax.evaluation.backends import resolved
 from verifai_jax.falsification import simulate
@@ -74,7 +74,8 @@ def fmea(
     - `executor`: whose workers simulate, as in `falsify`.
     - `target`: `FILE.py:NAME` of the problem with its faults, for the commands that replay.
     - `progress`: whether to show one line of progress; see `core.display.progress` for the default.
-    **Returns:** the table, the most probable failure first.
+    **Returns:** the table, the most probable failure first. Ctrl-C ends the call; with `folder` it
+    may be repeated.
     **Raises:** `ValueError` for no fault, one that cannot be off, rates out of range or without a
     mission time; as `Problem.with_faults`.
     """
@@ -139,7 +140,9 @@ def _run_of(
     if path is not None:
         # Made again each time: it takes seconds, as its confirmation does.
         shutil.rmtree(path, ignore_errors=True)
-    return simulate(rows.problem, frame, seed=rows.seed, folder=path, target=target, progress=False)
+    run = simulate(rows.problem, frame, seed=rows.seed, folder=path, target=target, progress=False)
+    end_if_interrupted(run.stopped)
+    return run
 
 
 def _faults_of(problem: Problem) -> dict[str, Fault]:

@@ -1,7 +1,6 @@
 """The effect of a fault, read from its counterexample and the same simulation without it."""
 
 import math
-import shlex
 from collections.abc import Mapping
 from dataclasses import replace
 
@@ -12,6 +11,7 @@ from verifai_jax.core.values.trace import Trace
 from verifai_jax.evaluation.replay import Replay
 from verifai_jax.evaluation.replay import replay as simulate_again
 from verifai_jax.falsification.run import Run
+from verifai_jax.falsification.run_folder import replay_command
 from verifai_jax.faults.failure_table.result import Effect
 from verifai_jax.faults.fault import Fault
 from verifai_jax.mtl import robustness_signal
@@ -41,13 +41,14 @@ def with_counterexample(
     off = {f"{name}.{n}": fault.weakest(n) for name, fault in own.items() for n in fault.domains}
     key = run_keys(run.seed)[1]
     without = simulate_again(run.problem, {**columns, **off}, key, row, run.precision)
+    command = "table." * (run.folder is None) + replay_command(run, row)
     shown_by, shown = _first_difference(again.trace, without.trace)
     grades = [f"{name}.{fault.grade}" for name, fault in own.items()]
     return replace(
         effect, row=row, severity={number: float(columns[number]) for number in grades},
         verdict=verdicts[row], broken=again.worst,
         delay=_violation(again, onset) - max(onset, 0.0), shown_by=shown_by,
-        shown_after=shown - max(onset, 0.0), command=_command(run, row),
+        shown_after=shown - max(onset, 0.0), command=command,
     )  # fmt: skip
 
 
@@ -76,11 +77,3 @@ def _first_difference(trace: Trace, without: Trace) -> tuple[str, float]:
             found.append((float(clock[at]), -float(apart[at]), name))
     when, _, name = min(found, default=(math.nan, 0.0, ""))
     return name, when
-
-
-def _command(run: Run, row: int) -> str:
-    if run.folder is None:
-        return f"table.run.replay({row})"
-    if run.target is None:
-        return f"vj.load({str(run.folder)!r}, problem).replay({row})"
-    return shlex.join(["verifai-jax", "replay", str(run.folder), str(row)])

@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from verifai_jax.analysis.counterexamples.nominal import Nominal
+from verifai_jax.core.messages.errors import end_if_interrupted
 from verifai_jax.core.store.cache import Cache
 from verifai_jax.estimation import estimate
 from verifai_jax.evaluation.evaluator import Evaluator
@@ -97,6 +98,7 @@ class Rows:
                 self.problem.only(*effect.faults), budget=2 * budget, confidence=confidence,
                 seed=self.seed, progress=False, executor=self.executor,
             )  # fmt: skip
+            end_if_interrupted(seen.stopped)
             chance = rate.estimate if seen.probability is None else seen.probability
             return {"interval": np.array([seen.low, seen.high, chance])}
 
@@ -110,6 +112,7 @@ class Rows:
                 self.problem.only(*names), "cross_entropy", budget, seed=self.seed, confirm=False,
                 progress=False, executor=self.executor,
             )  # fmt: skip
+            end_if_interrupted(run.stopped)
             worst = run.table.counterexamples.sort_values("rho").head(FOLLOWED)
             points = self.problem.space.points(worst) if len(worst) else self.nominal.u[None][:0]
             return {"points": np.asarray(points, np.float32)}

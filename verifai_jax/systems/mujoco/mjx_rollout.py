@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Int, PyTree
 
+from verifai_jax.core.compute.derivatives import with_derivative_of
 from verifai_jax.core.messages.errors import require
 from verifai_jax.core.values.trace import Status, Trace
 from verifai_jax.systems.base import Features, Seed
@@ -135,15 +136,6 @@ def _is_one(count: int | Int[Array, ""]) -> bool:
     return isinstance(count, int) and count == 1
 
 
-@jax.custom_jvp
-def _with_derivative_of(value: Array, other: Array) -> Array:
-    """Return `value` with the derivative of `other`, which is not computed without derivatives."""
-    return value
-
-
-_with_derivative_of.defjvp(lambda primals, tangents: (primals[0], tangents[1]))
-
-
 def solve_constraints(model: MjxModel, data: MjxData) -> Any:
     """Return the data after MJX's constraint solver, differentiable in forward and reverse mode.
 
@@ -163,13 +155,13 @@ def solve_constraints(model: MjxModel, data: MjxData) -> Any:
     zero = jnp.zeros_like(residual)
     curved = jax.lax.stop_gradient(here).replace(Ma=residual, qfrc_constraint=zero)
     step = update(constant_newton, constant.replace(qfrc_smooth=zero), curved).Mgrad
-    qacc = _with_derivative_of(solution.qacc, -step)
+    qacc = with_derivative_of(solution.qacc, -step)
     there = create(newton, start.replace(qacc=qacc), grad=False)
     return data.tree_replace(
         {
             "qacc": qacc,
-            "qfrc_constraint": _with_derivative_of(solution.qfrc_constraint, there.qfrc_constraint),
-            "_impl.efc_force": _with_derivative_of(solution._impl.efc_force, there.efc_force),
+            "qfrc_constraint": with_derivative_of(solution.qfrc_constraint, there.qfrc_constraint),
+            "_impl.efc_force": with_derivative_of(solution._impl.efc_force, there.efc_force),
         }
     )
 

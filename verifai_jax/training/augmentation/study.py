@@ -21,6 +21,7 @@ from jaxtyping import Array, Float, Key
 
 from verifai_jax._version import __version__
 from verifai_jax.core.display.progress import ProgressBar
+from verifai_jax.core.messages.errors import end_if_interrupted
 from verifai_jax.core.store.cache import Cache
 from verifai_jax.core.store.files import plain
 from verifai_jax.core.store.log import Arrays
@@ -211,9 +212,7 @@ class Seed:
                 problem, self.plan.search, self.plan.budget,
                 seed=seed, confirm=False, progress=False,
             )  # fmt: skip
-            if run.stopped == "interrupted":
-                # A search ends with what it has; a table that is cut short is no finished work.
-                raise KeyboardInterrupt
+            end_if_interrupted(run.stopped)
             names = [*self.task.space.columns, "rho", "violated", "status"]
             return encode_frame(run.table.all.loc[:, names].reset_index(drop=True))
 

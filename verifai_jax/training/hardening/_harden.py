@@ -26,7 +26,7 @@ from verifai_jax.core.compute.keys import run_keys
 from verifai_jax.core.compute.precision import reproducible_settings
 from verifai_jax.core.display.progress import say_done, shows_progress
 from verifai_jax.core.messages.checks import check_count, check_fraction
-from verifai_jax.core.messages.errors import suggests_options
+from verifai_jax.core.messages.errors import end_if_interrupted, suggests_options
 from verifai_jax.core.store.cache import Cache, locked_cache
 from verifai_jax.estimation.certification import Certificates, certify
 from verifai_jax.estimation.comparison import Comparison, compare
@@ -36,7 +36,7 @@ from verifai_jax.rl import PPO, Algorithm, evaluate
 from verifai_jax.search import Search
 from verifai_jax.statistics.confidence_sequences import safe_at
 from verifai_jax.training.hardening.arms import FunctionArms, TaskArms
-from verifai_jax.training.hardening.collecting import Collected, collect, end_if_interrupted
+from verifai_jax.training.hardening.collecting import Collected, collect
 from verifai_jax.training.hardening.mixture import (
     CAPACITY,
     HardeningError,
@@ -131,18 +131,14 @@ def harden(
 ) -> Hardening:
     """Train a policy, and go on training where it fails until it is certified.
 
-    The policy is trained on the task's own episodes first. Then each round attacks it, confirms and
-    shrinks the failures, and goes on training with a mixture of episodes: the task's own, the prior
-    of the problem's features, and neighbourhoods of failures. These are failing samples of the
-    prior, counterexamples of the attack, shrunk ones, and samples within the rules of the error
-    table; points that the policy has mastered make room for new ones. Each round's policy is
-    certified. Of the policies whose return is within `tolerance` of the first one's, the one that
-    fails least is returned, and never one that a paired comparison shows to be worse than the
-    first.
+    The policy is trained on the task's own episodes first. Then each round attacks and certifies
+    it, confirms and shrinks the failures, and goes on training with a mixture of episodes: the
+    task's own, the prior of the problem's features, and neighbourhoods of failures. Of the policies
+    whose return is within `tolerance` of the first one's, the one that fails least is returned, and
+    never one that a paired comparison shows to be worse than the first.
 
-    No certificate uses a sample that was trained on: counterexamples of one round enter the
-    training, and the next certificate has another seed. The last one, of the policies before and
-    after together, is made after the choice.
+    No certificate uses a sample that was trained on: each has a seed of its own. The last one, of
+    the policies before and after together, is made after the choice.
 
     **Arguments:**
     - `study`: a `Study`, a `Trainer`, or a task. A task says by `start(key, features) -> state` how
@@ -161,8 +157,8 @@ def harden(
     - `samples`, `attack`, `attack_simulations`: of each certificate, as in `certify`.
     - `added`: the maximum number of points to train around that a round adds.
     - `own`, `failing`: shares of episodes that are the task's own, and that begin near failures,
-      those of the prior included that fail anyway; the others are of the prior. After a
-      round that loses return, more are the task's own, and fewer again after one that does not.
+      with those of the prior that fail anyway; the others are of the prior. After a round that
+      loses return, more are the task's own, and fewer again after one that does not.
     - `tolerance`: share of the first policy's return that may be lost.
     - `episodes`: episodes of the task itself, the same for all policies, that measure returns.
     - `baseline`: whether an arm with plain domain randomisation is trained as well: the same seed,

@@ -19,6 +19,7 @@ from jaxtyping import Bool, Float
 
 from verifai_jax.analysis import rules
 from verifai_jax.analysis.counterexamples import shrink
+from verifai_jax.core.messages.errors import end_if_interrupted
 from verifai_jax.falsification import falsify
 from verifai_jax.problem.problem import Problem
 from verifai_jax.search import PointList
@@ -131,9 +132,3 @@ def _radii(
     fails[np.flatnonzero(possible)[np.asarray(run.table.violating.index, int)]] = True
     thin = fails.reshape(count, AROUND).mean(axis=1) < THIN
     return np.where(thin, NARROW, RADIUS), run.simulations
-
-
-def end_if_interrupted(stopped: str | None) -> None:
-    """Raise `KeyboardInterrupt` for a result that Ctrl-C cut short, which is no whole round's."""
-    if stopped == "interrupted":
-        raise KeyboardInterrupt

@@ -112,11 +112,12 @@ class Hardening(Drawn, Tabular):
             f"  the intervals hold together with {sure}, on samples that nothing was trained on"
         )
         before, after = self.before.rate, self.after.rate
-        if before is not None and after is not None and self.chosen[HARDENED]:
+        if before is not None and after is not None and before.failures and self.chosen[HARDENED]:
             by_bounds = before.low / after.high if after.high else float("inf")
+            sampled = f"{self.times_safer:z.3g} times by the samples"
             lines.append(
-                f"  the failure probability before is {self.times_safer:z.3g} times that after, "
-                f"{by_bounds:z.3g} times at least by the intervals"
+                f"  the failure probability before is at least {by_bounds:z.3g} times that after, "
+                f"by the intervals ({sampled if after.failures else 'no sample fails after'})"
             )
         if self.comparison is not None:
             compared = self.comparison.candidates[0]

@@ -8,6 +8,7 @@ import numpy as np
 
 from verifai_jax._version import __version__
 from verifai_jax.core.compute.executors import Executor
+from verifai_jax.core.messages.errors import end_if_interrupted
 from verifai_jax.core.store.cache import Cache
 from verifai_jax.core.store.log import Arrays
 from verifai_jax.core.user_code.callbacks import Callback, notify
@@ -252,9 +253,8 @@ class RunningSweep:
                 attack_simulations=min(SCREENING, self.options["attack_simulations"]),
                 progress=None,
             )
-            if certificates.stopped == "interrupted":
-                # A half-finished screening would change the proposals of a resumed sweep.
-                raise KeyboardInterrupt
+            # A half-finished screening would change the proposals of a resumed sweep.
+            end_if_interrupted(certificates.stopped)
             safety = dict(zip(finite, certificates.rows, strict=True))
         objectives: dict[int, float | None] = {}
         for number, group in entries.items():
