@@ -56,21 +56,21 @@ RESERVED = ("dt", "times", "valid")
 
 
 class Refused(ConnectionError):
-    """An error of a server that does not want this client, and will not another time."""
+    """An error from a server that refuses this client for good."""
 
 
 class Full(ConnectionError):
-    """An error of a server that has no room for this client now, but may have another time."""
+    """An error from a server that has no room for this client now, but may have later."""
 
 
 class Waveform:
-    """A function of time by its control points: the form in which a `Signal` feature arrives.
+    """A function of time given by control points: the form in which a `Signal` feature arrives.
 
-    `wind(time)`, in seconds; `wind.over(4.0)(time)` where the feature has no duration. With `hold`
-    `"linear"` and `"pchip"` (a monotone cubic) the first control point is the value at 0 and the
-    last that at the end; with `"constant"` each is held for an equal part of the duration, with
+    Call `wind(time)` with seconds, or `wind.over(4.0)(time)` if the feature has no duration. With
+    `hold` `"linear"` and `"pchip"` (a monotone cubic) the first control point is the value at 0 and
+    the last that at the end; with `"constant"` each is held for an equal part of the duration, with
     `"pulse"` for `width` seconds of it, and the value is 0 for the rest. `times` are those of the
-    control points, where they are not at equal distances.
+    control points, unless they are at equal distances.
     """
 
     def __init__(
@@ -85,7 +85,7 @@ class Waveform:
         self.times, self.width = times, width
 
     def over(self, duration: float) -> "Waveform":
-        """Return the same control points over so many seconds."""
+        """Return the same control points with this duration in seconds."""
         return Waveform(self.knots, self.hold, float(duration), self.times, self.width)
 
     def __call__(self, time: float) -> Any:
@@ -135,10 +135,10 @@ class Waveform:
 
 
 class Reaction:
-    """A function of signals by its parameters: the form in which a `Reactive` feature arrives.
+    """A function of signals given by parameters: the form in which a `Reactive` feature arrives.
 
-    `push(gap=12.0, speed=3.0)`, or the signals in the order of `inputs`: asked at each step, it
-    answers with a number within its bounds.
+    Call it at each step with `push(gap=12.0, speed=3.0)`, or with the signals in the order of
+    `inputs`; it returns a number within its bounds.
     """
 
     def __init__(
@@ -177,21 +177,22 @@ def serve(
     **Arguments:**
     - `simulate(features, seed) -> result`: features are numbers, arrays, dictionaries of these,
       `Waveform`s and `Reaction`s; `seed` is an integer in `[0, 2^32)`, the same on every replay.
-      The result is a dictionary of signals, `[time]` or `[time, k]`, and `dt` in seconds (or
-      `times`, and `valid`, how many samples count); or anything with `.signals` and these as
-      attributes. What it raises becomes a row with that message.
-    - `token`: the server's; the environment variable `VERIFAI_JAX_TOKEN` when left out. It is
+      The result is a dictionary of signals, `[time]` or `[time, k]`, with `dt` in seconds (or
+      `times`, and `valid`, the number of valid samples); or an object with `.signals` and these as
+      attributes. An error that it raises becomes a row with that message.
+    - `token`: the server's token; the environment variable `VERIFAI_JAX_TOKEN` when left out. It is
       proved, not sent.
-    - `capacity`: how many points may wait here at most.
-    - `reconnect`: connect again, however often, when the server goes away; or for how many seconds
-      to try before giving up; or False.
-    - `name`: what the server's log calls this client.
+    - `capacity`: maximum number of points that may wait here.
+    - `reconnect`: True to reconnect, however often, when the server goes away; a number of seconds
+      after which to give up; or False.
+    - `name`: the name of this client in the server's log.
     - `certificate`: for an encrypted connection (TLS), a PEM file with the server's certificate or
-      that of the authority that signed it, or `"system"` for those that this machine trusts; the
-      environment variable `VERIFAI_JAX_CERTIFICATE` when left out, and not encrypted without.
-    **Raises:** `Refused` for a wrong token, another protocol or certificate, or something that is
-    no run of verifai_jax; `ConnectionError` when no run could be reached at all and `reconnect`
-    allows no more tries; `ValueError` for a file that is not a certificate.
+      that of the authority that signed it, or `"system"` for those that this machine trusts. The
+      environment variable `VERIFAI_JAX_CERTIFICATE` when left out; without it the connection is not
+      encrypted.
+    **Raises:** `Refused` for a wrong token, another protocol or certificate, or a server that is
+    not a run of verifai_jax; `ConnectionError` if no run could be reached and `reconnect` allows no
+    more attempts; `ValueError` for a file that is not a certificate.
     """
     certificate = certificate or os.environ.get("VERIFAI_JAX_CERTIFICATE") or None
     tls = None if certificate is None else _trusting(certificate)
@@ -341,7 +342,7 @@ class _Connection:
                     self.welcome = True
                     self._points.extend(_points_of(message))
                     if len(self._points) > self.capacity:
-                        raise _no_run(f"it hands out more than {self.capacity} points")
+                        raise _no_run(f"it sends more than {self.capacity} points")
                 case "bye":
                     raise EOFError("the run has ended")
                 case "error":
@@ -422,7 +423,7 @@ def _no_run(why: str) -> Refused:
 
 
 def plain(text: object) -> str:
-    """Write a server's text in one line that cannot garble a log or a terminal."""
+    """Convert a server's text to one line that cannot affect a log or a terminal."""
     if not isinstance(text, str):
         short = text is None or isinstance(text, bool | int | float)
         text = repr(text) if short else f"a {type(text).__name__}"
@@ -445,7 +446,7 @@ def answer(point: Mapping[str, Any], simulate: Callable[[dict[str, Any], int], A
 
 
 def described(error: BaseException) -> str:
-    """Write an error in one line, with the line of the simulator where it arose."""
+    """Describe an error in one line, with the line of the simulator that raised it."""
     try:
         words = " ".join(str(error)[:3000].split())
     except Exception:  # `__str__` is code of the simulator too.
@@ -482,7 +483,7 @@ def _with_gaps(value: object) -> np.ndarray:
 def encoded(number: int, result: object) -> bytes:
     """Return a result as a frame whose arrays are raw bytes.
 
-    **Raises:** `TypeError` for something that is not a result.
+    **Raises:** `TypeError` for an object that is not a result.
     """
     if isinstance(result, Mapping):
         signals = result.get("signals")
@@ -544,7 +545,7 @@ def address_of(text: str) -> tuple[str, int]:
 def function_of(text: str) -> Callable[..., Any]:
     """Import the function named by `MODULE:NAME` or `FILE.py:NAME`.
 
-    **Raises:** `ValueError` where there is none.
+    **Raises:** `ValueError` if there is none.
     """
     path, _, name = text.rpartition(":")
     if path.endswith(".py"):

@@ -79,7 +79,7 @@ def test_every_text_gives_the_reason(runs, tmp_path):
             said = {why for why in OTHERS.values() if why in text} - {OTHERS["first"]}
             wanted = {OTHERS[origin]} if origin != "first" else set()
             assert said == wanted, (origin, said)
-        assert ("by what it found before" in report) == (origin == "learned")
+        assert ("by what it had found before" in report) == (origin == "learned")
     assert "its first 2 rows were given; leave out first=" in runs["first"].summary()
 
 

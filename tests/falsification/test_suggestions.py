@@ -203,9 +203,9 @@ def test_wrong_arguments_say_what_is_right():
     with pytest.raises(ValueError, match="points"):
         search.Suggested(list, points=0)
     suggested = search.Suggested(list, INNER)
-    with pytest.raises(ValueError, match="must be their search itself"):
+    with pytest.raises(ValueError, match="must be the search itself"):
         vj.repeat(PROBLEM, suggested, 16)
-    with pytest.raises(ValueError, match="must be their search itself"):
+    with pytest.raises(ValueError, match="must be the search itself"):
         vj.falsify(PROBLEM, search.Split({"a": suggested}, INNER), 16)
-    with pytest.raises(ValueError, match="must be their search itself"):
+    with pytest.raises(ValueError, match="must be the search itself"):
         search.Diverse(suggested).check(Cube((0,)))

@@ -229,8 +229,8 @@ W = {"wait": Box(0, 1)}
         (
             {("cruise", "cut"): W, ("far", "brake"): {"to": "cruise", **W}},
             {},
-            "no sequence of events leads from 'cruise' to the state 'far' of far -brake-> cruise; "
-            "it leads to cruise: correct its name, or add an event with to='far'",
+            "no sequence of events leads from 'cruise' to the state 'far' of far -brake-> cruise, "
+            "only to cruise: correct its name, or add an event with to='far'",
         ),
         (
             {

@@ -119,15 +119,15 @@ def only(entry, name="x"):
 @pytest.mark.parametrize(
     ("data", "message"),
     [
-        ([], r"describes no feature space: \[\]"),
+        ([], r"does not describe a feature space: \[\]"),
         ({"features": []}, "at least one field"),
-        ({"features": 3}, "describes no domain"),
-        (only(3), "describes no domain"),
+        ({"features": 3}, "does not describe a domain"),
+        (only(3), "does not describe a domain"),
         (only({"kind": "Bix", "low": 0, "high": 1}), "unknown kind of domain 'Bix'; did you mean"),
         (only({"kind": "__import__"}), "unknown kind of domain '__import__'"),
-        (only({"kind": "Box", "low": 0}), r"describes no domain \('high'\)"),
+        (only({"kind": "Box", "low": 0}), r"does not describe a domain \('high'\)"),
         (only({"kind": "Box", "low": 2, "high": 1}), "low must be below high in a Box"),
-        (only({"kind": "Array", "domain": 3, "length": 2}), "describes no domain"),
+        (only({"kind": "Array", "domain": 3, "length": 2}), "does not describe a domain"),
         (
             only({"kind": "Fixed", "domain": {"kind": "Box", "low": 0, "high": 1},
                   "row": [["", 9]]}),

@@ -44,7 +44,7 @@ def test_single_precision_is_as_good_as_it_is():
     assert period(trace_at(jnp.asarray(np.arange(300) / 30, jnp.float32))) == pytest.approx(1 / 30)
     with pytest.raises(ValueError, match=r"are float32 numbers, .* give them in double precision"):
         period(trace_at((1.7e9 + 0.1 * np.arange(30)).astype(np.float32)))
-    with pytest.raises(ValueError, match=r"do not tell a period of .* which lie 0\.00781 s apart"):
+    with pytest.raises(ValueError, match=r"do not tell a period of .* whose spacing is 0\.00781 s"):
         period(trace_at((86_400 + 0.02 * np.arange(30)).astype(np.float32)))
 
 

@@ -142,12 +142,12 @@ def test_fronts_are_those_of_all_pairs(text, seed):
     ("text", "words"),
     [
         ("always x > 3", "has no parameter"),
-        ("always[0, ?d] x > ?d", "give them two names"),
+        ("always[0, ?d] x > ?d", "use two names"),
         ("always[?a, ?b] x > ?c", "one parameter or two"),
         ("always (x > ?d & x < ?d + 6)", r"not monotone in \?d"),
-        ("always x > ?a * y + ?b", "stand in one comparison"),
+        ("always x > ?a * y + ?b", "occur in one comparison"),
         ("(eventually x > 20) & always x > ?d", "no value of [?]d satisfies"),
-        ("always (x > 0 | x > ?d)", "nothing bounds it"),
+        ("always (x > 0 | x > ?d)", "the data do not bound it"),
         ("always (x > 2 & y > ?q)", "signal 'y'"),
     ],
 )

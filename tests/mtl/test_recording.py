@@ -239,7 +239,7 @@ def test_a_comma_that_may_stand_between_thousands_is_refused(tmp_path):
     path = tmp_path / "log.csv"
     for separator in (",", "\t"):
         path.write_text(f'time{separator}x\n0{separator}"1,500"\n1{separator}7\n')
-        with pytest.raises(ValueError, match=r"has '1,500' in column 'x', which may have"):
+        with pytest.raises(ValueError, match=r"has '1,500' in column 'x', whose comma may be"):
             read(path)
     path.write_text("time;x\n0;1,500\n1;7\n")
     assert np.asarray(read(path)["x"]).tolist() == [1.5, 7.0]

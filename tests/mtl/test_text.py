@@ -149,7 +149,7 @@ def test_a_formula_is_written_so_that_it_is_read_again(formula, text):
         ("abs(a & b) > 2", "a number or a signal is needed here, not the formula 'a & b'"),
         ("3", "not the number 3: compare a signal with it, as in x > 3, or write TRUE or FALSE"),
         ("always (1 + 2)", "a formula is needed here, not the number 1 + 2"),
-        ("2 < 0.5", "2 < 0.5 compares numbers and no signal"),
+        ("2 < 0.5", "2 < 0.5 compares numbers but no signal"),
         ("a & 2 < 0.5", "compare a signal, as in x < 0.5, or write TRUE or FALSE"),
         (
             "always (x^2 < 0.5)",
@@ -329,7 +329,7 @@ def test_deep_texts_have_a_robustness(name):
         ("F[0,1e99999999999999999999] x > 0", "a time must be a finite number of seconds"),
         ("F[0," + "1" * 100_000 + "] x > 0", "a time must be a finite number of seconds"),
         ("x > 1e999", "a number in a formula must be finite"),
-        (" + ".join(["1"] * 3000) + " > 0", "compares numbers and no signal"),
+        (" + ".join(["1"] * 3000) + " > 0", "compares numbers but no signal"),
         ("x / 0 > 1", "a division by zero: x / 0"),
         ("1 / 0 > x", "a division by zero: 1 / 0"),
         ("x / (1 - 1) > 1", "a division by zero: x / (1 - 1)"),

@@ -123,7 +123,7 @@ def test_a_grid_ends():
 
 def test_a_search_that_does_not_get_past_the_constraint_says_so():
     never = vj.FeatureSpace(DOMAINS, where=lambda f: f["x"] > 2)
-    with pytest.raises(ConstraintError, match=r"where refused all that .* 0 of \d+ points"):
+    with pytest.raises(ConstraintError, match=r"where refused all proposals .* 0 of \d+ points"):
         Proposals(named("halton"), never.cube, 16, KEY, never.constraint).next(16)
 
 

@@ -56,7 +56,7 @@ def test_equal_differences_have_an_interval_of_no_width():
 
 
 def test_lists_of_different_lengths_are_refused():
-    with unchecked(), pytest.raises(ValueError, match=r"one length; got shapes \[2\] and \[1\]"):
+    with unchecked(), pytest.raises(ValueError, match=r"same length; got shapes \[2\] and \[1\]"):
         paired_difference([1.0, 2.0], [1.0])
     with pytest.raises(ValueError, match="confidence must lie between 0 and 1; got 95"):
         paired_difference([1.0], [1.0], 95)

@@ -168,7 +168,9 @@ def test_what_cannot_be_verified_is_an_error_that_says_why():
         lambda f, key: vj.Trace({"x": f["x"] + jax.random.normal(key, (3,))}, dt=1.0),
         "always x > 0",
     )  # fmt: skip
-    with pytest.raises(vj.ProblemError, match=r"'noise' draws random numbers.*make what it"):
+    with pytest.raises(
+        vj.ProblemError, match=r"'noise' draws random numbers.*make these numbers features"
+    ):
         vj.verify(random)
     box = vj.Problem(
         "host",

@@ -54,11 +54,9 @@ class Boundary(InNotebook):
 
     - `brier`: mean squared difference of predicted probability and verdict, on held-out rows.
     - `base`: the same for a constant prediction, the share of failures.
-    - `calibration`: for each tenth of the predicted probability, how many rows failed, and of how
-      many.
+    - `calibration`: for each tenth of the predicted probability, the failed rows and all rows.
     - `reach`: distance up to which a row tells something about a point (`Samples.points`).
-    - `share`: mean probability over the prior; it is neither a bound nor an estimate with an
-      interval.
+    - `share`: mean probability over the prior; neither a bound nor an estimate with an interval.
     - `unsampled`: share of the prior beyond the reach of all rows. Both are NaN without a space.
     - `samples`: the rows.
     """
@@ -103,7 +101,7 @@ class Boundary(InNotebook):
         """
         check_count("count", count)
         if self._prior is None:
-            raise ValueError("the space of the rows is not known: give it, boundary(run) knows it")
+            raise ValueError("the space of the rows is unknown: use boundary(run), which knows it")
         frame = self._prior
         inputs = _inputs(self.samples, frame)
         near, said = self._near(frame), self._answer(inputs)
@@ -123,9 +121,8 @@ class Boundary(InNotebook):
 
     def __str__(self) -> str:
         lines = [
-            f"the failing boundary of {self.samples.name}, from {len(self.samples):,} rows: "
-            f"Brier score {self.brier:z.3g} on rows not learned from, {self.base:z.3g} by the "
-            "share of failures alone"
+            f"the failing boundary of {self.samples.name}, from {len(self.samples):,} rows: Brier "
+            f"score {self.brier:z.3g} on held-out rows, {self.base:z.3g} for a constant prediction"
         ]
         if self._prior is not None:
             lines.append(
@@ -134,7 +131,7 @@ class Boundary(InNotebook):
             )
         for low, high, rows, failed in self.calibration.to_numpy(float):
             count = f"{int(failed):,} of {int(rows):,}"
-            lines.append(f"  said {low:z.1f} to {high:z.1f}: {count} failed")
+            lines.append(f"  predicted {low:z.1f} to {high:z.1f}: {count} failed")
         if self._prior is not None:
             best = self.next_points(1).iloc[0].to_dict()
             shown = {name: best[name] for name in self.samples.names}

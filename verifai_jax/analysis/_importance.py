@@ -82,8 +82,8 @@ class Importance(Drawn, InNotebook):
                 lines.append(f"{what} depends on {listed}; {self.score_words(target)}")
             else:
                 lines.append(
-                    f"{what}: importances mean nothing, a model from these rows does not predict "
-                    f"others ({self.score_words(target)})"
+                    f"{what}: importances are meaningless, because a model from these rows does "
+                    f"not predict others ({self.score_words(target)})"
                 )
         return "\n".join(lines)
 
@@ -113,8 +113,7 @@ def importance(
     Sources: trees of Geurts, Ernst and Wehenkel, Extremely randomized trees, Machine Learning 63
     (2006); permutation importance of Breiman, Random forests, Machine Learning 45 (2001).
 
-    **Raises:** `ValueError` if there are no rows, or if neither failing nor the robustness can be
-    learned.
+    **Raises:** `ValueError` without rows, or if neither failing nor the robustness can be learned.
     """
     repeats = check_count("repeats", repeats, 2)
     samples = Samples.of(source, "all")

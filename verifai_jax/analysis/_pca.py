@@ -97,8 +97,8 @@ class Components(Drawn, InNotebook):
         - `rows`: row numbers of the table, or a DataFrame with the columns; by default the rows
           that were analysed.
 
-        An absent entry counts as the pivot's. **Raises:** `IndexError` for a row number that is not
-        in the table.
+        An absent entry counts as the pivot's. **Raises:** `IndexError` for a row that is not in the
+        table.
         """
         frame = self.samples.frame
         if isinstance(rows, pd.DataFrame):
@@ -236,14 +236,12 @@ def pca(
     - `source`: a run, its table, a DataFrame with feature columns, or `Samples`.
     - `columns`, `which`, `space`: as in `Samples.of`.
       Unordered columns are left out.
-    - `components`: number of components; by default all in which the rows vary, which is also the
-      maximum.
+    - `components`: number of components; by default all in which the rows vary, the maximum.
     - `scale`: `"range"` scales features by their range in the space, `"raw"` does not scale (as
       VerifAI), `"standard"` gives the components of the correlation matrix, `"rows"` scales by the
       range of the rows.
     **Returns:** `Components`.
-    **Raises:** `ValueError` if there is no ordered column, or fewer rows or columns than
-    components.
+    **Raises:** `ValueError` without an ordered column, or for more components than rows or columns.
     """
     samples = Samples.of(source, which, columns, space)
     samples.need_ordered("principal component analysis")

@@ -126,8 +126,7 @@ def odd_coverage(
     - `seed`: the seed of the points of the prior, and of those that measure shares of a domain
       whose conditions couple attributes.
     **Returns:** an `OddCoverage`.
-    **Raises:** `ValueError` if there are no rows, and for an attribute that has a feature but no
-    range.
+    **Raises:** `ValueError` without rows, and for an attribute that has a feature but no range.
     """
     check_count("cells", cells, 2)
     samples = Samples.of(source, "all")

@@ -46,8 +46,8 @@ def read_odd(path: str | Path) -> OperationalDomain:
     module that must or must not hold. Values are converted to the unit of the feature.
 
     **Arguments:**
-    - `path`: the file. Without an entry `features` each attribute is a feature, named by its last
-      part.
+    - `path`: the file. Without an entry `features` each attribute is a feature, with its last part
+      as name.
     **Raises:** `FileNotFoundError`; `ValueError` naming the entry, for any other file.
     """
     path = Path(path)
@@ -73,13 +73,12 @@ def odd_of(
 ) -> OperationalDomain:
     """Return the domain spanned by a space of features, for `write`.
 
-    **Raises:** `ValueError` for a feature that is neither a range nor a choice, and for a
-    constraint.
+    **Raises:** `ValueError` for a constraint, and a feature that is neither a range nor a choice.
     """
     taxonomy: dict[str, Any] = {}
     include: dict[str, Any] = {}
     if space.where is not None:
-        raise ValueError("a constraint is code, which a file of OpenODD does not hold")
+        raise ValueError("a constraint is code, which an OpenODD file cannot contain")
     for feature, domain in space.domains.items():
         found, unit = domain.tuning, (units or {}).get(feature, "")
         if found is not None and found.choices:

@@ -104,8 +104,7 @@ class Analysis(Drawn):
     def save(self, folder: str | Path) -> Path:
         """Write `report.md` and pictures to a folder; return the path of the report.
 
-        **Raises:** `OSError` if the file system refuses, for example because a file has the
-        folder's name.
+        **Raises:** `OSError` if the file system refuses, such as when a file has the folder's name.
         """
         path = Path(folder)
         lines = [f"# {html.escape(one_line(self.name))}", ""]

@@ -16,7 +16,7 @@ from verifai_jax.cli.json_output import command, give_result
     "--boundary",
     type=click.IntRange(1),
     metavar="POINTS",
-    help="Learn where the boundary runs, and say so many points to simulate next.",
+    help="Learn the failing boundary, and suggest this many points to simulate next.",
 )
 @ODD
 @option(

@@ -24,7 +24,7 @@ PATH = click.Path(path_type=Path)
 
 
 def option(*names: str, **settings: Any) -> Callable[[Command], Command]:
-    """Return an option of a command; its help shows the default where there is one."""
+    """Return an option of a command; its help shows the default if there is one."""
     return click.option(*names, show_default=settings.get("default") is not None, **settings)
 
 
@@ -50,25 +50,25 @@ RUN_FOLDER = option(
 PICTURES = option("--pictures/--no-pictures", default=True, help="Draw pictures.")
 """Pictures can be left out."""
 KEEP_GOING = option(
-    "--keep-going", is_flag=True, help="Simulate on where all of the first simulations raise."
+    "--keep-going", is_flag=True, help="Simulate on even if all of the first simulations raise."
 )
 PROGRESS = click.option(
     "--progress/--no-progress", default=None, help="Show a progress bar  [default: on a terminal]"
 )
 """The progress bar can be forced or left out."""
-SEED = option("--seed", default=0, help="Seed of all chance.")
+SEED = option("--seed", default=0, help="Seed of all random numbers.")
 """The seed of everything random in a command."""
 ONLY = option(
     "--only",
     metavar="NAMES",
-    help="Features to vary, comma-separated; the others stay at their nominal values.",
+    help="Features to vary, comma-separated; the others keep their nominal values.",
 )
 """Features that vary."""
 BATCH = option("--batch", type=int, help="Simulations per call  [default: chosen]")
 """Simulations per call of the simulator."""
-MAX_SECONDS = option("--max-seconds", type=float, help="Seconds at most, compilation included.")
+MAX_SECONDS = option("--max-seconds", type=float, help="Maximum seconds, including compilation.")
 """A limit of time."""
-STOP_AFTER = option("--stop-after", type=int, help="Stop at that many counterexamples.")
+STOP_AFTER = option("--stop-after", type=int, help="Stop at this many counterexamples.")
 """A number of failures that ends a run."""
 PRECISION = option("--precision", type=click.Choice(["float32", "float64"]), default="float32")
 """Floating-point numbers of the simulations."""
@@ -93,7 +93,7 @@ PROVED = option(
     "--proved",
     type=PATH,
     metavar="JSON",
-    help="What verify wrote with --into: spend nothing on what it proved.",
+    help="Result of verify --into: simulate nothing that it proved.",
 )
 """File of a verification."""
 REPORT = option(
@@ -104,20 +104,20 @@ ERRORS = option(
     "--errors",
     type=click.IntRange(1),
     metavar="PAIRS",
-    help="Say how wrong the number can be, by so many pairs of simulations for each part.",
+    help="Add how wrong the number can be, with this many pairs of simulations for each part.",
 )
 """Simulations by which the parts of an error are measured."""
 ODD = option(
     "--odd",
     type=PATH,
     metavar="YAML",
-    help="The operational design domain, a file of OpenODD: say what is covered of it.",
+    help="Operational design domain, an OpenODD file: report how much of it is covered.",
 )
 """The file of a domain."""
 EVEN_IF_CHANGED = option(
     "--even-if-changed",
     is_flag=True,
-    help="The model was changed on purpose: go on with it, and note what differs.",
+    help="Accept that the model was changed, and note the differences.",
 )
 """For commands that go on with what another model may have simulated."""
 SET = option("--set", "options", multiple=True, metavar="NAME=VALUE", help="Option of the search.")
@@ -140,20 +140,20 @@ PARAMETER_CHOICE = all_of(
         "--aim",
         type=click.Choice(("robustness", "probability")),
         default="robustness",
-        help="Robustness against an attack, or the least failure probability.",
+        help="Robustness against an attack, or the lowest failure probability.",
     ),
     option("--margin", default=0.0, help="Robustness wanted."),
-    option("--attack", default="cross_entropy", help="Search that attacks."),
-    option("--held-out", default=2000, help="Simulations of the result."),
+    option("--attack", default="cross_entropy", help="Search used for attacks."),
+    option("--held-out", default=2000, help="Fresh simulations to check the result."),
     option(
         "--mass",
         default=0.999,
-        help="Probability of the part of the prior that is attacked; 1 for all of it.",
+        help="Probability of the central part of the prior that is attacked; 1 for all of it.",
     ),
     click.option(
         "--gradient/--no-gradient",
         default=None,
-        help="Improve by gradients  [default: where the system has them]",
+        help="Use gradients  [default: if the system has them]",
     ),
     SEED,
     MAX_SECONDS,
@@ -170,7 +170,7 @@ NAMES = all_of(
 def read_names(
     constants: tuple[str, ...], definitions: tuple[str, ...]
 ) -> tuple[dict[str, float], dict[str, str]]:
-    """Return the constants and the definitions of `NAMES`; a usage error names a wrong one."""
+    """Read the constants and the definitions of `NAMES`; a usage error names a wrong entry."""
     numbers = {}
     for name, value in split_pairs("--const", constants):
         try:
@@ -207,24 +207,24 @@ def load_problem(target: str, only: str | None = None) -> "Problem":
 
 
 def load_judged_run(folder: Path, target: str | None) -> "Run":
-    """Load the run in a folder as `load_run` does; one without any verdict ends the command."""
+    """Load the run in a folder like `load_run`; if it has no verdict, end the command."""
     run = load_run(folder, target)
     if len(run.table.failed) == run.simulations:
         raise CommandError(
             f"no simulation of the run in {folder} had a verdict, of {run.simulations:,}; "
-            f"verifai-jax replay {shlex.quote(str(folder))} ROW simulates one again",
+            f"verifai-jax replay {shlex.quote(str(folder))} ROW repeats one",
             BROKEN,
         )
     return run
 
 
 def load_run(folder: Path, target: str | None) -> "Run":
-    """Load the run in a folder, with the problem named, or else the one that the run records."""
+    """Load the run in a folder, with the named problem, or else the one that it records."""
     return read_run(folder, load_problem(target or recorded_target(folder)))
 
 
 def read_run(folder: Path, problem: "Problem | None" = None) -> "Run":
-    """Read the run in a folder; say what the folder is where it holds none."""
+    """Read the run in a folder; if there is none, the error says what the folder is."""
     from verifai_jax import load
     from verifai_jax.core.messages.text import printable
 
@@ -248,9 +248,9 @@ def recorded_target(folder: Path, remedy: str = "--problem specs/FILE.py:NAME") 
 
 
 def read_record(folder: Path) -> dict[str, Any]:
-    """Read the record of the run in a folder; say what the folder is where it holds none.
+    """Read the record of the run in a folder; if there is none, the error says what it is.
 
-    **Raises:** as `verifai_jax.falsification.run_folder.read_record`.
+    **Raises:** the errors of `verifai_jax.falsification.run_folder.read_record`.
     """
     from verifai_jax.falsification import run_folder
 
@@ -263,7 +263,7 @@ def read_record(folder: Path) -> dict[str, Any]:
 def _describe_folder(folder: Path, record: str, missing: str) -> str:
     """Say what a folder without a run is; `missing` says that its record is."""
     if folder.is_file():
-        what = "it is a file; give the folder that verifai-jax falsify has written"
+        what = "it is a file; give the folder that verifai-jax falsify wrote"
         return f"no run in {folder}: {what}"
     if not folder.exists():
         parent = folder.parent
@@ -276,21 +276,21 @@ def _describe_folder(folder: Path, record: str, missing: str) -> str:
     runs = sorted(path.name for path in folder.glob("*") if (path / record).is_file())
     if runs:
         return f"{missing}; but its folders {', '.join(runs)} are runs"
-    return f"{missing}; give a folder that verifai-jax falsify has written"
+    return f"{missing}; give a folder that verifai-jax falsify wrote"
 
 
 def is_sweep(folder: Path) -> bool:
-    """Return whether a folder is one that `verifai-jax sweep` has written."""
+    """Return whether a folder was written by `verifai-jax sweep`."""
     return any((folder / name).is_file() for name in ("sweep.json", "sweep.cache"))
 
 
 def split_names(text: str) -> list[str]:
-    """Split names at their commas."""
+    """Split names at commas."""
     return [name.strip() for name in text.split(",")]
 
 
 def split_pairs(option: str, texts: tuple[str, ...]) -> list[tuple[str, str]]:
-    """Split each NAME=VALUE of a repeated option; a usage error says which one is wrong."""
+    """Split each NAME=VALUE of a repeated option; a usage error names a wrong one."""
     pairs = []
     for text in texts:
         name, equals, value = text.partition("=")
@@ -301,7 +301,7 @@ def split_pairs(option: str, texts: tuple[str, ...]) -> list[tuple[str, str]]:
 
 
 def plain_values(option: str, texts: tuple[str, ...]) -> dict[str, Any]:
-    """Read each NAME=VALUE of a repeated option, the value as JSON where it is JSON."""
+    """Read each NAME=VALUE of a repeated option; values are parsed as JSON if possible."""
     values: dict[str, Any] = {}
     for name, value in split_pairs(option, texts):
         try:
@@ -312,10 +312,10 @@ def plain_values(option: str, texts: tuple[str, ...]) -> dict[str, Any]:
 
 
 def refuse_others(allowed: Container[str], why: str) -> None:
-    """Raise a usage error for an option of this command that was given and is not allowed now.
+    """Raise a usage error for an option that was given but is not allowed here.
 
     **Arguments:**
-    - `allowed`: names of parameters, in addition to those that every command has.
+    - `allowed`: names of allowed parameters, in addition to those of every command.
     - `why`: the end of the message, after the option.
     """
     context = click.get_current_context()
@@ -328,7 +328,7 @@ def refuse_others(allowed: Container[str], why: str) -> None:
 
 
 def target_apart(folder: Path, target: str | None) -> str | None:
-    """Return the target of a run where its folder alone does not name it for a command."""
+    """Return the target of a run, if the folder alone does not identify it for a command."""
     from verifai_jax.core.user_code.targets import TargetError, target_of_project
 
     if target is None:
@@ -341,12 +341,12 @@ def target_apart(folder: Path, target: str | None) -> str | None:
 
 
 def resuming(command: str, folder: Path, target: str | None, options: Mapping[str, object]) -> str:
-    """Write the command that goes on with a folder, as a shell reads it.
+    """Return the command that resumes a folder, in shell syntax.
 
     **Arguments:**
     - `command`: `falsify` or `sweep`.
-    - `target`: that the folder records; it is named where the record alone would not do.
-    - `options`: that the record does not hold, with their values; those that are None are left out.
+    - `target`: the recorded target; it is included if the record alone does not suffice.
+    - `options`: options that the record does not hold, with their values; None is left out.
     """
     apart = target_apart(folder, target)
     words = ["verifai-jax", command, *([] if apart is None else [apart]), "--resume", str(folder)]

@@ -19,12 +19,16 @@ from verifai_jax.cli.json_output import as_plain, command, give_result
     type=float,
     default=0.0,
     show_default=True,
-    help="Difference of failure probabilities that does not matter.",
+    help="Largest difference of failure probabilities that does not matter.",
 )
 @click.option(
-    "--confidence", type=float, default=0.95, show_default=True, help="Of all verdicts together."
+    "--confidence",
+    type=float,
+    default=0.95,
+    show_default=True,
+    help="Confidence of all verdicts together.",
 )
-@click.option("--budget", type=int, default=100_000, show_default=True, help="Simulations at most.")
+@click.option("--budget", type=int, default=100_000, show_default=True, help="Maximum simulations.")
 @SEED
 @MAX_SECONDS
 @CLUSTER
@@ -42,8 +46,7 @@ def compare(
 ) -> None:
     """Compare failure rates of CANDIDATES (specs/FILE.py:NAME) with that of TARGET, in pairs.
 
-    specs/FILE.py:NAME@REVISION is the problem as it was at a revision of git; the checkout is not
-    touched.
+    specs/FILE.py:NAME@REVISION is the problem at a revision of git; the checkout is not touched.
     """
     from verifai_jax import Problem
     from verifai_jax import compare as run_compare

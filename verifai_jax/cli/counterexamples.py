@@ -16,11 +16,14 @@ CORPUS = "counterexamples"
 @command("save-counterexamples")
 @arguments.RUN
 @option(
-    "--into", type=PATH, default=Path(CORPUS), help="Folder of the files, made for version control."
+    "--into",
+    type=PATH,
+    default=Path(CORPUS),
+    help="Folder for the files, meant for version control.",
 )
-@option("--max-count", default=5, help="Counterexamples at most.")
-@option("--shrink/--no-shrink", default=True, help="Shrink each first.")
-@option("--budget", default=1000, help="Simulations to shrink one with.")
+@option("--max-count", default=5, help="Maximum counterexamples.")
+@option("--shrink/--no-shrink", default=True, help="Shrink each counterexample first.")
+@option("--budget", default=1000, help="Simulations to shrink each one.")
 @arguments.PROBLEM
 def save_counterexamples(
     folder: Path, into: Path, max_count: int, shrink: bool, budget: int, target: str | None
@@ -36,7 +39,7 @@ def save_counterexamples(
 @command("replay-counterexamples")
 @arguments.TARGET
 @click.argument("folder", metavar="FOLDER", type=PATH, default=Path(CORPUS))
-@option("--rename", multiple=True, metavar="OLD=NEW", help="New name of a feature.")
+@option("--rename", multiple=True, metavar="OLD=NEW", help="Old and new name of a feature.")
 @fail_on(counterexample="unless every one is simulated and fixed")
 def replay_counterexamples(
     target: str, folder: Path, rename: tuple[str, ...], fail_on: Gate | None

@@ -55,11 +55,11 @@ TESTED = (
 
 
 class BadPair(NamedTuple):
-    """Versions of two packages that are known not to work together, or of one that has a defect.
+    """Versions of two packages that do not work together, or of one package with a defect.
 
-    - `package`, `versions`: one package, and its versions `[least, below)`; None is no bound.
-    - `other`, `others`: the other package, likewise; the same package again for a defect of one.
-    - `problem`: a sentence on what goes wrong, what it means for a verdict, and the remedy.
+    - `package`, `versions`: a package, and its versions `[least, below)`; None means no bound.
+    - `other`, `others`: the other package and its versions; the same again for a defect of one.
+    - `problem`: a sentence on what goes wrong, its effect on verdicts, and the remedy.
     """
 
     package: str

@@ -19,15 +19,19 @@ if TYPE_CHECKING:
 @command()
 @arguments.TARGET
 @option("--method", help="monte_carlo, importance, splitting or surrogate  [default: chosen]")
-@option("--budget", default=50_000, help="Simulations at most.")
-@option("--p0", type=float, help="Probability that it should be below.")
+@option("--budget", default=50_000, help="Maximum simulations.")
+@option("--p0", type=float, help="Failure probability to stay below.")
 @option(
     "--simulations-are",
     type=click.Choice(["auto", "slow", "fast"]),
     default="auto",
-    help="slow: a surrogate proposes, for a few hundred simulations.",
+    help="slow: a surrogate chooses a few hundred simulations.",
 )
-@option("--within", type=float, help="Slow simulations end at this factor to the ends.")
+@option(
+    "--within",
+    type=float,
+    help="With slow simulations, stop when both ends are within this factor.",
+)
 @option("--confidence", default=0.95)
 @arguments.SEED
 @arguments.ONLY
@@ -80,7 +84,7 @@ def estimate(
         path = found.report(report, problem=problem, errors=budget)
         click.echo(f"  report       {path}")
     if not found.simulations:
-        raise CommandError("interrupted before a batch was finished", INTERRUPTED)
+        raise CommandError("interrupted before the first batch was finished", INTERRUPTED)
     if found.rest and found.prior_no_verdict == found.prior_simulations and not found.failures:
         raise CommandError(
             f"no simulation had a verdict, of {found.prior_simulations:,}: nothing is known of the "

@@ -51,7 +51,7 @@ USAGE_ERRORS = (
 
 
 class CommandError(click.ClickException):
-    """An error that is reported in one line, with its exit code."""
+    """An error reported in one line, with its exit code."""
 
     def __init__(self, message: str, exit_code: int) -> None:
         super().__init__(message)
@@ -59,26 +59,26 @@ class CommandError(click.ClickException):
 
 
 def fail_gate() -> click.exceptions.Exit:
-    """Return what ends a command whose gate failed."""
+    """Return the error that ends a command whose gate failed."""
     return click.exceptions.Exit(GATE_FAILED)
 
 
 def check_again(finding: str, even_if_changed: bool) -> None:
-    """End the command with code 4 where a row did not give its number again.
+    """End the command with code 4 if a row did not reproduce its number.
 
     **Arguments:**
-    - `finding`: what differs, as text; empty if nothing does.
-    - `even_if_changed`: whether the user has said that another model is meant.
+    - `finding`: a text on the difference; empty if there is none.
+    - `even_if_changed`: whether the user has accepted a changed model.
     """
     if finding and not even_if_changed:
         raise click.exceptions.Exit(NOT_AGAIN)
 
 
 def command_error(error: BaseException, show_traceback: bool = False) -> CommandError:
-    """Turn an error of the Python API into one that the command line tells in a line.
+    """Turn an error of the Python API into a one-line error of the command line.
 
-    A traceback is printed where it is asked for, and where the error is a bug of this package:
-    neither a refusal, nor a failure that the package foresees, nor raised by the user's own code.
+    A traceback is printed if requested, and if the error is a bug of this package: not a refusal,
+    not a failure that the package foresees, and not raised by the user's own code.
     """
     from verifai_jax.core.messages.text import printable
 

@@ -35,19 +35,19 @@ _PARTS = (
 @click.argument("target", required=False)
 @option("--search", help="Name of the search  [default: auto]")
 @arguments.SET
-@option("--budget", type=int, help="Simulations at most  [default: 10000]")
+@option("--budget", type=int, help="Maximum simulations  [default: 10000]")
 @arguments.BATCH
 @arguments.SEED
 @arguments.ONLY
 @arguments.MAX_SECONDS
 @arguments.STOP_AFTER
-@option("--within", type=float, help="Stop when the failure rate is known as closely.")
+@option("--within", type=float, help="Stop when the failure rate is known to within this number.")
 @option("--decide", type=float, help="Stop when the rate is clearly above or below this.")
-@option("--warm-start", type=PATH, help="Run to learn from first.")
+@option("--warm-start", type=PATH, help="Earlier run from which the search learns first.")
 @option(
     "--resume",
     type=PATH,
-    help="Run folder to go on with; with a larger --budget the run of that budget and this batch.",
+    help="Run folder to continue; with a larger --budget, up to that budget.",
 )
 @arguments.EVEN_IF_CHANGED
 @arguments.PRECISION
@@ -58,7 +58,7 @@ _PARTS = (
 @option(
     "--shard",
     metavar="I/N",
-    help="Simulate part I of N alone, as a job of an array; merge makes the run of them.",
+    help="Simulate only part I of N, as a job of an array; merge combines the parts.",
 )
 @click.option(
     "--confirm/--no-confirm",
@@ -69,13 +69,13 @@ _PARTS = (
 @option(
     "--diverse-by",
     type=click.Choice(["inputs", "behaviour"]),
-    help="Of kinds that differ in this  [default: inputs]",
+    help="Kinds differ in this  [default: inputs]",
 )
 @option(
     "--objective",
     type=click.Choice(["robustness", "likelihood"]),
     default="robustness",
-    help="Failures that break the property by most, or the likeliest.",
+    help="Look for the largest violation, or for the likeliest failure.",
 )
 @arguments.RUN_FOLDER
 @arguments.KEEP_GOING
@@ -115,7 +115,7 @@ def falsify(
         while_compiling(figure.load)
     stop_when = _stopping_rule(within, decide)
     if shard is not None:
-        arguments.refuse_others(_PARTS, "needs all rows of a run; --shard has a part")
+        arguments.refuse_others(_PARTS, "needs all rows of a run; --shard has only a part")
     elif resume is not None:
         arguments.refuse_others(_RESUMES, "is fixed in the run that --resume goes on with")
         target = target or _resumed_target(resume)
@@ -208,7 +208,7 @@ def _stopping_rule(within: float | None, decide: float | None) -> "Within | Deci
     if within is None and decide is None:
         return None
     if within is not None and decide is not None:
-        raise click.UsageError("--within and --decide are two ways to stop; give one")
+        raise click.UsageError("--within and --decide are alternatives; give one")
     from verifai_jax import Decided, Within
 
     if within is not None:
@@ -218,7 +218,7 @@ def _stopping_rule(within: float | None, decide: float | None) -> "Within | Deci
 
 
 def check_run(run: "Run", asked: Gate | None) -> None:
-    """End the command with code 1 where a run does not keep the gate that was asked for."""
+    """End the command with code 1 if a run fails the requested gate."""
     high = None if run.failure_rate is None else run.failure_rate.high
     failed = {"counterexample": run.table.counts.claimed > 0, RATE: exceeds(asked, high)}
     check_gate(asked, failed)
@@ -227,12 +227,11 @@ def check_run(run: "Run", asked: Gate | None) -> None:
 def print_run(
     run: "Run", pictures: bool, options: Mapping[str, object] = MappingProxyType({})
 ) -> None:
-    """Print the summary of a run and how to see more of it.
+    """Print the summary of a run, and the commands to see more of it.
 
     **Arguments:**
-    - `options`: the options of the command that the record does not hold, to be given again on
-      resuming.
-    **Raises:** `CommandError` where no simulation has a verdict.
+    - `options`: the options that the record does not hold and that must be given again on resuming.
+    **Raises:** `CommandError` if no simulation has a verdict.
     """
     click.echo(run.summary())
     give_result(**describe_run(run))

@@ -12,16 +12,16 @@ from verifai_jax.cli.json_output import command, draw, give_result
 
 @command()
 @arguments.TARGET
-@option("--rate", type=float, help="Occurrences of each fault in an hour.")
-@option("--mission-time", type=float, help="Hours of a mission.")
+@option("--rate", type=float, help="Rate of each fault per hour.")
+@option("--mission-time", type=float, help="Duration of a mission in hours.")
 @option("--samples", default=512, help="Simulations of each fault.")
 @option(
-    "--budget", default=2000, help="Simulations of the search where no sample of a fault fails."
+    "--budget", default=2000, help="Simulations of the search for faults whose samples do not fail."
 )
 @option("--pairs/--no-pairs", default=True, help="Try pairs of faults.")
 @option("--confidence", default=0.95)
 @arguments.SEED
-@option("--folder", type=PATH, help="Folder to write, and to go on in  [default: runs/fmea-NAME]")
+@option("--folder", type=PATH, help="Folder to write, or to continue  [default: runs/fmea-NAME]")
 @arguments.PLOT
 @arguments.PROGRESS
 def fmea(target: str, folder: Path | None, plot: Path | None, **options: Any) -> None:

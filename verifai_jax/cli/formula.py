@@ -22,7 +22,7 @@ ASKED = arguments.all_of(
         "--end",
         type=click.Choice(["hold", "truncate"]),
         default="hold",
-        help="Semantics after the last sample.",
+        help="How a trace continues after the last sample.",
     ),
     arguments.NAMES,
 )
@@ -93,7 +93,7 @@ def mutants(
 @click.argument("other")
 @FILES
 @ASKED
-@option("--budget", default=2000, help="Simulations of a problem at most.")
+@option("--budget", default=2000, help="Maximum simulations of a problem.")
 @arguments.SEED
 @arguments.PLOT
 @fail_on(apart="if a trace tells the formulas apart")

@@ -16,7 +16,7 @@ from verifai_jax.cli.next_folder import given_or_next
 
 @command()
 @arguments.TARGET
-@option("--budget", default=10_000, help="Simulations at most.")
+@option("--budget", default=10_000, help="Maximum simulations.")
 @option(
     "--cells",
     multiple=True,

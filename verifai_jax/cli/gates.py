@@ -23,10 +23,10 @@ RATE = "rate"
 
 
 class Gate(NamedTuple):
-    """A gate that was asked for.
+    """A gate requested by the user.
 
     - `name`: the name of the gate.
-    - `bound`: greatest failure rate that passes; None for other gates.
+    - `bound`: the largest failure rate that passes; None for other gates.
     """
 
     name: str
@@ -74,18 +74,18 @@ def fail_on(**gates: str) -> Callable[[Command], Command]:
     """Return the option `--fail-on` of a command.
 
     **Arguments:**
-    - `gates`: when each fails, as text, by name; `rate` has a bound, `rate>P`.
+    - `gates`: a description of when each gate fails, by name; `rate` has a bound, `rate>P`.
     """
     words = "; ".join(f"{'rate>P' if name == RATE else name}: {t}" for name, t in gates.items())
     return click.option("--fail-on", type=GateType(tuple(gates)), help=f"End with code 1. {words}.")
 
 
 def check_gate(asked: Gate | None, failed: Mapping[str, bool]) -> None:
-    """End the command with code 1 where the gate that was asked for failed.
+    """End the command with code 1 if the requested gate failed.
 
     **Arguments:**
-    - `asked`: the gate; None for none.
-    - `failed`: by name of the gate.
+    - `asked`: the requested gate; None for none.
+    - `failed`: whether each gate failed, by name.
     """
     if asked is None:
         return
@@ -95,7 +95,7 @@ def check_gate(asked: Gate | None, failed: Mapping[str, bool]) -> None:
 
 
 def exceeds(asked: Gate | None, high: float | None) -> bool:
-    """Return whether a rate whose interval ends at `high` may be above the bound of the gate."""
+    """Return whether a rate whose interval ends at `high` may exceed the bound of the gate."""
     if asked is None or asked.bound is None:
         return False
     # Without a rate, as where nothing had a verdict, nothing is shown.

@@ -34,16 +34,16 @@ _BESIDES = frozenset(
 
 
 class Kept:
-    """The finished simulations of a command, which go once it is done."""
+    """The finished simulations of a command, which are removed when it is done."""
 
     def __init__(self, work: "Unfinished | None") -> None:
         self._work = work
 
     def stopped(self, why: str | None) -> None:
-        """Note that the result exists, and what ended the work.
+        """Record that the result exists, and why the work ended.
 
         **Arguments:**
-        - `why`: what ended it early; None or anything else if it is done.
+        - `why`: the reason for an early end; None or another value if it is done.
         """
         if self._work is None:
             return
@@ -54,9 +54,9 @@ class Kept:
 
 @contextlib.contextmanager
 def kept_until_done() -> Iterator[Kept]:
-    """Keep the simulations of the present command until it says that it is done.
+    """Keep the simulations of the present command until it reports that it is done.
 
-    Where nothing can be written, or the same command is at work, nothing is kept.
+    If nothing can be written, or the same command is running, nothing is kept.
     """
     from verifai_jax.core.display.progress import goes_on_with
     from verifai_jax.evaluation.unfinished import keeping
@@ -86,6 +86,6 @@ def kept_until_done() -> Iterator[Kept]:
 
 
 def command_line() -> str:
-    """Return the present command as a shell reads it."""
+    """Return the present command in shell syntax."""
     context = click.get_current_context()
     return shlex.join(["verifai-jax", *context.meta.get(WORDS, [context.info_name or ""])])

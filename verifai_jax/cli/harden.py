@@ -13,17 +13,21 @@ from verifai_jax.cli.json_output import command, draw, give_result
 
 @command()
 @arguments.TARGET
-@option("--rounds", default=8, help="Attacks, at most.")
+@option("--rounds", default=8, help="Maximum attacks.")
 @option("--steps", type=int, help="Environment steps of the first training.")
-@option("--further-steps", type=int, help="Of each round  [default: an eighth of --steps]")
-@option("--samples", default=512, help="Of each certificate.")
-@option("--attack", default="cross_entropy", help="Search that attacks.")
+@option(
+    "--further-steps",
+    type=int,
+    help="Environment steps of each round  [default: an eighth of --steps]",
+)
+@option("--samples", default=512, help="Confidence of each certificate.")
+@option("--attack", default="cross_entropy", help="Search used for attacks.")
 @option("--attack-simulations", default=512)
 @option("--confidence", default=0.95)
 @option("--baseline", is_flag=True, help="Train with plain domain randomisation as well.")
 @arguments.SEED
 @arguments.MAX_SECONDS
-@option("--folder", type=PATH, help="Folder to write, and to go on in  [default: runs/harden-NAME]")
+@option("--folder", type=PATH, help="Folder to write, or to continue  [default: runs/harden-NAME]")
 @arguments.EVEN_IF_CHANGED
 @arguments.PLOT
 @arguments.PROGRESS

@@ -40,7 +40,7 @@ class ReportingCommand(click.Command):
         )
 
     def invoke(self, ctx: click.Context) -> Any:
-        """Run the command, and print its result where that is asked for."""
+        """Run the command, and print its result as JSON if requested."""
         if not ctx.params.pop("as_json"):
             return super().invoke(ctx)
         try:
@@ -61,7 +61,7 @@ def give_result(**values: object) -> None:
     """Set entries of the present command's result.
 
     **Arguments:**
-    - `values`: anything that `as_plain` knows.
+    - `values`: values of types that `as_plain` supports.
     """
     context = click.get_current_context(silent=True)
     if context is not None:
@@ -69,11 +69,11 @@ def give_result(**values: object) -> None:
 
 
 def show_result(found: Any, plot: Path | None, *names: str) -> None:
-    """Print a result, give it as plain data, and draw it into a file where one is named.
+    """Print a result, set it as plain data, and draw it into a file if one is named.
 
     **Arguments:**
     - `plot`: the file of its picture, whose folder is made; None for no picture.
-    - `names`: attributes to give; all fields that its `repr` shows when left out.
+    - `names`: attributes to include; by default all fields in its `repr`.
     """
     from verifai_jax.core.messages.text import printable
 
@@ -84,16 +84,16 @@ def show_result(found: Any, plot: Path | None, *names: str) -> None:
 
 
 def draw(found: Any, path: Path) -> None:
-    """Draw a result into a file, whose folder is made, and say where it is."""
+    """Draw a result into a file, whose folder is made, and print the path."""
     found.plot(path)
     click.echo(f"  picture      {path}")
 
 
 def as_plain(value: object) -> Any:
-    """Return a value as JSON has it: tables as lists of rows, dataclasses as objects.
+    """Convert a value to JSON types: tables to lists of rows, dataclasses to objects.
 
-    Fields of a dataclass that are not part of its `repr` are left out, as is what has no plain
-    form.
+    Fields of a dataclass that are not part of its `repr` and values without a plain form are left
+    out.
     """
     if value is None or isinstance(value, bool | int | str):
         return value
@@ -127,7 +127,7 @@ def _has_form(value: object) -> bool:
 
 
 def describe_run(run: Any) -> dict[str, Any]:
-    """Return what a run found, as plain data; None for what a table that was changed would say."""
+    """Return the findings of a run as plain data; None for numbers of a table that was changed."""
     counts, rate = run.table.counts, run.failure_rate
     best, known = None, not run.table.changed
     if known and counts.without_verdict < run.simulations:

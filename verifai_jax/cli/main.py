@@ -171,7 +171,7 @@ class _Group(click.Group):
 
 @click.group(cls=_Group, epilog=EPILOG, context_settings={"help_option_names": ["-h", "--help"]})
 @click.version_option(__version__, prog_name="verifai-jax")
-@click.option("--traceback", is_flag=True, help="Show where an error was raised.")
+@click.option("--traceback", is_flag=True, help="Show a traceback for errors.")
 def main(traceback: bool) -> None:
     """Find inputs that make a closed-loop system break a temporal-logic property."""
 

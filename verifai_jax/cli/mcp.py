@@ -39,7 +39,7 @@ FLAG = {"type": "boolean", "default": False}
 
 
 class Tool(NamedTuple):
-    """A command as a tool: its words, its arguments, and which of them follow the options."""
+    """A command as a tool: its description, its arguments, and which of them follow the options."""
 
     description: str
     command: str
@@ -103,17 +103,17 @@ KINDS = {"string": str, "integer": int, "boolean": bool}
 
 
 class Refused(ValueError):
-    """Arguments that a tool does not take."""
+    """An error for arguments that a tool does not accept."""
 
 
 @dataclass
 class Server:
-    """Tools on one folder.
+    """A server of tools on one folder.
 
-    - `folder`: below which all paths are.
-    - `budget`: simulations of one call at most.
-    - `total`: simulations of all calls at most.
-    - `seconds`: of one call at most.
+    - `folder`: the folder that contains all paths.
+    - `budget`: maximum number of simulations in one call.
+    - `total`: maximum number of simulations in all calls.
+    - `seconds`: maximum number of seconds for one call.
     """
 
     folder: Path
@@ -163,7 +163,7 @@ class Server:
         return _line(number, error={"code": -32601, "message": f"no method {method!r}"})
 
     def call(self, name: str, given: Mapping[str, Any]) -> dict[str, Any]:
-        """Call a tool; what is wrong is said in its answer, for the agent to read."""
+        """Call a tool; errors are part of its answer, for the agent to read."""
         try:
             return self._call(name, TOOLS[name], given)
         except (ValueError, OSError) as error:
@@ -245,7 +245,7 @@ class Server:
 def checked(tool: Tool, given: Mapping[str, Any]) -> dict[str, Any]:
     """Return the arguments of a call, completed by defaults.
 
-    **Raises:** `Refused` for one that is unknown, missing, or not as its schema says.
+    **Raises:** `Refused` for an argument that is unknown, missing, or does not fit its schema.
     """
     for name in given:
         if name not in tool.arguments:
@@ -280,10 +280,27 @@ def _line(number: object, **answer: object) -> str:
 
 
 @click.command()
-@click.option("--folder", type=click.Path(path_type=Path), default=".", help="Of the project.")
-@click.option("--budget", type=click.IntRange(1), default=100_000, help="Simulations of a call.")
-@click.option("--total", type=click.IntRange(1), default=1_000_000, help="Simulations in all.")
-@click.option("--seconds", type=click.FloatRange(1), default=600.0, help="Seconds of a call.")
+@click.option(
+    "--folder", type=click.Path(path_type=Path), default=".", help="Folder of the project."
+)
+@click.option(
+    "--budget",
+    type=click.IntRange(1),
+    default=100_000,
+    help="Maximum simulations in a call.",
+)
+@click.option(
+    "--total",
+    type=click.IntRange(1),
+    default=1_000_000,
+    help="Maximum simulations in all.",
+)
+@click.option(
+    "--seconds",
+    type=click.FloatRange(1),
+    default=600.0,
+    help="Maximum seconds for a call.",
+)
 def mcp(folder: Path, budget: int, total: int, seconds: float) -> None:
     """Serve an agent over standard input and output, by the Model Context Protocol.
 

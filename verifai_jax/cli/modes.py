@@ -11,12 +11,12 @@ from verifai_jax.cli.json_output import command, show_result
 
 @command()
 @arguments.TARGET
-@option("--budget", default=50_000, help="Simulations at most.")
+@option("--budget", default=50_000, help="Maximum simulations.")
 @option("--confidence", default=0.95)
 @option(
     "--min-share",
     default=0.001,
-    help="Part of the failure probability below which a mode is not listed.",
+    help="Modes with a smaller share of the failure probability are not listed.",
 )
 @arguments.SEED
 @arguments.ONLY

@@ -49,7 +49,7 @@ if TYPE_CHECKING:
     "--end",
     type=click.Choice(["hold", "truncate", "strict"]),
     default="hold",
-    help="Semantics after the last sample.",
+    help="How a trace continues after the last sample.",
 )
 @option("--compat", type=click.Choice(["pymtl"]), help="Right-open windows, as in py-mtl.")
 @NAMES
@@ -92,8 +92,7 @@ def monitor(
     With - as RECORDING, lines of CSV are read from the standard input as they come, until the
     verdict is certain whatever follows: tail -f log.csv | verifai-jax monitor FORMULA -
 
-    With --export-c FILE.h nothing is judged: FORMULA becomes a monitor in C, and with FILE.fmu one
-    as an FMU.
+    With --export-c FILE.h, FORMULA becomes a monitor in C, and with FILE.fmu an FMU.
     """
     import jax
 
@@ -222,7 +221,7 @@ EVEN = 1e-3
 
 
 class Sample(NamedTuple):
-    """One row of the stream: its line, its time (None without a column of times), its signals."""
+    """One row of the stream: its line, its time (None without a time column), its signals."""
 
     line: int
     time: float | None
@@ -233,16 +232,16 @@ def monitor_stream(
     formula: "Formula", lines: Iterable[str], time: str, dt: float | None, show: Any = click.echo,
     hold: bool = False,
 ) -> bool:  # fmt: skip
-    """Monitor samples until the verdict is certain whatever follows, or until they end.
+    """Monitor samples until the verdict is certain, or until they end.
 
     **Arguments:**
-    - `lines`: the lines of CSV; the first has the names.
+    - `lines`: the lines of CSV; the first contains the names.
     - `time`: the column of sample times in seconds, or of dates (ISO 8601).
-    - `dt`: the sampling period in seconds, instead of a column of times.
-    - `show`: what prints a line.
+    - `dt`: the sampling period in seconds, if there is no column of times.
+    - `show`: a function that prints a line.
     - `hold`: whether a gap keeps the last value of its signal.
-    **Returns:** whether the formula holds; with the last sample held, if the samples have ended.
-    **Raises:** `ValueError` for lines that are no evenly spaced samples; `CommandError` for a NaN.
+    **Returns:** whether the formula holds; if the samples have ended, with the last one held.
+    **Raises:** `ValueError` for lines that are not evenly spaced samples; `CommandError` for a NaN.
     """
     from verifai_jax import mtl
 

@@ -20,10 +20,10 @@ Command = TypeVar("Command", bound=Callable[..., object])
 
 
 def fleet_options(command: Command) -> Command:
-    """Add the options of many requirements on many recordings."""
+    """Add the options for judging many requirements on many recordings."""
     files = click.Path(path_type=Path, dir_okay=False)
     for each in (
-        click.option("--jobs", type=click.IntRange(1), default=1, help="Processes that judge."),
+        click.option("--jobs", type=click.IntRange(1), default=1, help="Number of processes."),
         option("--junit", type=files, help="File of the verdicts as JUnit XML."),
         option("--report", type=files, help="HTML file of the report."),
     ):
@@ -34,7 +34,7 @@ def fleet_options(command: Command) -> Command:
 def is_fleet(
     formula: str, recordings: Sequence[Path], report: Path | None, junit: Path | None
 ) -> bool:
-    """Return whether a command line is about several requirements or recordings."""
+    """Return whether a command line has several requirements or recordings."""
     several = len(recordings) > 1 or recordings[0].is_dir()
     return several or _is_file(formula) or report is not None or junit is not None
 
@@ -49,12 +49,12 @@ def monitor_fleet(
     jobs: int,
     options: Mapping[str, Any],
 ) -> "Judgement":
-    """Judge requirements, a file of them or one formula, on recordings; print what was found.
+    """Judge one formula or a file of requirements on recordings; print the findings.
 
     **Arguments:**
-    - `jobs`: processes that judge; more than one are started for it.
-    - `options`: the options of `judge`: how recordings are read.
-    **Raises:** `CommandError` where nothing has a verdict.
+    - `jobs`: number of processes that judge; more than one are started for this.
+    - `options`: the options of `judge` for reading recordings.
+    **Raises:** `CommandError` if nothing has a verdict.
     """
     from verifai_jax import mtl
 

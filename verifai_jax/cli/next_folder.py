@@ -13,12 +13,11 @@ def given_or_next(
     goes_on: Callable[[Path], str] | None = None,
     record: str | Path = "run.json",
 ) -> Iterator[Path]:
-    """Return the folder that was given, or else the next one, as `next_folder` makes it.
+    """Return the given folder, or else the next one, made by `next_folder`.
 
     **Arguments:**
-    - `goes_on`: writes the command that goes on with the folder, which is said for those who kill
-      this one.
-    - `record`: file that the folder has from when on that is possible.
+    - `goes_on`: returns the command that resumes the folder; it is printed in case of a kill.
+    - `record`: the file from whose existence on that is possible.
     """
     from verifai_jax.core.display.progress import goes_on_with
 
@@ -31,9 +30,9 @@ def given_or_next(
 
 @contextlib.contextmanager
 def next_folder(parent: str, name: str) -> Iterator[Path]:
-    """Make the first of parent/NAME-1, parent/NAME-2, ... that is missing, for this process alone.
+    """Make the first missing folder of parent/NAME-1, parent/NAME-2, ..., for this process alone.
 
-    A command that ends without a file in it removes it.
+    A command that ends without writing a file into it removes it.
     """
     from verifai_jax.core.messages.text import folder_name
     from verifai_jax.core.store.locks import writing

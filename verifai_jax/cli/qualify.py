@@ -16,7 +16,7 @@ from verifai_jax.cli.json_output import command, give_result
     default=Path("qualification"),
     help="Folder for qualification.html and qualification.json.",
 )
-@option("--only", multiple=True, help="Name of an oracle, several times for several.")
+@option("--only", multiple=True, help="Name of an oracle; may be repeated.")
 def qualify(folder: Path, only: tuple[str, ...]) -> None:
     """Run the tool's own oracles on this machine, and write the record to be signed.
 

@@ -20,10 +20,10 @@ from verifai_jax.cli.json_output import command, draw, give_result, show_result
     "nominal",
     multiple=True,
     metavar="NAME=VALUE",
-    help="Value a parameter starts from  [default: the problem's nominal value]",
+    help="Initial value of a parameter  [default: the problem's nominal value]",
 )
-@option("--run", "folder", type=PATH, help="Run with counterexamples.")
-@option("--budget", default=20_000, help="Simulations at most.")
+@option("--run", "folder", type=PATH, help="Run with counterexamples to start from.")
+@option("--budget", default=20_000, help="Maximum simulations.")
 @option(
     "--estimate",
     type=int,

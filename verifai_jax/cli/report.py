@@ -19,8 +19,14 @@ from verifai_jax.cli.json_output import command, give_result
     help="File to write  [default: report.html in the folder]",
 )
 @option("--unit", "units", multiple=True, metavar="FEATURE=UNIT", help="Unit of a feature.")
-@option("--reason", "reasons", multiple=True, metavar="FEATURE=TEXT", help="Reason of its range.")
-@option("--traces", type=int, help="Rows simulated beforehand at most  [default: chosen]")
+@option(
+    "--reason",
+    "reasons",
+    multiple=True,
+    metavar="FEATURE=TEXT",
+    help="Reason for the range of a feature.",
+)
+@option("--traces", type=int, help="Maximum rows simulated for the report  [default: chosen]")
 @click.option(
     "--studies/--no-studies",
     default=None,
@@ -30,7 +36,7 @@ from verifai_jax.cli.json_output import command, give_result
     "--modes",
     type=int,
     metavar="SIMULATIONS",
-    help="Add all ways of failing of a run and their probabilities, by so many simulations.",
+    help="Add all modes of failure and their probabilities, with this many simulations.",
 )
 @arguments.ODD
 @option(
@@ -38,7 +44,11 @@ from verifai_jax.cli.json_output import command, give_result
     is_flag=True,
     help="Add the claims as a tree, boxes on credibility, and a page to be signed.",
 )
-@option("--without-problem", is_flag=True, help="Simulate nothing: report what the folder says.")
+@option(
+    "--without-problem",
+    is_flag=True,
+    help="Simulate nothing: report only the content of the folder.",
+)
 def report(
     folder: Path,
     target: str | None,

@@ -20,9 +20,9 @@ from verifai_jax.cli.json_output import command, give_result, show_result
     "--by",
     type=click.Choice(["count", "distance", "likelihood"]),
     default="count",
-    help="Fewest features first, least distance first, or the likeliest failure.",
+    help="Minimise the number of features first, or the distance; or find the likeliest failure.",
 )
-@option("--budget", default=2000, help="Simulations at most.")
+@option("--budget", default=2000, help="Maximum simulations.")
 @arguments.SEED
 @option(
     "--others/--no-others", default=True, help="Start from other counterexamples of the run too."

@@ -30,19 +30,29 @@ _MAX_ROWS = 12
 
 @command()
 @click.argument("target", required=False)
-@option("--configurations", type=int, help="Configurations at most  [default: 32]")
+@option("--configurations", type=int, help="Maximum configurations  [default: 32]")
 @option("--search", help="Name of the search, or optuna:tpe  [default: halton]")
 @arguments.SET
 @option("--seed", type=int, help="Seed of the search and the samples  [default: 0]")
-@option("--samples", type=int, help="Samples of each policy, at least  [default: 512]")
-@option("--confidence", type=float, help="Of all verdicts together  [default: 0.95]")
+@option("--samples", type=int, help="Minimum number of samples of each policy  [default: 512]")
+@option("--confidence", type=float, help="Confidence of all verdicts together  [default: 0.95]")
 @option("--budget", type=int, help="Simulations of the certification in all.")
 @option("--attack", help="Search that attacks each policy  [default: cross_entropy]")
 @option("--attack-simulations", type=int, help="Simulations of each attack  [default: 256]")
-@option("--halving", "reduction", type=float, help="One of so many configurations continues.")
+@option(
+    "--halving",
+    "reduction",
+    type=float,
+    help="The share of configurations that continue is one in this many.",
+)
 @option("--halving-by", "by", help="Criterion: return or safety  [default: return]")
 @option("--only", metavar="NAMES", help="Hyper-parameters to vary, comma-separated.")
-@option("--nominal", multiple=True, metavar="NAME=VALUE", help="Value of one that --only fixes.")
+@option(
+    "--nominal",
+    multiple=True,
+    metavar="NAME=VALUE",
+    help="Value of a hyper-parameter that --only fixes.",
+)
 @arguments.MAX_SECONDS
 @option("--cache", type=PATH, help="Folder of finished work  [default: the sweep's folder]")
 @option("--resume", type=PATH, help="Folder of a sweep to resume.")
@@ -209,7 +219,7 @@ def _describe_folder(folder: Path) -> str:
         goes_on = arguments.resuming("falsify", folder, None, {})
         return f": it is the folder of a run; {goes_on} goes on with it"
     if arguments.is_sweep(folder):
-        return ": its finished work is elsewhere; name it, --cache FOLDER, as when it began"
+        return ": its finished work is elsewhere; give the same --cache FOLDER as before"
     if not folder.exists():
         return ": there is no such folder"
     return ": verifai-jax sweep has not written it"

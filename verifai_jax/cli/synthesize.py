@@ -14,7 +14,7 @@ from verifai_jax.cli.json_output import command, show_result
 @command()
 @TARGET
 @option("--parameters", metavar="NAMES", help="Features to choose, comma-separated  [default: all]")
-@option("--budget", default=10_000, help="Simulations at most.")
+@option("--budget", default=10_000, help="Maximum simulations.")
 @PARAMETER_CHOICE
 @option("--table", type=PATH, metavar="CSV", help="Write the candidates into a CSV file.")
 @fail_on(unsafe="unless the formula holds with the parameters, in the check too")

@@ -13,15 +13,19 @@ FOLDER = PATH
 
 @command()
 @click.argument("targets", metavar="FILE.py...", nargs=-1, required=True)
-@option("--requirements", type=FOLDER, help="File of them  [default: those of the problems]")
-@option("--tests", type=FOLDER, multiple=True, help="Files or folders  [default: tests]")
+@option(
+    "--requirements", type=FOLDER, help="File of requirements  [default: those of the problems]"
+)
+@option("--tests", type=FOLDER, multiple=True, help="Files or folders of tests  [default: tests]")
 @option("--runs", type=FOLDER, multiple=True, help="Folders of runs  [default: runs]")
-@option("--reports", type=FOLDER, multiple=True, help="Files or folders  [default: reports]")
+@option(
+    "--reports", type=FOLDER, multiple=True, help="Files or folders of reports  [default: reports]"
+)
 @option(
     "--without",
     multiple=True,
     type=click.Choice(["tests", "runs", "reports"]),
-    help="A kind of link that is not asked for.",
+    help="Kind of link that is not required.",
 )
 @option("--csv", type=FOLDER, help="File to write the table to.")
 @option("--report", type=FOLDER, help="HTML file to write.")

@@ -14,11 +14,13 @@ from verifai_jax.cli.json_output import as_plain, command, give_result
 @command()
 @arguments.TARGET
 @click.argument("trials", type=PATH, required=False)
-@option("--simulations", default=10_000, help="Of the prior.")
+@option("--simulations", default=10_000, help="Simulations of the prior.")
 @option("--confidence", default=0.95)
-@option("--allocated", is_flag=True, help="Trials were chosen as --next does.")
-@option("--at-any-time", is_flag=True, help="Verdicts decided when to stop, or what to try.")
-@option("--next", "count", type=int, help="Choose so many trials to make next.")
+@option("--allocated", is_flag=True, help="Trials were chosen by --next.")
+@option(
+    "--at-any-time", is_flag=True, help="Verdicts influenced when to stop, or which trials to make."
+)
+@option("--next", "count", type=int, help="Choose this many trials to make next.")
 @option(
     "--sheet",
     type=PATH,

@@ -13,15 +13,15 @@ from verifai_jax.cli.json_output import command, give_result, show_result
 
 @command()
 @arguments.TARGET
-@option("--budget", type=float, help="Seconds, about.  [default: 60]")
-@option("--boxes", type=int, help="Boxes to look at, at most.")
-@option("--samples", default=4096, help="Of what is undecided.")
+@option("--budget", type=float, help="Approximate time in seconds  [default: 60]")
+@option("--boxes", type=int, help="Maximum boxes to examine.")
+@option("--samples", default=4096, help="Simulations of the undecided part.")
 @option("--confidence", default=0.95)
 @arguments.SEED
 @arguments.ONLY
 @arguments.PRECISION
 @option("--continuous", is_flag=True, help="Verify the differential equation at all times.")
-@option("--into", type=PATH, help="File for the result, or to go on with.")
+@option("--into", type=PATH, help="File for the result, or to continue.")
 @arguments.PLOT
 @arguments.REPORT
 @arguments.PROGRESS

@@ -95,8 +95,7 @@ def estimate(
       it is shown, and otherwise how many more simulations without a failure would show it.
     - `precision`, `backend`: as in `falsify`.
     - `max_seconds`: wall-clock seconds after which the estimate is made from finished simulations.
-    - `progress`: True draws a progress bar, False none; None draws one on a terminal and in a
-      notebook.
+    - `progress`: True draws a bar, False none; None draws one on a terminal and in a notebook.
     - `executor`: an executor whose workers simulate, as in `falsify`; the estimate is the same.
     - `simulations_are`: `"slow"` if only a few hundred simulations are affordable: the method is
       then `"surrogate"`, which computes more to simulate less. `"auto"` assumes this for a black

@@ -221,14 +221,14 @@ class _Stage:
         failures = int(failing.sum())
         estimate = _estimate(self.name, failures, without, count, effective, confidence)
         notes = [
-            f"the interval of {self.name} is approximate: it weighs rows of a run that began "
+            f"the interval of {self.name} is approximate: it weights rows of a run that started "
             f"elsewhere, {self.run.simulations:,} of them"
         ]
         far = float(np.quantile(gaps[inside], 0.95)) if inside.any() else 0.0
         if far > FAR:
             notes.append(
-                f"rows of {self.name} are {far:.0%} of a range away from where it begins: run it "
-                "there, or give its problem instead of its run"
+                f"rows of {self.name} start {far:.0%} of a range away from where the sequence "
+                "reaches it: run it from there, or give its problem instead of its run"
             )
         tried = np.flatnonzero(failing)[:CONFIRMED]
         if not len(tried):

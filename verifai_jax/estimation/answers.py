@@ -161,8 +161,8 @@ def importance_answer(
         )
     if samples.unresolved > 0.01:
         answer.notes.append(
-            f"failures lie where single precision or a distribution's outermost value hides up to "
-            f"{format_percent(samples.unresolved)} of them; the interval is wider by that"
+            "failures lie where single precision or a distribution's outermost value hides up to "
+            f"{format_percent(samples.unresolved)} of them; the interval is widened by this"
         )
     return answer
 
@@ -192,8 +192,8 @@ def check_by_splitting(
     other = log_interval(run.estimate, UNDERSTATED * run.cv, plan.confidence, 10)
     answer.low, answer.high = min(interval[0], other[0]), max(interval[1], other[1])
     answer.notes.append(
-        f"splitting gave {run.estimate:z.2g}, which does not agree; the interval is made to "
-        "hold both. More simulations would tell"
+        f"splitting gave {run.estimate:z.2g}, which does not agree; the interval is widened to "
+        "contain both. More simulations would decide"
     )
 
 
@@ -273,7 +273,7 @@ def bound_answer(
         "stuck": "the search found no failure: the robustness gets no lower than "
         f"{limit_state.lowest:z.4g}, or has no slope to follow",
         "budget": f"the budget ended at robustness {level:z.4g}, which is reached with probability "
-        f"{reached:z.1e}; failing is rarer, or impossible",
+        f"{reached:z.1e}; a failure is less probable, or impossible",
     }.get(run.stopped or "", f"ended ({run.stopped}) at robustness {level:z.4g}")
     counts = counts + monte_carlo.sample_prior(limit_state, rng, limit_state.left)
     answer = monte_carlo_answer(counts, plan)

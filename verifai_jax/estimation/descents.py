@@ -218,8 +218,8 @@ def _descend(
 ) -> None:
     """Lower the robustness of each point until it fails or its steps are used up.
 
-    With gradients a descent ends at once where many before it have come to the same plane, `known`
-    by their feet.
+    With gradients a descent ends at once where many before it reached the same plane, one of
+    `known`.
     """
     steps, given_up = STEPS, np.zeros(len(descents.z), bool)
     if limit_state.gradient is not None:

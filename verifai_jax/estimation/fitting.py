@@ -101,8 +101,7 @@ def fit_diagonal(
 ) -> Gaussian:
     """Fit a Gaussian without correlations, a little wider than the points.
 
-    A coordinate that differs from the prior by no more than sampling noise keeps the prior's
-    distribution.
+    A coordinate that differs from the prior only by sampling noise keeps the prior.
     """
     size = max(effective_size(weight) * worth, 2.0)
     mean = weight @ z

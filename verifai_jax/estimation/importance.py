@@ -154,7 +154,7 @@ class FittedProposal:
     probability: float = 0.0
 
     def promise(self, simulations: int) -> float:
-        """Return the effective failures expected from so many samples, less for a heavy tail."""
+        """Return the effective failures expected of this many samples, fewer for a heavy tail."""
         return self.effective * simulations / widening(self.tail) ** 2
 
 

@@ -206,12 +206,12 @@ def _with_chance(answer: Answer, again: float, own_chance: str) -> Answer:
     if again < 1:
         answer.diagnostics["failing_again"] = again
     if again < SURE:
-        what = "the system draws random numbers, and they decide"
+        what = "the system draws random numbers, which decide"
         keys = " with other random keys"
         if own_chance:
-            what, keys = "what the system has of its own decides", ""
+            what, keys = "random numbers or memory of the system decide", ""
         answer.notes.append(
-            f"{what} with the features whether a simulation fails: of the failures found "
+            f"{what} together with the features whether a simulation fails: of the failures found "
             f"{format_percent(again)} fail again{keys}. The probability is over both"
         )
     return answer

@@ -38,8 +38,7 @@ class Counts:
     def interval(self, confidence: float) -> tuple[float, float]:
         """Return the Clopper-Pearson interval of the failure probability.
 
-        A sample without a verdict counts as safe at the lower end, and as a failure at the upper
-        end.
+        A sample without a verdict is safe at the lower end, and a failure at the upper end.
         """
         if not self.simulations:
             return 0.0, 1.0

@@ -212,8 +212,7 @@ class LimitState:
     def begin(self, z: Float[np.ndarray, "n d"]) -> "Begun":
         """Start simulating points, and return an object that waits for their scores.
 
-        Workers of an executor start at once; without workers the simulation starts when its result
-        is requested.
+        An executor starts at once; without one the simulation starts when its result is requested.
         """
         return Begun(self, z)
 

@@ -111,8 +111,7 @@ class Estimate(Drawn, Reported, InNotebook):
         **Arguments:**
         - `p0`: failure probability to be shown, between 0 and 1.
         - `confidence`: the confidence of the bound; by default that of the estimate.
-        **Returns:** the number of samples in addition to those of `upper_bound`; 0 if these
-        suffice.
+        **Returns:** the number of samples beyond those of `upper_bound`; 0 if these suffice.
         **Raises:** `ValueError` unless `0 < p0 < 1`.
         """
         check_fraction("p0", p0)

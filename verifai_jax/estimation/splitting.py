@@ -83,8 +83,7 @@ def run_splitting(
     **Arguments:**
     - `per_level`: number of states in a level: `chains` times the length of a chain.
     - `chains`: number of chains in a level; they start at the lowest points of the previous level.
-    - `first`: samples of the prior to start with, and their score, failing and proper; drawn when
-      left out.
+    - `first`: first samples of the prior, with score, failing and proper; drawn when left out.
     - `reserve`: number of simulations that must be left over.
     **Returns:** the run; `stopped` says why it reached no failure.
     """

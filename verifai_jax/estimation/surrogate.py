@@ -340,8 +340,9 @@ def _answer(
     if samples.failing.sum() < MIN_FAILING:
         answer = bound_answer(limit_state, rng, plan, SplittingRun(stopped="stuck"), counts)
         answer.notes.append(
-            f"the surrogate is worth nothing: of {len(samples.x):,} samples where it sees failures "
-            f"{int(samples.failing.sum()):,} fail, so that samples of the prior are counted"
+            f"the surrogate does not help: of {len(samples.x):,} samples where it predicts "
+            f"failures {int(samples.failing.sum()):,} fail, so samples of the prior are counted "
+            "instead"
         )
         return answer
     weights, value = samples.mean, min(mean.value, 1.0)

@@ -38,7 +38,7 @@ WORTH_TRYING = 5.0
 
 
 class Choice(NamedTuple):
-    """A problem on one backend; its name, None for a system without; and why, for people."""
+    """A problem on one backend; the backend's name, None for a system without; and the reason."""
 
     problem: Problem
     backend: str | None
@@ -56,10 +56,10 @@ def resolved(
 ) -> Choice:
     """Return the problem on the backend that suits the run.
 
-    - `wanted`: a backend by name; chosen here when left out, unless the system names one itself.
+    - `wanted`: a backend by name; by default the system's own, or else the faster one here.
 
-    **Raises:** `UnknownNameError` for a backend that the system lacks; `ValueError` for one whose
-    system has none to choose from.
+    **Raises:** `UnknownNameError` for a backend that the system lacks; `ValueError` if the system
+    has no backends.
     """
     system, candidates = problem.system, problem.system.backends
     if not candidates:
@@ -104,7 +104,7 @@ def _fastest(
         likely = problem.system.likely == traced
         if budget / speed < (WORTH_TRYING if likely else WORTH_MEASURING):
             seconds = f"{budget / speed:z.1f} s for all simulations"
-            return Choice(host, on_host, f"{seconds}, less than compiling for {traced} takes")
+            return Choice(host, on_host, f"{seconds}, less than compiling for {traced}")
         try:
             engine = engine_for(compiled, batch, precision=precision)
             engine.compile()
@@ -146,11 +146,11 @@ def engines_for(problem: Problem, engines: Engines) -> dict[str, Problem]:
     """Return the problem in other engines, by the names of their checks.
 
     **Arguments:**
-    - `problem`: on the backend that it ran on.
+    - `problem`: the problem on the backend on which it ran.
     - `engines`: another system for the same features and signals, a problem with one, the name of a
-      backend of its system, `"all"` for all other backends that are installed; several names, or
-      several of these by name.
-    **Raises:** `ValueError` without such a backend; `UnknownNameError` for other features.
+      backend of its system, `"all"` for all other installed backends; several names, or a
+      dictionary of several of these.
+    **Raises:** `ValueError` if there is no such backend; `UnknownNameError` for other features.
     """
     if engines is None:
         return {}

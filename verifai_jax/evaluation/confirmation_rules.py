@@ -28,16 +28,16 @@ def decide(
     by_far: bool,
     came_again: bool,
 ) -> confirmations.Confirmations:
-    """Decide about rows from their replays.
+    """Decide on rows from their replays.
 
     **Arguments:**
-    - `found`: the rows, all of verdict `raised`; completed in place.
-    - `run`: robustness of the rows in the run, if that is known.
-    - `untraceable`: what raised when a check was traced; empty if nothing did.
-    - `may_refute`: whether a check simulates more finely than the run.
-    - `by_far`: whether rows have to fail by more than they moved.
-    - `came_again`: whether other rows could be simulated again, so that one that raises now has not
-      come again.
+    - `found`: the rows, all with verdict `raised`; completed in place.
+    - `run`: robustness of the rows in the run, if known.
+    - `untraceable`: the error raised when a check was traced; empty if there was none.
+    - `may_refute`: whether some check simulates more finely than the run.
+    - `by_far`: whether rows have to fail by more than their robustness moved.
+    - `came_again`: whether other rows could be simulated again, so that an error now means that the
+      failure was not reproduced.
     """
     rho = {name: verdicts.lowest for name, verdicts in replayed.items()}
     found.rho.update(rho)
@@ -89,10 +89,10 @@ def hold_to_run(
     rows: Mapping[str, np.ndarray],
     only_repeats: bool,
 ) -> None:
-    """Hold to the run's verdict on rows of a host system, where this time is no evidence against.
+    """Keep the run's verdict on rows of a host system that the present replays do not contradict.
 
-    What did not come again in the run stays unconfirmed, whatever it does this time; and what fails
-    every time stays confirmed, by whatever it has moved.
+    A failure that the run could not reproduce stays unconfirmed, whatever happens now; one that
+    fails every time stays confirmed, however far its robustness moved.
     """
     fails = np.all([verdicts.violated for verdicts in replayed.values()], axis=0)
     still = (rows["verdict"] == "confirmed") & fails & only_repeats
@@ -107,11 +107,11 @@ def hold_to_run(
 
 
 def lowest_failing(again: Verdicts, more: Verdicts, at: np.ndarray) -> Verdicts:
-    """Return the repetitions, those rows replaced that a further one shows to fail less.
+    """Return the repetitions; of two, the one that fails by less.
 
     **Arguments:**
-    - `again`: of all rows.
-    - `more`: a further repetition of the rows `at`.
+    - `again`: the repetitions of all rows.
+    - `more`: a further repetition of the rows at indices `at`.
     """
     with np.errstate(invalid="ignore"):
         less = ~more.violated | ~(more.lowest <= again.lowest[at])
@@ -130,14 +130,14 @@ def lowest_failing(again: Verdicts, more: Verdicts, at: np.ndarray) -> Verdicts:
 def describe_disagreement(
     i: int, found: Mapping[str, Verdicts], rho: float, band: float, as_run: float | None = None
 ) -> str:
-    """Say why a row is not confirmed.
+    """Explain why a row is not confirmed.
 
     **Arguments:**
     - `i`: index of the row.
     - `found`: the replays of all rows, by check.
     - `rho`: robustness of the row in the finest replay.
-    - `band`: how much it moved between replays.
-    - `as_run`: its robustness in the run, where that is known.
+    - `band`: how far the robustness moved between replays.
+    - `as_run`: its robustness in the run, if known.
     """
     lost = [name for name in found if not found[name].proper[i]]
     if lost:

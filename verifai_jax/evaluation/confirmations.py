@@ -69,9 +69,9 @@ def describe_checks(checks: Collection[str], *, of_step: bool = True) -> str:
 
     **Arguments:**
     - `checks`: their names, as in `Confirmations.checks`.
-    - `of_step`: whether to say why there was none at a finer step.
+    - `of_step`: whether to explain why no finer step was checked.
     **Returns:** the end of a sentence, such as `in double precision and at a half and a quarter of
-    the step`; empty without a check.
+    the step`; empty if there was no check.
     """
     parts = []
     if "float64" in checks:
@@ -91,12 +91,12 @@ def describe_checks(checks: Collection[str], *, of_step: bool = True) -> str:
 
 
 def engines_of(checks: Iterable[str]) -> list[str]:
-    """Return those checks that other engines make."""
+    """Return the checks made in other engines."""
     return [name for name in checks if name.startswith(ENGINE)]
 
 
 def describe_check(name: str) -> str:
-    """Write a check as people read it."""
+    """Describe a check in English."""
     return CHECK_TEXTS.get(name) or f"in {name.removeprefix(ENGINE)}"
 
 
@@ -106,15 +106,15 @@ class Confirmation(InNotebook):
 
     **Fields:**
     - `name`: the name of the problem.
-    - `row`: its number in the table; None for features without one.
+    - `row`: its number in the table; None for features that are not a row.
     - `verdict`: `"confirmed"`, `"refuted"`, `"fragile"` or `"raised"`.
-    - `rho`: robustness `as_run`, NaN if it is unknown, and of each check by name.
+    - `rho`: the robustness by name: `as_run`, NaN if unknown, and that of each check.
     - `band`: how far the robustness moved between the replays.
-    - `why`: the reason of the verdict, as a sentence.
-    - `notes`: checks that could not be made, and why.
+    - `why`: a sentence with the reason for the verdict.
+    - `notes`: checks that could not be made, with the reasons.
     - `precision`: the precision of the run.
-    - `changed`, `finding`: as in `Replay`, of the row simulated again in the run's precision; the
-      second is looked for if the model has changed or the verdict is not `"confirmed"`.
+    - `changed`, `finding`: as in `Replay`, for the row simulated again in the run's precision;
+      `finding` is only computed if the model has changed or the verdict is not `"confirmed"`.
     """
 
     name: str
@@ -135,7 +135,7 @@ class Confirmation(InNotebook):
 
     @property
     def transferable(self) -> bool | None:
-        """True if it is confirmed in each engine; None without another engine."""
+        """True if it is confirmed in all engines; None if no other engine was used."""
         return self.confirmed if engines_of(self.rho) else None
 
     def __str__(self) -> str:
@@ -161,31 +161,31 @@ class Confirmations(InNotebook):
 
     **Fields:**
     - `name`: the name of the problem.
-    - `numbers`: `[n]`, of the rows in the table.
-    - `run_rho`: `[n]`, the robustness as the run computed it; NaN if it is unknown.
-    - `verdict`: `[n]`: `confirmed`: it fails in every check, and by more than replays move it (if
-      all that can be done is to simulate it once more, and no row of the run held then, it is
-      enough that it fails again); `refuted`: none of the finer checks fails (half and quarter of
-      the step and the other engines, or double precision if the step cannot be refined);
-      `fragile`: the checks disagree, one of them gave no robustness, the row fails by less than
-      that, or it did not fail when it was simulated again; `raised`: a check raised, and the others
-      fail; `unexamined`: left out, see `Confirmer`; empty for a row that was not to be checked.
-    - `rho`: for each check made, by name, the robustness `[n]` of the worst formula; NaN without
-      one. Names are `float64` (or `again`, in the precision of the run), `half_step`,
-      `quarter_step`, `quarter_step_float32`, `nudged` (at the finest step, with features one
-      rounding of float32 away), and `engine.NAME` of another engine.
-    - `band`: `[n]`, how much the robustness moved: between half and quarter of the step, which is
-      what a method of order 1 is still off at the quarter (Richardson's extrapolation), or by
-      rounding: between two precisions, two neighbouring features, or the run and its replay if
-      `run_rho` is known. A row is confirmed if it fails by more than the first and by four times
-      the second.
-    - `why`: `[n]`, the reason as a sentence; empty if confirmed.
-    - `notes`: checks that could not be made, and why.
+    - `numbers`: `[n]`, row numbers in the table.
+    - `run_rho`: `[n]`, the robustness computed in the run; NaN if unknown.
+    - `verdict`: `[n]`, one of these. `confirmed`: it fails in every check, by more than replays
+      move it (if it can only be simulated once more, and no row of the run was safe then, it
+      suffices that it fails again). `refuted`: it fails in none of the finer checks (half and
+      quarter of the step and the other engines, or double precision if the step cannot be refined).
+      `fragile`: the checks disagree, one gave no robustness, the row fails by less than replays
+      move it, or it did not fail when simulated again. `raised`: a check raised, and the others
+      fail. `unexamined`: left out, see `Confirmer`. Empty for a row that was not to be checked.
+    - `rho`: for each check, by name, the least robustness `[n]` of the formulas; NaN if there is
+      none. Names are `float64` (or `again`, in the precision of the run), `half_step`,
+      `quarter_step`, `quarter_step_float32`, `nudged` (at the finest step, with features moved by
+      one rounding of float32), and `engine.NAME` of another engine.
+    - `band`: `[n]`, how far the robustness moved. Between half and quarter of the step this is the
+      remaining error of a method of order 1 at the quarter (Richardson extrapolation). By rounding
+      it moves between two precisions, two neighbouring features, or the run and its replay if
+      `run_rho` is known. A row is confirmed if it fails by more than the former and by four times
+      the latter.
+    - `why`: `[n]`, a sentence with the reason; empty if confirmed.
+    - `notes`: checks that could not be made, with the reasons.
     - `checks`: names of the checks that were made, for `describe_checks`.
-    - `changed`, `finding`: as in `Confirmation`, of the worst row that is not confirmed, or the
-      worst of all.
-    - `wavering`: a note if a host system did not give the numbers of the run again; then it is the
-      first of `notes`, too.
+    - `changed`, `finding`: as in `Confirmation`, for the worst row that is not confirmed, or else
+      the worst of all.
+    - `wavering`: a note if a host system did not reproduce the numbers of the run; it is then also
+      the first of `notes`.
     """
 
     _internal = frozenset(("put", "refuse", "blank"))
@@ -210,7 +210,7 @@ class Confirmations(InNotebook):
         run_rho: Float[np.ndarray, " n"] | None,
         verdict: str = "unexamined",
     ) -> "Confirmations":
-        """Return rows of one verdict before any was replayed; see `put`."""
+        """Return rows with one verdict, none of them replayed yet; see `put`."""
         missing = np.full(len(numbers), np.nan)
         known = missing if run_rho is None else np.asarray(run_rho, np.float64)
         texts = np.full(len(numbers), "", object)
@@ -218,16 +218,16 @@ class Confirmations(InNotebook):
         return cls(name, np.asarray(numbers), known, verdicts, {}, missing.copy(), texts)
 
     def put(self, rows: Int[np.ndarray, " some"], part: "Confirmations") -> None:
-        """Take over, in place, what replays of some of these rows have shown."""
+        """Store the results of replays of some of these rows, in place."""
         self.verdict[rows], self.band[rows], self.why[rows] = part.verdict, part.band, part.why
         for name, values in part.rho.items():
             self.rho.setdefault(name, np.full(len(self), np.nan))[rows] = values
 
     def refuse(self) -> tuple[Bool[np.ndarray, " n"], Float[np.ndarray, " n"]]:
-        """Return which rows are not claimed, and the robustness that a search learns of them.
+        """Return which rows are not claimed, and the robustness that a search observes for them.
 
-        That is the greatest one of the run and its replays, and positive, so that a search does not
-        stay with what is no failure; NaN if no replay was made.
+        It is the largest value of the run and its replays, and positive, so that a search leaves
+        points that are not failures; NaN without a replay.
         """
         refused = np.isin(self.verdict, NOT_CLAIMED)
         if not self.rho:
@@ -237,7 +237,7 @@ class Confirmations(InNotebook):
 
     @cached_property
     def table(self) -> "pd.DataFrame":
-        """A row each, by row number: `verdict`, `rho` as run, `rho.CHECK`, `band`, `why`."""
+        """One line for each row number: `verdict`, `rho` in the run, `rho.CHECK`, `band`, `why`."""
         import pandas as pd
 
         return pd.DataFrame(
@@ -258,7 +258,7 @@ class Confirmations(InNotebook):
 
     @property
     def transferable(self) -> Bool[np.ndarray, " n"] | None:
-        """True for rows confirmed in each engine; None without another engine."""
+        """True for rows confirmed in all engines; None if no other engine was used."""
         return self.verdict == "confirmed" if engines_of(self.checks) else None
 
     @property
@@ -313,13 +313,13 @@ class Confirmations(InNotebook):
 
 @dataclass(frozen=True)
 class Repetitions:
-    """Counts of how a host system gave its rows again, with the same features and key.
+    """Counts of how a host system reproduced its rows with the same features and keys.
 
-    - `rows`: violating rows that were simulated again.
-    - `moved`: those with another robustness, beyond rounding, or none.
-    - `rounded`: those whose last digits alone differ.
-    - `lost`: those that did not fail again.
-    - `max_difference`: how far a robustness moved.
+    - `rows`: number of violating rows simulated again.
+    - `moved`: rows whose robustness changed by more than rounding, or is missing.
+    - `rounded`: rows in which only the last digits differ.
+    - `lost`: rows that did not fail again.
+    - `max_difference`: the largest change of a robustness.
     """
 
     rows: int = 0
@@ -332,7 +332,7 @@ class Repetitions:
     def count(
         cls, rho: Float[np.ndarray, " n"], again: Float[np.ndarray, " n"], verdict: np.ndarray
     ) -> "Repetitions":
-        """Count over violating rows: robustness in the run and in the repetition, and verdicts."""
+        """Count over violating rows: robustness in the run and repetition, and verdicts."""
         rho, again = np.asarray(rho, np.float64), np.asarray(again, np.float64)
         known = ~np.isnan(again)
         lost = (verdict == "fragile") & ~(again < 0)
@@ -347,7 +347,7 @@ class Repetitions:
         )
 
     def joined(self, other: "Repetitions") -> "Repetitions":
-        """Return the counts over the rows of both."""
+        """Return the sums of both counts."""
         return Repetitions(
             self.rows + other.rows,
             self.moved + other.moved,
@@ -376,7 +376,7 @@ class Repetitions:
 def came_otherwise(
     rho: Float[np.ndarray, " n"], again: Float[np.ndarray, " n"]
 ) -> Bool[np.ndarray, " n"]:
-    """Return which robustnesses differ by more than rounding explains; not those without one."""
+    """Return which robustnesses differ by more than rounding explains; NaN does not count."""
     rho, again = np.asarray(rho, np.float64), np.asarray(again, np.float64)
     with np.errstate(invalid="ignore"):
         scale = np.maximum(np.abs(rho), np.abs(again))

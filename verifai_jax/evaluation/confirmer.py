@@ -84,27 +84,26 @@ Check: TypeAlias = tuple[Replays | HostReplays, int]
 
 
 class Confirmer:
-    """Checks rows of a run's table; what it compiles is kept with the problem.
+    """Checks rows of a run's table; compiled programs are cached with the problem.
 
     **Arguments:**
-    - `problem`: on the backend that it ran on.
+    - `problem`: the problem on the backend on which it ran.
     - `precision`: the precision of the run.
-    - `seed`: the seed of the run; a simulation gets the random key that it had.
-    - `engines`: that have to agree, as `engines_for` reads them.
-    - `max_rows`: how many rows are examined whatever comes; by default 256, and more where a row
-      takes few replays: 2048 where the step stays. Of more, those nearest to zero are, and
-      further ones until the rest is ten times farther from zero than any replay has moved a row;
-      these stay `unexamined`. Only where rows have a column `rho`. A row that is worse than all
-      examined before is examined whatever else was.
-    - `executor`, `target`: whose workers simulate a host system again, and how they find the
-      problem; this process when left out.
+    - `seed`: the seed of the run; each simulation gets its original random key.
+    - `engines`: engines that have to agree, as in `engines_for`.
+    - `max_rows`: maximum number of rows examined; by default 256, or 2048 if the step is not
+      refined, so that a row takes few replays. If there are more rows with a column `rho`, those
+      nearest to zero are examined, and further ones until the rest is ten times farther from zero
+      than any replay has moved a row; the rest stays `unexamined`. A row that is worse than all
+      examined before is always examined.
+    - `executor`, `target`: an executor whose workers simulate a host system again, and the name
+      with which they find the problem; this process when left out.
 
-    Once rows were examined, `check_names` names the checks that a confirmed row has passed, and
-    `raised` has a note on the first replay that raised, if any did. `wavers` is whether a row gave
-    another robustness when a host system simulated it again, and `flips` whether one did not fail
-    again.
+    After rows were examined, `check_names` names the checks that a confirmed row has passed, and
+    `raised` is a note on the first replay that raised, if any. `wavers` is true if a host system
+    gave a row another robustness when it simulated it again, `flips` if a row did not fail again.
 
-    **Raises:** what `Problem.check` does, for a simulator that does not fit.
+    **Raises:** the errors of `Problem.check` for a simulator that does not fit.
     """
 
     def __init__(
@@ -136,9 +135,9 @@ class Confirmer:
         self._planned = False
 
     def prepare(self) -> None:
-        """Trace what replays a row before there is one, while something else compiles.
+        """Trace the replay programs in advance, while something else compiles.
 
-        An error in it is reported once there are rows.
+        An error in tracing is reported when there are rows.
         """
         if self.problem.black_box or self.others:
             return
@@ -192,12 +191,12 @@ class Confirmer:
     def check_round(
         self, columns: Mapping[str, np.ndarray], first: int
     ) -> tuple[Int[np.ndarray, " violating"], Confirmations]:
-        """Check the violating ones of a run's new rows, as many as `limit` says.
+        """Check the violating rows among a run's new rows, at most `limit` of them.
 
         **Arguments:**
-        - `columns`: the columns of all new rows, as the table will have them.
-        - `first`: number of the first one in the run.
-        **Returns:** which of the new rows violate the property, and what came of these.
+        - `columns`: the columns of all new rows, as in the table.
+        - `first`: number of the first new row in the run.
+        **Returns:** which of the new rows violate the property, and their verdicts.
         """
         violating = np.flatnonzero(columns["violated"])
         taken = {name: column[violating] for name, column in columns.items()}
@@ -211,10 +210,11 @@ class Confirmer:
         return sum(each.compile_seconds for each in replays.values())
 
     def limit(self, simulations: int) -> int:
-        """Return how many rows a falsification of so many simulations examines at most.
+        """Return the maximum number of rows to examine in a falsification of this many simulations.
 
-        To simulate a black box again takes as long as to simulate it: 4 % of the simulations, or 32
-        of them, unless a row did not come again, or the simulator has finer steps of its own.
+        Simulating a black box again takes as long as the first time. So the limit is 4 % of the
+        simulations, or 32, unless a row was not reproduced, or the simulator has finer steps of its
+        own.
         """
         if self.problem.black_box and not self.wavers:
             self._plan()
@@ -223,19 +223,19 @@ class Confirmer:
         return max(LIMIT, simulations // SHARE)
 
     def far(self, rho: float) -> bool:
-        """Return whether a robustness is so far from zero that no replay will have another sign.
+        """Return whether a robustness is so far from zero that no replay would change its sign.
 
-        That is ten times as far as any replay has moved a row so far.
+        It is if it is ten times larger than any change by a replay so far.
         """
         return bool(abs(rho) > SAFE * self.band)
 
     def checkpoint(self) -> dict[str, np.ndarray]:
-        """Return what decides which rows are examined next, as an entry of a checkpoint."""
+        """Return the state that decides which rows are examined next, for a checkpoint."""
         numbers = [self.examined, self.band, self.worst, self.wavers, self.flips]
         return {CHECKPOINT: np.array(numbers, np.float64)}
 
     def restore(self, checkpoint: Mapping[str, Any]) -> None:
-        """Go on from a checkpoint."""
+        """Continue from a checkpoint."""
         if CHECKPOINT in checkpoint:
             examined, band, worst, wavers, flips = checkpoint[CHECKPOINT]
             self.examined, self.band, self.worst = int(examined), float(band), float(worst)

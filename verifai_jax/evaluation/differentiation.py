@@ -25,9 +25,9 @@ SWEEPS = 8
 
 @dataclass(frozen=True)
 class Derivative:
-    """The gradient of an objective over `dim` coordinates; `reverse` names the mode.
+    """The derivative of an objective with respect to `dim` coordinates; `reverse` names the mode.
 
-    - `forward_up_to`: coordinates up to which forward sweeps are the quicker way.
+    - `forward_up_to`: number of coordinates up to which forward sweeps are faster.
     """
 
     dim: int
@@ -36,15 +36,15 @@ class Derivative:
 
     @property
     def reverse(self) -> bool:
-        """True where one reverse sweep is taken."""
+        """True if one reverse sweep is used."""
         return self.mode == "reverse" or (self.mode is None and self.dim > self.forward_up_to)
 
     def by(self, mode: str) -> "Derivative":
-        """Return the same by `"forward"` sweeps or one `"reverse"` sweep in any dimension."""
+        """Return the same derivative by `"forward"` sweeps or one `"reverse"` sweep."""
         return replace(self, mode=mode)
 
     def describe(self) -> str:
-        """Say what forward mode costs, for people."""
+        """Describe the cost of forward mode."""
         return (
             f"gradient by {self.dim} forward sweeps for each simulation, because reverse mode does "
             "not work through a loop of this system"
@@ -61,7 +61,7 @@ class Derivative:
     def of_several(
         self, objective: Callable[..., tuple[Float[Array, " k"], Any]], u: Float[Array, " d"]
     ) -> tuple[Float[Array, "k d"], Any]:
-        """Differentiate an objective of several values: a reverse sweep for each, or as above."""
+        """Differentiate an objective of several values: a reverse sweep each, or forward sweeps."""
         if self.reverse:
             values, sweep, auxiliary = jax.vjp(objective, u, has_aux=True)
             if len(values) == 1:
@@ -74,7 +74,7 @@ class Derivative:
 
 
 def reverse_refused(error: Exception) -> bool:
-    """Return whether this is JAX's refusal to differentiate a loop of unknown length in reverse."""
+    """Return whether JAX refuses to differentiate a loop of unknown length in reverse."""
     return "Reverse-mode differentiation does not work" in str(error)
 
 

@@ -52,22 +52,22 @@ class Engine:
 
     **Arguments:**
     - `problem`: a checked `Problem`.
-    - `batch`: rows of a call at most; fewer are padded.
+    - `batch`: maximum number of rows in a call; fewer rows are padded.
     - `gradient`: whether `evaluate` also differentiates the smooth robustness.
-    - `devices`: JAX devices to split the batch over; all of this process when left out.
-    - `precision`: `"float32"` or `"float64"`, of simulation, monitor and gradient.
-    - `clauses`: whether it evaluates, and differentiates, clause by clause instead.
-    - `inputs`: how rows become features and a system; points of the unit cube when left out.
-    - `own_keys`: whether each row is given the random key of its simulation, instead of one key of
-      the run and the number of the first row.
-    - `alone`: whether the engine takes one row at a time, which compiles without `jax.vmap` and so
-      takes less time; with `own_keys` only.
-    - `lanes`: rows that a device works on together; as the system says when left out.
-    - `effort`: how much XLA does to make its programs fast; when left out as the system says, and
-      for derivatives, which are of few rows, at most a little.
-    - `guidance`: what it computes for a search in addition to the robustness.
+    - `devices`: JAX devices over which the batch is split; all of this process when left out.
+    - `precision`: the precision of simulation, monitor and gradient, `"float32"` or `"float64"`.
+    - `clauses`: whether it evaluates and differentiates each clause instead.
+    - `inputs`: how rows become features and a system; by default they are points of the unit cube.
+    - `own_keys`: whether each row has its own random key, instead of one derived from the run's key
+      and the row number.
+    - `alone`: whether the engine takes one row at a time, without `jax.vmap`, which compiles
+      faster; only with `own_keys`.
+    - `lanes`: number of rows that a device processes together; by default that of the system.
+    - `effort`: how strongly XLA optimises its programs. By default that of the system; for
+      derivatives, which have few rows, at most a little.
+    - `guidance`: additional results for a search.
 
-    `program` is that of one row.
+    `program` is the program of one row.
     """
 
     def __init__(
@@ -102,14 +102,14 @@ class Engine:
         self._executables: dict[Mode, jax.stages.Compiled] = {}
 
     def begin_compiling(self) -> None:
-        """Trace now and compile in the background."""
+        """Trace now, and compile in the background."""
         with in_precision(self.precision):
             self._begin("evaluate")
 
     def begin_if_recalled(self) -> None:
-        """Begin to compile derivatives if an earlier process had the same: they only have to load.
+        """Start compiling derivatives if an earlier process stored them: loading them is quick.
 
-        Simulation and monitor are traced to know.
+        Simulation and monitor are traced to find out.
         """
         with in_precision(self.precision):
             started = time.perf_counter()
@@ -120,7 +120,7 @@ class Engine:
                 self._begin("evaluate")
 
     def compile(self) -> None:
-        """Compile now, so that `evaluate` only runs; the time is in `compile_seconds`."""
+        """Compile now, so that `evaluate` only runs; `compile_seconds` counts the time."""
         with in_precision(self.precision):
             self._executable("evaluate")
 
@@ -135,13 +135,13 @@ class Engine:
         """Simulate `n <= batch` rows and decide which violate the property.
 
         **Arguments:**
-        - `rows`: `[n, ...]`, points of the unit cube or whatever the engine's inputs are.
+        - `rows`: `[n, ...]`, points of the unit cube, or the rows of the engine's inputs.
         - `key`: the run's key; row `first + i` is simulated with `simulation_key(key, first + i)`.
-          With `own_keys` the keys `[n]` of the simulations.
+          With `own_keys` the simulations' keys `[n]`.
         - `first`: number of the first row.
         - `temperature`: the temperature of the smooth robustness that is differentiated, one for
-          all rows or one each; unused without gradient. Clause by clause it has no unit.
-        - `shared`: what all rows share, for inputs that have such.
+          all rows or one for each; unused without a gradient. For clauses it is dimensionless.
+        - `shared`: values shared by all rows, for inputs that have some.
         """
         rho, status, features, more = self._run("evaluate", rows, key, first, temperature, shared)
         if "traces" in more:
@@ -163,7 +163,7 @@ class Engine:
         return self._run("holds", rows, key, first, 1.0, shared)
 
     def with_batch(self, batch: int) -> "Engine":
-        """Return an engine of other batches, which has traced what this one has."""
+        """Return an engine with another batch size that reuses what was traced here."""
         other = Engine(
             self.problem, batch, self.gradient, self.layout.devices, self.precision,
             self.program.goals is not None, self.inputs, self.own_keys, self.alone,
@@ -174,12 +174,12 @@ class Engine:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """Decisions that a user may not expect, once the program is compiled."""
+        """Decisions that may surprise a user, once the program is compiled."""
         return self.program.notes
 
     @property
     def padded(self) -> int:
-        """Rows of the program of a batch."""
+        """Number of rows of the program for a batch."""
         return self.layout.padded
 
     def _run(
@@ -308,7 +308,7 @@ def _one_key(keys: Key[Array, "*lanes"]) -> Key[Array, ""]:
 
 
 class EngineMode(NamedTuple):
-    """The options of one problem's engine; see `Engine`, and `CubePoints` for `given`."""
+    """The options of a problem's engine; see `Engine`, and `CubePoints` for `given`."""
 
     batch: int
     gradient: bool
@@ -331,7 +331,7 @@ def engine_for(
     guidance: Guidance = NOTHING,
     given: bool = False,
 ) -> Engine:
-    """Return the engine of this (problem, batch, mode), made once and kept with the problem."""
+    """Return the engine for this (problem, batch, mode), made once and cached with the problem."""
     mode = EngineMode(batch, gradient, precision, clauses, guidance, given)
     return problem.programs.get(
         ENGINES,

@@ -33,8 +33,8 @@ if TYPE_CHECKING:
     from verifai_jax.evaluation.native_engine import NativeEngine
     from verifai_jax.evaluation.unfinished import Part
 NOT_NATIVE = (
-    "simulated without native code, which is made of systems that JAX traces, in single precision "
-    "and in this process"
+    "simulated without native code, which supports only systems that JAX traces, in single "
+    "precision and in this process"
 )
 """Note of a run for which native code was asked for in vain."""
 
@@ -43,23 +43,23 @@ class Evaluator:
     """Simulates and evaluates points of a problem's unit cube; `simulations` counts them.
 
     **Arguments:**
-    - `problem`: a checked one, on the backend it is to run on.
-    - `batch`: simulations at once; a call with fewer points is padded.
-    - `gradient`: whether the smooth robustness is differentiated too.
-    - `clauses`: whether clauses are evaluated, and differentiated, instead.
+    - `problem`: a checked problem, on the backend on which it should run.
+    - `batch`: maximum number of simulations at once; fewer points are padded.
+    - `gradient`: whether to differentiate the smooth robustness as well.
+    - `clauses`: whether to evaluate and differentiate clauses instead.
     - `precision`: `"float32"` or `"float64"`.
     - `seed`: the seed of the random keys of simulations; as in `falsify`.
-    - `journal`: the journal of rows in flight, for a problem on the host.
-    - `executor`: with `concurrent.futures`' `submit`, whose workers simulate; this process when
-      left out.
-    - `guidance`: what is computed for a search in addition to the robustness.
-    - `target`: name `FILE.py:NAME` of the problem, for an executor that cannot send it.
-    - `keep_traces`: whether verdicts come with traces, in this process; or names of signals that
-      they are to have in addition to those of the formulas.
-    - `given`: whether rows of features that somebody gave (`given_rows`) may be among the points.
-    - `engine`: `"native"`, or `"auto"` where it decides by `budget`, the simulations of the run,
-      whether rows are simulated by native code; see `evaluation.native_engine`.
-    - `ends_raising`: whether a call raises `AlwaysRaises` where all of the first simulations raise.
+    - `journal`: the journal of rows in progress, for a problem on the host.
+    - `executor`: an executor with the `submit` of `concurrent.futures`, whose workers simulate;
+      this process when left out.
+    - `guidance`: additional results for a search.
+    - `target`: the name `FILE.py:NAME` of the problem, for an executor that cannot pickle it.
+    - `keep_traces`: whether verdicts include traces, in this process; or names of signals that
+      these should have in addition to the monitored ones.
+    - `given`: whether points may include rows of user-given features (`given_rows`).
+    - `engine`: `"native"` to simulate rows with native code, or `"auto"` to decide by `budget`, the
+      number of simulations of the run; see `evaluation.native_engine`.
+    - `ends_raising`: whether a call raises `AlwaysRaises` if all of the first simulations raise.
     """
 
     def __init__(
@@ -134,22 +134,22 @@ class Evaluator:
 
     @property
     def simulated_by(self) -> Literal["auto", "xla", "native", "host"]:
-        """The engine of the rows, `"auto"` before it is decided; `"host"` for black boxes."""
+        """The engine that simulates rows, `"auto"` until decided; `"host"` for black boxes."""
         if self._native is not None:
             return self._native.chosen
         return "host" if self.problem.black_box else "xla"
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """Decisions of the engine that a user may not expect."""
+        """Decisions of the engine that may surprise a user."""
         return (*self.engine.notes, *self._not_native)
 
     def begin_compiling(self) -> None:
-        """Trace now and compile in the background."""
+        """Trace now, and compile in the background."""
         self.engine.begin_compiling()
 
     def begin_if_recalled(self) -> None:
-        """Begin to compile derivatives now where they need not be traced; see `Engine`."""
+        """Start compiling derivatives if they need not be traced; see `Engine`."""
         if isinstance(self.engine, Engine):
             self.engine.begin_if_recalled()
 
@@ -230,7 +230,7 @@ class Evaluator:
         )
 
     def part(self) -> "Part | None":
-        """Return what is kept of work that goes on where an earlier process was killed, if any."""
+        """Return the stored part of unfinished work for this evaluator, if there is any."""
         if self._keeps_traces:
             return None
         self._kept = present_part(self._kept, self.problem, *self._mode)
@@ -242,7 +242,7 @@ class Evaluator:
         temperature: Float[np.ndarray, " n"] | float = 1.0,
         first: int | None = None,
     ) -> "Sent":
-        """Send points to the workers; `result` of what it returns is what a call returns.
+        """Send points to the workers; `result` of the returned object gives the verdicts.
 
         **Raises:** `TypeError` for an evaluator without an executor.
         """
@@ -251,7 +251,7 @@ class Evaluator:
         return Sent(self, u, temperature, start)
 
     def submit(self, u: Float[Any, "n d"], first: int) -> "Pending":
-        """Send points to the workers of the executor; `result` of what it returns waits for them.
+        """Send points to the executor's workers; `result` of the returned object waits for them.
 
         **Raises:** `TypeError` for an evaluator without an executor.
         """
@@ -265,7 +265,7 @@ class Evaluator:
         return self._sender.submit(u, self.key, first, temperature)
 
     def rows_of(self, u: Float[Any, "n d"]) -> Float[Any, "n row"]:
-        """Return points as rows of the engine, which takes others where features may be given."""
+        """Return points as rows of the engine, which are longer if features may be given."""
         if self.given and u.shape[1] == self.problem.space.dim:
             u = np.pad(u, ((0, 0), (0, self.problem.space.width)), constant_values=np.nan)
         return u if u.dtype == self._dtype else np.asarray(u, self._dtype)
@@ -284,7 +284,7 @@ class Evaluator:
 
 
 class Sent:
-    """Points on their way to workers, unless their verdicts are kept; see `Evaluator.begin`."""
+    """Points sent to workers, unless their verdicts are already stored; see `Evaluator.begin`."""
 
     def __init__(
         self,
@@ -301,7 +301,7 @@ class Sent:
             self._pending = evaluator._send(u, first, temperature)
 
     def result(self) -> Verdicts:
-        """Wait for the verdicts, and count them; once."""
+        """Wait for the verdicts, and count them; call it once."""
         if self._pending is None:
             assert self._known is not None
             verdicts = self._known
@@ -312,6 +312,6 @@ class Sent:
         return verdicts
 
     def cancel(self) -> None:
-        """Take what has not begun out of the queue of the workers."""
+        """Remove points that have not started from the workers' queue."""
         if self._pending is not None:
             self._pending.cancel()

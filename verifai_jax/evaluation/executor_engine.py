@@ -50,18 +50,18 @@ SHIPMENTS: Slot[tuple[str, str | None], Any] = Slot("shipments")
 
 
 class ExecutorEngine:
-    """Evaluates any number of rows on the workers of an executor; see the module's docstring.
+    """Evaluates any number of rows on an executor's workers; see the module's docstring.
 
     **Arguments:**
-    - `problem`: a checked one, on the backend it is to run on.
-    - `batch`: rows of a batch on one machine, which says how many lanes go together.
-    - `executor`: with `submit`.
-    - `gradient`, `clauses`, `precision`, `guidance`: as of `engine.Engine`.
-    - `given`: whether points are rows of given features, as of `CubePoints`.
-    - `journal`: the journal of rows in flight, for a problem on the host.
-    - `target`: name `FILE.py:NAME` of the problem, for an executor that cannot send it.
-    **Raises:** `TypeError` for anything that is not an executor; `ValueError` for one that cannot
-    work here, or that cannot send the problem.
+    - `problem`: a checked problem, on the backend on which it should run.
+    - `batch`: number of rows of a batch on one machine, for the number of parallel lanes.
+    - `executor`: an executor with `submit`.
+    - `gradient`, `clauses`, `precision`, `guidance`: as in `engine.Engine`.
+    - `given`: whether points are rows of given features, as in `CubePoints`.
+    - `journal`: the journal of rows in progress, for a problem on the host.
+    - `target`: the name `FILE.py:NAME` of the problem, for an executor that cannot pickle it.
+    **Raises:** `TypeError` for anything that is not an executor; `ValueError` for an executor that
+    cannot work here, or to which the problem cannot be sent.
     """
 
     def __init__(
@@ -108,13 +108,13 @@ class ExecutorEngine:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """Decisions of the workers' engines that a user may not expect, and other processors."""
+        """Decisions of the workers' engines that may surprise a user, and other processors."""
         dropped = f"{self._dropped} answers of workers belonged to other calls and were dropped"
         return (*self._notes, *self._remarks.texts, *([dropped] if self._dropped else []))
 
     @property
     def block(self) -> int:
-        """Rows of a block that takes about `seconds_per_block`."""
+        """Number of rows in a block that takes about `seconds_per_block`."""
         if self._seconds is None:
             return self.unit * (1 if self.problem.black_box else AT_FIRST)
         wanted = executors.seconds_per_block(self.executor)
@@ -123,14 +123,14 @@ class ExecutorEngine:
 
     @property
     def ahead(self) -> int:
-        """Rows on their way that keep all workers busy."""
+        """Number of rows to send ahead so that all workers stay busy."""
         return min(MAX_AHEAD, IN_FLIGHT * executors.count_workers(self.executor) * self.block)
 
     def begin_compiling(self) -> None:
-        """Do nothing: the workers compile, with their first block."""
+        """Do nothing, because workers compile with their first block."""
 
     def compile(self) -> None:
-        """Do nothing, as `begin_compiling`."""
+        """Do nothing, because workers compile with their first block."""
 
     def evaluate(
         self,
@@ -139,7 +139,7 @@ class ExecutorEngine:
         first: int = 0,
         temperature: Float[np.ndarray, " n"] | Float[Array, ""] | float = 1.0,
     ) -> Verdicts:
-        """Simulate and evaluate rows on the workers; arguments as of `engine.Engine.evaluate`."""
+        """Simulate and evaluate rows on the workers; arguments as in `engine.Engine.evaluate`."""
         return self.submit(rows, key, first, temperature).result()
 
     def submit(
@@ -149,16 +149,16 @@ class ExecutorEngine:
         first: int = 0,
         temperature: Float[np.ndarray, " n"] | Float[Array, ""] | float = 1.0,
     ) -> "Pending":
-        """Send rows to the workers, and return what waits for their verdicts."""
+        """Send rows to the workers, and return an object that waits for their verdicts."""
         u = np.ascontiguousarray(rows, self._dtype)
         pending = Pending(self, u, key, first, np.asarray(temperature, np.float32))
         pending.send()
         return pending
 
     def send(self, *arguments: Any) -> executors.Future:
-        """Send one block to a worker: words of the key, first number, points, temperatures.
+        """Send a block to a worker: words of the key, first number, points, temperatures.
 
-        **Raises:** `ValueError` where it cannot be sent.
+        **Raises:** `ValueError` if it cannot be sent.
         """
         try:
             return self.executor.submit(evaluate_block, self._shipment, self.mode, *arguments)
@@ -170,9 +170,9 @@ class ExecutorEngine:
     def is_answer(
         self, result: dict[str, Any], words: UInt32[np.ndarray, "2"], first: int, u: Any
     ) -> bool:
-        """Return whether a result is that of this call; count one that is not.
+        """Return whether a result belongs to this call; count results that do not.
 
-        **Raises:** `WorkerError` where too many are not.
+        **Raises:** `WorkerError` if there are too many of those.
         """
         question = question_of(self._shipment, words, first, u)
         if result.get("question", question) == question:
@@ -180,20 +180,19 @@ class ExecutorEngine:
         self._dropped += 1
         if self._dropped > MAX_DROPPED:
             raise executors.WorkerError(
-                f"{self._dropped} answers of the executor belonged to other calls than the one "
-                "whose future they came by; what was finished before is kept: resume with another "
-                "executor"
+                f"{self._dropped} answers of the executor belonged to other calls than their "
+                "futures; finished work is kept: resume with another executor"
             )
         return False
 
     def step(self, count: int) -> int:
-        """Return the rows of the next block of so many: all workers have one, for not too long."""
+        """Return the number of rows in the next block: enough for all workers, but not too long."""
         share = -(-count // executors.count_workers(self.executor))
         rows = min(self.block, max(share, self.block // 8))
         return -(-rows // self.unit) * self.unit
 
     def runs(self, u: Float[np.ndarray, "n d"], first: int) -> list[tuple[int, int, bool]]:
-        """Cut rows into those that the journal knows already and others, in their order."""
+        """Split rows into those already in the journal and others, in their order."""
         known = set() if self._journal is None else set(self._journal.recall(first, u))
         if not known:
             return [(0, len(u), False)] if len(u) else []
@@ -202,7 +201,7 @@ class ExecutorEngine:
         return [(a, b, bool(flags[a])) for a, b in pairwise(ends)]
 
     def recall(self, u: Float[np.ndarray, "n d"], key: Key[Array, ""], first: int) -> Verdicts:
-        """Return the verdicts of rows that the journal knows."""
+        """Return the verdicts of rows in the journal."""
         if self._recalling is None:
             self._recalling = HostEngine(
                 self.problem,
@@ -214,7 +213,7 @@ class ExecutorEngine:
         return self._recalling.evaluate(u, key, first, padded_to=self.mode.padded_to)
 
     def receive(self, result: dict[str, Any], u: Float[np.ndarray, "n d"], first: int) -> Verdicts:
-        """Return the verdicts of one block, and remember what it tells of its worker."""
+        """Return the verdicts of one block, and record the information on its worker."""
         verdicts = Verdicts(
             **{name: result[name] for name in ARRAYS if name in result},
             features=jax.tree.unflatten(self._features, result["leaves"]),
@@ -245,16 +244,16 @@ class ExecutorEngine:
 
 
 class Pending:
-    """Rows on their way; `result` waits for them, once.
+    """Rows sent to workers; call `result` once to wait for them.
 
-    A few blocks for each worker are on their way at a time, so that the size of later ones follows
-    from how long the first have taken.
+    Only a few blocks for each worker are sent at a time, so that the size of later ones can follow
+    from the time of the first.
 
     **Arguments:**
-    - `engine`: that sends them.
-    - `u`: their points.
-    - `key`, `first`: as of `ExecutorEngine.submit`.
-    - `temperature`: one for all rows, or one each.
+    - `engine`: the engine that sends them.
+    - `u`: the points of the rows.
+    - `key`, `first`: as in `ExecutorEngine.submit`.
+    - `temperature`: one temperature for all rows, or one for each.
     """
 
     def __init__(
@@ -275,7 +274,7 @@ class Pending:
         self._verdicts: Verdicts | None = None
 
     def send(self) -> list[executors.Future]:
-        """Send blocks until each worker has a few, and return those that are new."""
+        """Send blocks until each worker has a few, and return the new ones."""
         maximum = self._ended + IN_FLIGHT * executors.count_workers(self._engine.executor)
         already = len(self._sent)
         while self._unsent and len(self._sent) < maximum:
@@ -293,8 +292,8 @@ class Pending:
     def result(self) -> Verdicts:
         """Return the verdicts in the order of the rows.
 
-        **Raises:** `WorkerError` where a worker died and its block was not run again; what an
-        evaluation raised otherwise. What is queued is then cancelled.
+        **Raises:** `WorkerError` if a worker died and its block was not run again; otherwise the
+        error of an evaluation. Queued blocks are then cancelled.
         """
         if self._verdicts is None:
             found: dict[int, Verdicts] = {}
@@ -316,14 +315,14 @@ class Pending:
         return self._verdicts
 
     def cancel(self) -> None:
-        """Take what has not begun out of the queue."""
+        """Remove blocks that have not started from the queue."""
         self._unsent.clear()
         for _, _, future in self._sent:
             future.cancel()
 
 
 def identity(problem: Problem) -> dict[str, str]:
-    """Return the texts that tell a problem from another one: name, formulas and features."""
+    """Return texts that identify a problem: name, formulas and features."""
     return {
         "name": problem.name,
         "formulas": str({name: str(formula) for name, formula in problem.formulas.items()}),

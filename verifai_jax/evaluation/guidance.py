@@ -21,12 +21,12 @@ from verifai_jax.problem.problem import Problem
 
 
 class Guidance(NamedTuple):
-    """The parts of it that are wanted.
+    """The additional results that a search wants.
 
-    - `guide`: the value of the guide's term.
-    - `outcome`: what happened, as in `core.values.clauses`.
-    - `trace`: the monitored signals, of a system that JAX traces.
-    - `signals`: others that the trace is to have.
+    - `guide`: whether the value of the guide's term is wanted.
+    - `outcome`: whether a description of what happened is wanted, as in `core.values.clauses`.
+    - `trace`: whether the monitored signals are wanted, for a system that JAX traces.
+    - `signals`: further signals of the trace.
     """
 
     guide: bool = False
@@ -36,13 +36,13 @@ class Guidance(NamedTuple):
 
     @property
     def size(self) -> int:
-        """Numbers of a simulation, without its trace; 0 where none are wanted."""
+        """Number of results of a simulation, without its trace; 0 if none are wanted."""
         return int(self.guide) + OUTCOME * int(self.outcome)
 
     def all(
         self, problem: Problem, trace: Trace, features: Mapping[str, PyTree]
     ) -> dict[str, PyTree]:
-        """Return whatever is wanted of one simulation, as `Verdicts` names it; traced by JAX."""
+        """Return all wanted results of one simulation, named as in `Verdicts`; traced by JAX."""
         wanted: dict[str, PyTree] = {}
         if self.size:
             wanted["guidance"] = self.values(problem, trace, features)
@@ -56,7 +56,7 @@ class Guidance(NamedTuple):
     def values(
         self, problem: Problem, trace: Trace, features: Mapping[str, PyTree]
     ) -> Float[Array, " size"]:
-        """Return the numbers of one simulation, the guide's first; traced by JAX."""
+        """Return the numbers of one simulation, the guide's value first; traced by JAX."""
         trace = trace.hold()
         parts = []
         if self.guide and problem.guide is not None:
@@ -71,7 +71,7 @@ NOTHING = Guidance()
 
 
 def outcome_of(problem: Problem, trace: Trace) -> Float[Array, " outcome"]:
-    """Return the outcome of one simulation; see `core.values.clauses`. It is not differentiated."""
+    """Return the outcome of one simulation, not differentiated; see `core.values.clauses`."""
     signals = {name: jax.lax.stop_gradient(as_array(trace.signals[name])) for name in trace.signals}
     formulas = tuple(problem.formulas.values())
     predicate, sample = deciding_instant(formulas, trace, problem.end)

@@ -48,16 +48,15 @@ class HostEngine:
 
     **Arguments:**
     - `problem`: a checked `Problem`.
-    - `precision`: `"float32"` or `"float64"`, of features and monitor.
-    - `journal`: where rows are kept as soon as they have a verdict, until their batch is finished.
-    - `system`: simulated instead of the problem's own, such as one with a finer step.
-    - `monitor`: one that is compiled already for the same formulas.
-    - `guidance`: what is computed for a search in addition to the robustness; that of the monitor
-      if one is given.
-    - `keep_traces`: whether verdicts come with the traces, on the clock of the monitor.
-    - `given`: whether points are rows of given features, as of `CubePoints`.
+    - `precision`: the precision of features and monitor, `"float32"` or `"float64"`.
+    - `journal`: a journal that stores rows with a verdict until their batch is finished.
+    - `system`: a system that replaces the problem's own, such as one with a finer step.
+    - `monitor`: a compiled monitor of the same formulas.
+    - `guidance`: additional results for a search; by default those of the given monitor.
+    - `keep_traces`: whether verdicts include the traces, with the monitor's sampling period.
+    - `given`: whether points are rows of given features, as in `CubePoints`.
 
-    `simulation_seconds` is what the last simulations took, with the verdicts between them.
+    `simulation_seconds` is the time of the last simulations, including their verdicts.
     """
 
     def __init__(
@@ -91,10 +90,10 @@ class HostEngine:
         return self.remarks.texts
 
     def begin_compiling(self) -> None:
-        """Do nothing, as `compile`."""
+        """Do nothing; see `compile`."""
 
     def compile(self) -> None:
-        """Do nothing: monitors compile when the first trace shows its length."""
+        """Do nothing, because monitors compile when the first trace shows its length."""
 
     def evaluate(
         self,
@@ -109,11 +108,11 @@ class HostEngine:
     ) -> Verdicts:
         """Simulate `n` points of the unit cube and decide which violate the property.
 
-        **Arguments:** as of `engine.Engine.evaluate`; nothing is differentiated.
-        - `padded_to`: a power of two; features are computed of so many rows together at least, so
-          that few rows get theirs from the program that many would.
-        - `keep_traces`: as of the engine, for this call.
-        - `journals`: whether rows go to the journal, and come from it.
+        **Arguments:** those of `engine.Engine.evaluate`; nothing is differentiated.
+        - `padded_to`: a power of two, the minimum number of rows whose features are computed
+          together, so that few rows get the same bits as in a large batch.
+        - `keep_traces`: as for the engine, but for this call.
+        - `journals`: whether rows are written to the journal, and read from it.
         """
         with in_precision(self.precision):
             u = np.asarray(rows)
@@ -127,11 +126,11 @@ class HostEngine:
     def evaluate_features(
         self, features: PyTree, seeds: Integer[np.ndarray, " n"], keys: Key[Array, " n"] | None
     ) -> Verdicts:
-        """Simulate `n` rows of features, each with the seed of its own, and decide.
+        """Simulate `n` rows of features, each with its own seed, and decide their verdicts.
 
         **Arguments:**
-        - `features`: `[n, ...]` each.
-        - `keys`: that the seeds are made of, which a system needs that simulates batches.
+        - `features`: the features, `[n, ...]` each.
+        - `keys`: the keys of the seeds; needed by a system that simulates batches.
         """
         with in_precision(self.precision):
             return self._verdicts(features, keys, seeds, None, 0, self.keep_traces)
@@ -377,12 +376,12 @@ def _form(trace: Trace) -> Any:
 
 
 def on_host_clock(trace: Trace) -> Trace:
-    """Return a host system's trace as the compiled monitors need it, checked.
+    """Return a host system's trace, checked and in the form that compiled monitors need.
 
-    Its integers are not cut to 32 bits, and evenly spaced sample times are a period.
+    Its integers are not truncated to 32 bits, and evenly spaced sample times become a period.
 
-    **Raises:** what `Trace` does for a `valid` or a status that can be none, and `period` for
-    sample times that are not evenly spaced.
+    **Raises:** the errors of `Trace` for an invalid `valid` or status, and of `period` for unevenly
+    spaced sample times.
     """
     # Made anew, a row of a batch is checked as a trace of its own.
     signals = {name: without_wrapping(signal) for name, signal in trace.signals.items()}
@@ -390,12 +389,12 @@ def on_host_clock(trace: Trace) -> Trace:
 
 
 def pad_trace(trace: Trace) -> Trace:
-    """Hold a trace to a length that is a power of two.
+    """Extend a trace to a length that is a power of two.
 
-    Holding the last sample changes no verdict, and traces of all lengths share a few compiled
-    monitors.
+    Repeating the last sample changes no verdict, and traces of all lengths then share a few
+    compiled monitors.
 
-    **Raises:** as `on_host_clock`.
+    **Raises:** the errors of `on_host_clock`.
     """
     trace = on_host_clock(trace)
     valid = trace.length if trace.valid is None else int(trace.valid)

@@ -15,7 +15,7 @@ from verifai_jax.problem.problem import Problem
 
 
 class HostMonitor:
-    """The compiled monitor of a problem for batches of traces that came from the host."""
+    """The compiled monitor of a problem for batches of traces from the host."""
 
     def __init__(self, problem: Problem, guidance: Guidance = NOTHING) -> None:
         self.guidance = guidance

@@ -23,7 +23,7 @@ JOURNAL = "inflight.rows"
 
 
 class Journal:
-    """The finished rows of the batch in flight, in `folder`; see the module's docstring."""
+    """The finished rows of the batch in progress, in `folder`; see the module's docstring."""
 
     def __init__(self, folder: Path, name: str = JOURNAL) -> None:
         self.path = folder / name
@@ -32,9 +32,9 @@ class Journal:
         self._last = max(self._known, default=-1)
 
     def add(self, row: int, point: Float[np.ndarray, " d"], verdict: RowVerdict) -> None:
-        """Keep a row; it is with the operating system when this returns.
+        """Write a row; the operating system has it when this returns.
 
-        **Raises:** `OSError` where it cannot be written.
+        **Raises:** `OSError` if it cannot be written.
         """
         entry = {
             "point": np.asarray(point, np.float32).tolist(),
@@ -50,7 +50,7 @@ class Journal:
         self._log.put_json(str(row), entry)
 
     def recall(self, first: int, points: Float[np.ndarray, "n d"]) -> dict[int, RowVerdict]:
-        """Return the known rows from `first` on, of the same points, by their index among them."""
+        """Return the known rows of these points from `first` on, by their index."""
         if not self._known:
             return {}
         found = {}
@@ -61,14 +61,14 @@ class Journal:
         return found
 
     def settle(self, rows: int) -> None:
-        """Forget the journal once the table and its checkpoint have all of its rows."""
+        """Delete the journal once the table and its checkpoint contain all of its rows."""
         if self._last < rows:
             self._known = {}
             self._log.clear()
 
 
 def count_unfinished(folder: Path, rows: int) -> int:
-    """Count the finished simulations in `folder` after the first `rows`, those of the table."""
+    """Count the finished simulations in `folder` after the first `rows`, those in the table."""
     return sum(row >= rows for row in _read(Log(folder / JOURNAL)))
 
 

@@ -10,7 +10,7 @@ from verifai_jax.problem.problem import Problem
 
 
 class KeptWork(Protocol):
-    """The part of an `evaluation.unfinished.Unfinished` that evaluators need."""
+    """The interface of `evaluation.unfinished.Unfinished` that evaluators need."""
 
     def part(self, problem: Problem, *mode: object) -> Any:
         """Return the `Part` of the next evaluator."""
@@ -21,16 +21,16 @@ PRESENT: ContextVar[KeptWork | None] = ContextVar("unfinished", default=None)
 
 
 def present() -> KeptWork | None:
-    """Return the work whose simulations are kept now, or None if there is none."""
+    """Return the work whose simulations are being stored; None if there is none."""
     return PRESENT.get()
 
 
 def present_part(kept: Any, problem: Problem, *mode: object) -> Any:
-    """Return an evaluator's `Part` of the present work; None if nothing is kept.
+    """Return an evaluator's `Part` of the present work; None if nothing is stored.
 
     **Arguments:**
-    - `kept`: its part of the work before, or None. That of the present work is returned as it is.
-    - `problem`, `mode`: as for a new `Part`.
+    - `kept`: its part of earlier work, or None. A part of the present work is returned unchanged.
+    - `problem`, `mode`: the arguments of a new `Part`.
     """
     work = present()
     if work is None or (kept is not None and kept.of is work):

@@ -38,12 +38,12 @@ among them: with vectors of 512 bits its arctangent is wrong (0.10.2)."""
 
 
 class Layout(NamedTuple):
-    """The layout of the rows of a batch.
+    """The distribution of a batch's rows over devices, chunks and lanes.
 
-    - `devices`: JAX devices, of which each has an equal share.
-    - `chunks`: parts of a share, worked through one after the other.
-    - `lanes`: rows of a chunk, worked on together.
-    - `wide`: whether XLA may take the widest vectors that the processor has.
+    - `devices`: JAX devices, each with an equal share.
+    - `chunks`: number of parts of a share, which are processed one after the other.
+    - `lanes`: number of rows in a chunk, which are processed together.
+    - `wide`: whether XLA may use the widest vectors of the processor.
     """
 
     devices: Sequence[Device]
@@ -55,7 +55,7 @@ class Layout(NamedTuple):
     def of(
         cls, problem: Problem, batch: int, devices: Sequence[Device], lanes: int | None = None
     ) -> "Layout":
-        """Return the layout of a problem's batches, with as many lanes as its system says.
+        """Return the layout of a problem's batches, with the number of lanes of its system.
 
         - `lanes`: another number of lanes.
         """
@@ -67,20 +67,20 @@ class Layout(NamedTuple):
 
     @property
     def padded(self) -> int:
-        """Rows of the program."""
+        """Number of rows of the program."""
         return self.lanes * self.chunks * len(self.devices)
 
     @property
     def fills_machine(self) -> bool:
-        """True where every core has rows of its own, so that none is free to help another."""
+        """True if every core has its own rows, so that none is free to help another."""
         return 1 < len(self.devices) == len(jax.local_devices())
 
     def for_program(self, program: Any) -> "Layout":
-        """Return the layout that suits a `Jaxpr` of one row, of as many rows.
+        """Return the layout that suits the `Jaxpr` of one row, with the same number of rows.
 
-        Where each operation is of single numbers, what a chunk has in memory at a time is small,
-        and to start an operation on it takes a fifth of the time: chunks are twice as long. Others
-        lose by that, since XLA then writes the operands of products and sums to memory.
+        If all operations are on single numbers, a chunk needs little memory and starting an
+        operation takes a fifth of the time, so chunks are twice as long. Other programs lose by
+        longer chunks, since XLA then writes the operands of products and sums to memory.
         """
         if jax.default_backend() != "cpu":
             return self
@@ -95,13 +95,13 @@ class Layout(NamedTuple):
         return layout._replace(chunks=self.chunks // 2, lanes=2 * self.lanes)
 
     def spread(self, one_row: Callable[..., Any], own_keys: bool) -> Callable[..., Any]:
-        """Spread a function of one row over chunks of lanes and over the devices.
+        """Map a function of one row over chunks of lanes and over the devices.
 
         **Arguments:**
-        - `one_row`: a function of a row, its random key, a temperature, what all rows share, and
-          the numbers that its program reads.
-        - `own_keys`: whether each row is given its random key, instead of one key of the run and
-          the number of the first row.
+        - `one_row`: a function of a row, its random key, a temperature, the shared values, and the
+          numbers that its program reads.
+        - `own_keys`: whether each row has its own random key, instead of one derived from the run's
+          key and the row number.
         """
 
         def on_device(
@@ -144,7 +144,7 @@ class Layout(NamedTuple):
 
 
 def chunks_and_lanes(problem: Problem, batch: int, devices: int) -> tuple[int, int]:
-    """Return into how many chunks a device's share of a batch is cut, and the rows of one."""
+    """Return the number of chunks of a device's share of a batch, and the rows in one."""
     per_device = -(-batch // max(1, min(devices, batch)))
     factor = 1 if jax.default_backend() == "cpu" else ACCELERATOR_FACTOR
     chunks = -(-per_device // (factor * problem.system.lanes))

@@ -38,12 +38,12 @@ formula, its reach in seconds included: three units in the last place of single 
 
 
 class NativeEngine:
-    """Evaluates batches of a problem like the engine that it is given.
+    """Evaluates batches of a problem like the given engine, with native code for later rows.
 
     **Arguments:**
-    - `engine`: the engine of XLA, in single precision, over points of the unit cube.
-    - `wanted`: `"native"`, or `"auto"` for the rule of the module's docstring.
-    - `budget`: simulations of the run.
+    - `engine`: the XLA engine, in single precision, for points of the unit cube.
+    - `wanted`: `"native"`, or `"auto"` for the rule in the module's docstring.
+    - `budget`: number of simulations of the run.
     """
 
     def __init__(self, engine: Engine, wanted: Wanted, budget: int) -> None:
@@ -55,7 +55,7 @@ class NativeEngine:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """Decisions of the engine that a user may not expect."""
+        """Decisions of the engine that may surprise a user."""
         why = (f"simulated by XLA, not natively: {self._why}",) if self._why else ()
         return (*self._begun.notes, *why)
 
@@ -66,7 +66,7 @@ class NativeEngine:
 
     @property
     def padded(self) -> int:
-        """Rows of the program of XLA."""
+        """Number of rows of the XLA program."""
         return self._begun.padded
 
     @property
@@ -83,13 +83,13 @@ class NativeEngine:
 
     @property
     def chosen(self) -> Wanted:
-        """The engine that simulates the rows from `FIRST` on, as far as it is known by now."""
+        """The engine that simulates the rows from `FIRST` on, if that is decided."""
         if "_is_worth" not in self.__dict__:
             return self._wanted
         return "native" if self._is_worth and not self._why else "xla"
 
     def begin_compiling(self) -> None:
-        """Trace now and compile in the background."""
+        """Trace now, and compile in the background."""
         self._xla.begin_compiling()
         if self._is_worth and self.engine.batch > FIRST:
             # The first round needs it; it is made of what was traced just now.

@@ -40,7 +40,7 @@ AGREES = 1e-3
 
 
 class NativeProgram:
-    """The native program of an engine, which is compiled once for the problem."""
+    """The native program of an engine, compiled once for the problem."""
 
     def __init__(self, engine: Engine) -> None:
         self.engine = engine
@@ -50,12 +50,12 @@ class NativeProgram:
 
     @cached_property
     def draws(self) -> bool:
-        """True where the system uses its random key, or may do so."""
+        """True if the system uses its random key, or may use it."""
         return self.engine.gradient or self.engine.program.draws()
 
     @cached_property
     def traced(self) -> tuple[Any, str | None]:
-        """The program of a row, its random key by its number; and its identity."""
+        """The program of a row with its random key given by number, and the program's identity."""
         function = self.engine.program.traced_row()
         *_, numbers = self.engine.program.forms
 
@@ -80,14 +80,14 @@ class NativeProgram:
             return program, self.engine.program.identity
 
     def begin(self) -> None:
-        """Begin to compile, where that has not begun."""
+        """Start compiling, unless that has started."""
         if self._future is None:
             self._future = _pool().submit(self._load)
 
     def ready(self) -> Library:
-        """Return the library, once it is compiled.
+        """Wait until the library is compiled, and return it.
 
-        **Raises:** `Unavailable` where there is none.
+        **Raises:** `Unavailable` if it cannot be made.
         """
         if self.refused:
             raise Unavailable(self.refused)
@@ -125,7 +125,7 @@ class NativeProgram:
         return Verdicts(rho, status, broken, features, **more)
 
     def compare(self, ours: Verdicts, theirs: Verdicts, slack: np.ndarray) -> None:
-        """Compare rows with those of XLA, and note whether they agree."""
+        """Compare rows with those of XLA, and store whether they agree."""
         assert self._future is not None
         name, _ = self._future.result()
         mine = ours.rho

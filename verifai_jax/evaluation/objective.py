@@ -39,7 +39,7 @@ def objective(
 ) -> Callable[..., Float[Array, ""]]:
     """Return the robustness of one simulation as a function `(point, key=key)`.
 
-    A problem whose system has several backends is taken on the one that JAX traces.
+    If the problem's system has several backends, the one that JAX traces is used.
 
     **Arguments**, **Returns**, **Raises:** those of `Problem.objective`.
     """

@@ -33,11 +33,11 @@ _VARIES = re.compile(r"[-+]?\d[\d.]*(?:e[-+]?\d+)?")
 
 
 class AlwaysRaises(RuntimeError):
-    """All simulations of some work raise, so that it ends before its budget is spent."""
+    """An error that ends work early because all of its simulations raise."""
 
 
 class Raising:
-    """The simulations of some work, as long as all of them raise."""
+    """The simulations of some work, recorded as long as all of them raise."""
 
     def __init__(self) -> None:
         self._since: float | None = None  # The first of them, so without what compiles before.
@@ -47,7 +47,7 @@ class Raising:
         self.always = True
 
     def add(self, status: Integer[np.ndarray, " n"], messages: Sequence[str] | None) -> None:
-        """Take in the statuses and the messages of simulations."""
+        """Record the statuses and messages of simulations."""
         if not self.always or not len(status):
             return
         self._since = time.monotonic() if self._since is None else self._since
@@ -58,20 +58,20 @@ class Raising:
             self._kinds.add(_VARIES.sub("0", message))
 
     def check(self, name: str) -> None:
-        """End the work on the problem of this name where all of its simulations raise.
+        """End the work on the problem of this name if all of its simulations raise.
 
         **Raises:** `AlwaysRaises`.
         """
         if (said := self.reason) is not None:
             raise AlwaysRaises(
-                f"each of the first {self._count} simulations of problem {name!r} raised"
-                f"{f' {one_line(said)}' if said else ' an error'}, so the others are not made; "
+                f"each of the first {self._count} simulations of problem {name!r} "
+                f"raised{f' {one_line(said)}' if said else ' an error'}, so no more are made; "
                 "falsify(problem, 'uniform', 20, keep_going=True).table.all shows them"
             )
 
     @property
     def reason(self) -> str | None:
-        """The message of all, empty if they have none; None if others may still succeed."""
+        """The common message, empty if there is none; None if further simulations may succeed."""
         seconds = 0.0 if self._since is None else time.monotonic() - self._since
         alike = ALWAYS if seconds < SLOW else ALIKE if seconds < LONG else FEW
         enough = self._count >= (alike if len(self._kinds) == 1 else ALWAYS)

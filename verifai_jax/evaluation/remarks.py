@@ -9,25 +9,25 @@ from verifai_jax.core.messages.text import MAX_MESSAGE_LENGTH, storable
 
 @dataclass
 class Remarks:
-    """A count of simulations; for each note, how many of them had it, and how often in all."""
+    """Counts of simulations: how many had each note, and how often it occurred in all."""
 
     simulations: int = 0
     counts: dict[str, tuple[int, int]] = field(default_factory=dict)
 
     def add(self, notes: Mapping[str, int], simulations: int = 1) -> None:
-        """Take in the notes of a simulation, or those that several have together."""
+        """Record the notes of a simulation, or the common notes of several."""
         self.simulations += simulations
         for note, times in notes.items():
             self._count(storable(note, MAX_MESSAGE_LENGTH), simulations, times)
 
     def join(self, other: Mapping[str, Any]) -> None:
-        """Take in the remarks of a worker, as `to_data` gives them."""
+        """Add the remarks of a worker, in the form of `to_data`."""
         self.simulations += other["simulations"]
         for note, (simulations, times) in other["counts"].items():
             self._count(note, simulations, times)
 
     def to_data(self) -> dict[str, Any]:
-        """Return plain values, which travel between processes."""
+        """Return plain values, which can be sent between processes."""
         return {"simulations": self.simulations, "counts": dict(self.counts)}
 
     def _count(self, note: str, simulations: int, times: int) -> None:

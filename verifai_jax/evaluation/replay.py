@@ -32,12 +32,13 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Replay(InNotebook):
-    """One simulation, looked at again.
+    """One simulation that was repeated, with its trace.
 
-    `rho` holds the robustness of each formula by name; NaN where `status` is not OK. `key` is the
-    random key of the simulation. `duration` are the seconds that it would have lasted without an
-    early end, over which Signals lie; None for a single sample. `engine` says which other engine of
-    the system simulated it, because that compiles nothing and gives the number of the row.
+    `rho` is the robustness of each formula by name; NaN unless `status` is OK. `key` is the random
+    key of the simulation. `duration` is the time in seconds that it would have lasted without an
+    early end, over which Signals extend; None for a single sample. `engine` names another engine of
+    the system if that simulated it, which happens if it needs no compilation and reproduces the
+    number of the row.
     """
 
     _internal = frozenset(("changed", "finding"))
@@ -55,12 +56,12 @@ class Replay(InNotebook):
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """Sentences that stand in the way of taking the replay for its row; often none."""
+        """Sentences on doubts that the replay shows its row; often none."""
         return tuple(text for text in (self.changed, self.finding) if text)
 
     @property
     def violated(self) -> bool:
-        """True where the simulation ended properly and breaks a formula."""
+        """True if the simulation ended properly and breaks a formula."""
         rho = np.array([list(self.rho.values())])
         status = np.array([int(self.status)])
         holds = lambda: np.asarray(boolean_semantics(self.problem, self.trace))[None]  # noqa: E731
@@ -72,7 +73,7 @@ class Replay(InNotebook):
         return min(self.rho, key=lambda name: float(np.nan_to_num(self.rho[name], nan=np.inf)))
 
     def explain(self) -> Explanation:
-        """Explain which predicate decides the worst formula, when, and through which sub-formulas.
+        """Explain the worst formula: the deciding predicate, its time and the path to it.
 
         **Raises:** `ValueError` for a simulation without a verdict.
         """
@@ -82,12 +83,12 @@ class Replay(InNotebook):
         return explain(formula, self.trace, end=self.problem.end)
 
     def columns(self) -> dict[str, Any]:
-        """Return the features as a row of a table has them, by column."""
+        """Return the features by column, as in a row of a table."""
         one = jax.tree.map(lambda leaf: np.asarray(leaf)[None], self.features)
         return {name: column[0] for name, column in self.problem.space.rows(one).items()}
 
     def describe_features(self) -> str:
-        """Write the features in one line, control points of signals by their time."""
+        """Write the features in one line; control points of signals are named by their time."""
         labels = self.problem.space.labels(self.duration)
         return format_features(self.columns(), labels)
 
@@ -115,11 +116,11 @@ class Replay(InNotebook):
         return f"{verb} the property, robustness {min(self.rho.values()):z.4g}"
 
     def plot(self, path: str | Path | None = None, signals: Sequence[str] | None = None) -> Any:
-        """Draw signals with the bounds of all formulas and the instant marked; returns the figure.
+        """Draw signals with the bounds of all formulas and the deciding instant; return a figure.
 
         **Arguments:**
-        - `path`: file that the picture is written to, if given.
-        - `signals`: the signals, and features that are Signals, to draw; chosen when left out.
+        - `path`: file to which the picture is written, if given.
+        - `signals`: signals, and features that are Signals, to draw; by default a selection.
         **Raises:** `UnknownNameError` for a signal that does not exist.
         """
         return lazy_import("verifai_jax.reports.plotting.replay", "plot_replay")(
@@ -134,16 +135,16 @@ class Replay(InNotebook):
         size: Sequence[int] | None = None,
         fps: float | None = None,
     ) -> Any:
-        """Draw the simulation as an animated GIF, which a notebook shows.
+        """Draw the simulation as an animated GIF, which notebooks display.
 
         **Arguments:**
-        - `path`: a file that is written too; none when left out.
-        - `camera`: the name of a camera of a MuJoCo model; the one that sees best what moves when
-          left out.
+        - `path`: a file to write as well; none when left out.
+        - `camera`: name of a camera of a MuJoCo model; by default the one that shows the motion
+          best.
         - `size`: width and height of a frame in pixels.
-        - `fps`: frames a second; chosen when left out.
-        **Raises:** `ValueError` for a problem without `draw` that has no MuJoCo model and is no
-        environment of Gymnasium; `UnknownNameError` for a camera that the model lacks.
+        - `fps`: frames per second; chosen automatically when left out.
+        **Raises:** `ValueError` for a problem without `draw`, without a MuJoCo model and without a
+        Gymnasium environment; `UnknownNameError` for a camera that the model lacks.
         """
         draw = lazy_import("verifai_jax.reports.plotting.animation", "animate")
         return draw(self, path, camera=camera, size=size, fps=fps)
@@ -157,7 +158,7 @@ def replay(
     number: int | None = None,
     precision: str = "float32",
 ) -> Replay:
-    """Simulate the features of `row` again with the random key that simulation `number` had.
+    """Simulate the features of `row` again with the random key of simulation `number`.
 
     **Raises:** `ValueError` for a precision other than float32 and float64.
     """

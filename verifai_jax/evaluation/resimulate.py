@@ -48,7 +48,7 @@ states six calls take 0.12 s, the two of the larger program 0.10 s, and 0.28 s t
 
 
 class Refiner:
-    """A system at its own step and at finer ones; each is made once."""
+    """A system with its own step and with finer ones, each made once."""
 
     def __init__(self, system: System) -> None:
         self.system = system
@@ -62,7 +62,7 @@ class Refiner:
         return self._made[factor]
 
     def why_not(self, factors: Iterable[int]) -> str | None:
-        """Say why the step cannot be made smaller; None if it can."""
+        """Explain why the step cannot be refined; None if it can."""
         if not self.system.can_refine:
             if self.system.exact_step:
                 return "the step belongs to the system"
@@ -79,12 +79,12 @@ class Replays:
     """Replays of a problem that JAX traces.
 
     **Arguments:**
-    - `problem`: on the backend that it ran on.
+    - `problem`: the problem on the backend on which it ran.
     - `precision`: the precision of the replays.
     - `key`: the key of the run's simulations, from `run_keys`.
 
-    `draws` is whether the system uses its random key, and `compile_seconds` what its programs took
-    to compile. One program is traced at once, and what that raises is raised here.
+    `draws` tells whether the system uses its random key, `compile_seconds` how long its programs
+    took to compile. One program is traced at once; its errors are raised here.
     """
 
     def __init__(self, problem: Problem, precision: str, key: Key[Array, ""]) -> None:
@@ -139,7 +139,7 @@ class Replays:
         return verdicts.split(len(each))
 
     def begin_compiling(self, factor: int, count: int, times: int) -> None:
-        """Compile what replays so many rows so many times, in the background."""
+        """Compile in the background the programs that replay this many rows this many times."""
         engine = self._engine(factor, self._together(count, times))
         compiled = engine.compile_seconds
         # An error in it is reported when rows are replayed.
@@ -191,17 +191,17 @@ REPLAYS: Slot[tuple[str, int, int], Engine] = Slot("replays")
 
 
 class HostReplays:
-    """Replays of a problem that runs on the host, in this process or by the workers of an executor.
+    """Replays of a problem on the host, in this process or on an executor's workers.
 
-    A simulator that is only where the workers are cannot be started here, and a run that many
-    workers share would wait for one process.
+    A simulator that exists only on the workers cannot be started here, and a run shared by many
+    workers would wait for one process.
 
     **Arguments:**
-    - `problem`, `precision`, `key`: as of `Replays`.
-    - `executor`: with `submit`; this process simulates when left out.
-    - `target`: name of the problem, for an executor that cannot send it.
+    - `problem`, `precision`, `key`: as in `Replays`.
+    - `executor`: an executor with `submit`; this process simulates when left out.
+    - `target`: the name of the problem, for an executor that cannot pickle it.
 
-    `draws` is False: a black box gets an integer seed, the same in every precision.
+    `draws` is False: a black box gets an integer seed, which is the same in every precision.
     """
 
     draws = False
@@ -235,7 +235,7 @@ class HostReplays:
             )
 
     def begin_compiling(self, factor: int, count: int, times: int) -> None:
-        """Do nothing: a black box is not compiled."""
+        """Do nothing, because a black box is not compiled."""
 
     def __call__(
         self, factor: int, each: Sequence[PyTree], numbers: Int[np.ndarray, " n"]
@@ -246,9 +246,9 @@ class HostReplays:
         return self._replay(self.refiner(factor), each, numbers)
 
     def anew(self, features: PyTree, numbers: Int[np.ndarray, " n"]) -> list[Verdicts]:
-        """Simulate rows again, by a system that has not simulated what the run did.
+        """Simulate rows again with a new copy of the system, which has no state from the run.
 
-        That is the system itself, where it cannot be made anew.
+        If the system cannot be copied, it is used itself.
         """
         if self._executor is not None:
             return [self._sent(features, numbers, 1, True)]
@@ -313,13 +313,13 @@ def finest_replays(
     executor: "Executor | None" = None,
     target: str | None = None,
 ) -> tuple[Replays | HostReplays | None, list[str], str]:
-    """Return replays of a problem's rows in the finest precision that it can be traced in.
+    """Return replays of a problem's rows in the highest precision in which it can be traced.
 
     **Arguments:**
     - `run`: precision of the run.
-    - `key`, `executor`, `target`: as of `HostReplays`.
-    **Returns:** the replays, None if they cannot be traced; notes on what is left out; what raised
-    when it was traced, empty if nothing did.
+    - `key`, `executor`, `target`: as in `HostReplays`.
+    **Returns:** the replays, None if they cannot be traced; notes on checks that are left out; the
+    error raised in tracing, empty if there was none.
     """
     if problem.black_box:
         replays = HostReplays(problem, run, key, executor, target)
@@ -359,9 +359,8 @@ def replay_block(
     """Simulate rows again; called by a worker.
 
     **Arguments:**
-    - `shipment`: with the problem.
-    - `how`: backend, precision, by how much the step is smaller, and whether the system is to be
-      made anew.
+    - `shipment`: the pickled problem.
+    - `how`: backend, precision, divisor of the step, and whether to use a new copy of the system.
     - `words`: the two words of the key of the run's simulations.
     - `leaves`: the leaves of the features, `[n, ...]` each.
     **Returns:** `rho`, `status`, `violated` and `messages` of the rows.

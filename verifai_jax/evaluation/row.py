@@ -38,7 +38,7 @@ from verifai_jax.problem.problem import Problem
 
 
 class Inputs(abc.ABC):
-    """The inputs of one row, and those that all rows share; both are pytrees that JAX traces."""
+    """The inputs of one row, and the values shared by all rows; pytrees that JAX traces."""
 
     row_form: PyTree
     """Shapes and types of one row, as `jax.ShapeDtypeStruct`s."""
@@ -55,7 +55,7 @@ class Inputs(abc.ABC):
 
     @abc.abstractmethod
     def coordinates(self, row: PyTree, shared: PyTree, precision: str) -> Float[Array, " dim"]:
-        """Return what the robustness is differentiated by, in this precision."""
+        """Return the coordinates by which the robustness is differentiated, in this precision."""
 
     @abc.abstractmethod
     def simulated(
@@ -68,9 +68,9 @@ class CubePoints(Inputs):
     """Points of the unit cube of a problem's feature space.
 
     **Arguments:**
-    - `problem`: that says the space.
-    - `given`: whether rows are those of `given_rows`: points, followed by the real numbers of
-      features that somebody gave, which are simulated as they are; NaN for those of the point.
+    - `problem`: the problem whose space it is.
+    - `given`: whether rows have the form of `given_rows`: points, followed by real numbers of
+      user-given features, which are simulated exactly; NaN stands for the number of the point.
     - `precision`: the precision of the given numbers.
     """
 
@@ -100,11 +100,11 @@ class CubePoints(Inputs):
 
 
 class TableRows(Inputs):
-    """Features as a table holds them, simulated by a system that depends on a shared number.
+    """Features as stored in a table, simulated by a system that depends on a shared number.
 
     **Arguments:**
     - `form`: the features of one row, as `jax.ShapeDtypeStruct`s in the engine's precision.
-    - `system_at`: the system for the shared number, a `factor` of refinement.
+    - `system_at`: a function from the shared number, a refinement `factor`, to the system.
     """
 
     purpose = "closer replays"
@@ -123,14 +123,14 @@ class TableRows(Inputs):
 
 
 class WithParameters(Inputs):
-    """Points of the unit cube, and a vector of parameters of the system that all rows share.
+    """Points of the unit cube, with a vector of system parameters shared by all rows.
 
-    The coordinates are the parameters, followed by the point.
+    The coordinates are the parameters followed by the point.
 
     **Arguments:**
-    - `problem`: its space and formulas.
-    - `size`: how many parameters.
-    - `system_of`: the system of a vector of parameters.
+    - `problem`: the problem with its space and formulas.
+    - `size`: number of parameters.
+    - `system_of`: a function from a vector of parameters to the system.
     """
 
     def __init__(
@@ -163,14 +163,14 @@ class Row(NamedTuple):
 
 
 class RowFunction(NamedTuple):
-    """The function of one row; see the module's docstring.
+    """The function that simulates and evaluates one row; see the module's docstring.
 
     - `problem`: a checked `Problem`.
-    - `inputs`: how a row becomes features and a system.
+    - `inputs`: how a row is converted to features and a system.
     - `precision`: the precision of simulation, monitor and gradient.
-    - `gradient`: whether the smooth robustness is differentiated.
-    - `goals`: for an evaluation clause by clause.
-    - `guidance`: what is computed for a search in addition to the robustness.
+    - `gradient`: whether to differentiate the smooth robustness.
+    - `goals`: the goals of an evaluation by clauses.
+    - `guidance`: additional results for a search.
     """
 
     problem: Problem
@@ -204,7 +204,7 @@ class RowFunction(NamedTuple):
         return self.finish(*derivative.of_several(objective, coordinates))
 
     def coordinates(self, row: PyTree, shared: PyTree) -> Float[Array, " dim"]:
-        """Return what the objective is differentiated by."""
+        """Return the coordinates by which the objective is differentiated."""
         return self.inputs.coordinates(row, shared, self.precision)
 
     def objective(
@@ -215,10 +215,9 @@ class RowFunction(NamedTuple):
         temperature: Float[Array, ""],
         shared: PyTree,
     ) -> tuple[Float[Array, "*clauses"], PyTree]:
-        """Return what is differentiated, and the results that go with it.
+        """Return the differentiated objective, and the results computed with it.
 
-        That is the least smooth robustness, or the clauses of the goal that is nearest to being
-        broken.
+        The objective is the least smooth robustness, or the clauses of the goal nearest to failing.
         """
         features, system = self.inputs.simulated(coordinates, row, shared)
         trace = system(features, key).hold()
@@ -248,7 +247,7 @@ class RowFunction(NamedTuple):
         return self._with_guide(smoothed, trace, features), results
 
     def finish(self, derivatives: Float[Array, "*clauses dim"] | None, results: PyTree) -> Row:
-        """Return the row of these derivatives and of the results of the objective."""
+        """Return the row from the derivatives and results of the objective."""
         rho, status, features, clauses, more = results
         dtype, more = jnp.dtype(self.precision), dict(more)
         if clauses is None:
@@ -309,7 +308,7 @@ Monitor = Callable[[PyTree, Key[Array, ""]], tuple[Float[Array, " formulas"], In
 
 
 def streaming_monitor(problem: Problem) -> Monitor | None:
-    """Return the monitor of a problem; None if carrying it does not pay."""
+    """Return the streaming monitor of a problem; None if streaming does not pay."""
     system = problem.system
     if not system.can_fold or system.dt is None or problem.end != "hold":
         return None
@@ -350,14 +349,14 @@ class _Slot(NamedTuple):
 
 
 class Packing:
-    """The places of a pytree's leaves in one vector for each width; known once `pack` is traced."""
+    """The positions of a pytree's leaves in one vector per width; known once `pack` is traced."""
 
     def __init__(self) -> None:
         self._slots: list[_Slot] = []
         self._form: Any = None
 
     def pack(self, row: PyTree) -> dict[str, Array]:
-        """Concatenate one row's leaves bit by bit: all of four bytes, all of eight."""
+        """Concatenate the bits of one row's leaves, in one vector for each width."""
         leaves, self._form = jax.tree.flatten(row)
         self._slots, parts, filled = [], {}, {}
         for leaf in map(jnp.asarray, leaves):

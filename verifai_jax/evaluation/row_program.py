@@ -40,14 +40,14 @@ class RowProgram:
 
     **Arguments:**
     - `problem`: a checked `Problem`.
-    - `inputs`: how rows become features and a system.
-    - `precision`: `"float32"` or `"float64"`, of simulation, monitor and gradient.
-    - `gradient`: whether the smooth robustness is differentiated.
-    - `clauses`: whether it is evaluated, and differentiated, clause by clause instead.
-    - `guidance`: what is computed for a search in addition to the robustness.
+    - `inputs`: how rows are converted to features and a system.
+    - `precision`: the precision of simulation, monitor and gradient, `"float32"` or `"float64"`.
+    - `gradient`: whether to differentiate the smooth robustness.
+    - `clauses`: whether to evaluate and differentiate clauses instead.
+    - `guidance`: additional results for a search.
 
-    `notes` says, once traced, what was decided that a user may not expect; `derivative` is how rows
-    are differentiated.
+    After tracing, `notes` lists decisions that may surprise a user; `derivative` is the way of
+    differentiating rows.
     """
 
     def __init__(
@@ -72,7 +72,7 @@ class RowProgram:
     def row(
         self, row: PyTree, key: Key[Array, ""], temperature: Float[Array, ""], shared: PyTree = ()
     ) -> Row:
-        """Evaluate one row under `jax.vmap`, in a program that a caller compiles."""
+        """Evaluate one row under `jax.vmap`, in a program that the caller compiles."""
         return self._function(row, key, temperature, shared, self.derivative)
 
     def row_holds(
@@ -87,16 +87,16 @@ class RowProgram:
 
     @cached_property
     def forms(self) -> tuple[Any, ...]:
-        """Shapes and types of the arguments of one row.
+        """Shapes and types of the arguments for one row.
 
-        They are the row, its random key, a temperature, what all rows share, and the numbers.
+        They are the row, its random key, a temperature, the shared values, and the numbers.
         """
         numbers = jax.ShapeDtypeStruct((CAPACITY,), self.precision)
         key = jax.eval_shape(lambda: jax.random.key(0, impl=IMPLEMENTATION))
         return self.inputs.row_form, key, _TEMPERATURE, self.inputs.shared_form, numbers
 
     def trace(self, mode: Mode) -> jax.stages.Traced:
-        """Trace a row without derivatives; the program of a batch is made of that."""
+        """Trace a row without derivatives; the program of a batch is built from that."""
         if mode in self._traced:
             return self._traced[mode]
         one_row = {"evaluate": self.row, "holds": self.row_holds}[mode]
@@ -115,9 +115,9 @@ class RowProgram:
 
     @cached_property
     def derivatives(self) -> tuple[str | None, Callable[..., Any], Any]:
-        """The fingerprint of simulation and monitor, the derivatives of one row, and the program.
+        """Fingerprint of simulation and monitor, derivatives of one row, and the program.
 
-        Only these are traced here. All else follows from them.
+        Only these are traced here; everything else follows from them.
         """
         function, shared = self._function, self.inputs.shared_form
         numbers = self._numbers["evaluate"] = LiftedNumbers()
@@ -151,16 +151,16 @@ class RowProgram:
         return fingerprint(traced.jaxpr), packed_row, traced.jaxpr.jaxpr
 
     def traced_row(self) -> Callable[..., Any]:
-        """Return the function of one row, which is traced already.
+        """Return the function of one row, already traced.
 
-        It takes arguments of `forms`, and returns what `unpack` takes apart.
+        It takes arguments of `forms`; `unpack` splits its result.
         """
         with tracing(self.inputs.purpose), in_precision(self.precision):
             return self.derivatives[1] if self.gradient else as_traced(self.trace("evaluate"))
 
     @property
     def identity(self) -> str | None:
-        """A hash of all that the function of one row computes; None if that has no hash."""
+        """A hash of all that the function of one row computes; None if there is no such hash."""
         if not self.gradient:
             return fingerprint(self.trace("evaluate").jaxpr, derivatives=False)
         computes, *_ = self.derivatives
@@ -168,7 +168,7 @@ class RowProgram:
 
     @property
     def work(self) -> int:
-        """Operations on single numbers in a simulation, with its derivative, about."""
+        """Approximate number of scalar operations in a simulation with its derivative."""
         from verifai_jax.evaluation.native_code.work import work_of
 
         with tracing(self.inputs.purpose), in_precision(self.precision):
@@ -177,17 +177,17 @@ class RowProgram:
             return GRADIENT_WORK * work_of(self.derivatives[2])
 
     def numbers(self, mode: Mode = "evaluate") -> Float[np.ndarray, " numbers"]:
-        """Return the numbers that a program reads, once it is traced."""
+        """Return the numbers that a program reads, after it is traced."""
         return self._numbers[mode].vector(self.precision)
 
     def unpack(self, mode: Mode, packed: dict[str, Any], count: int) -> Any:
-        """Return the first rows of what a program computed."""
+        """Return the first rows of a program's result."""
         return self._packing[mode].unpack(packed, count)
 
     def draws(self) -> bool:
         """Return whether the system uses its random key, in a program without derivatives.
 
-        Traces the program, and raises what that raises.
+        This traces the program, and raises its errors.
         """
         with tracing(self.inputs.purpose), in_precision(self.precision):
             program = self.trace("evaluate").jaxpr.jaxpr
@@ -197,7 +197,7 @@ class RowProgram:
     def differentiable(self, trace: Callable[[], Any]) -> Any:
         """Return the result of `trace`, which traces rows of this program, in a mode that works.
 
-        Where the system refuses reverse mode, it is traced again in forward mode.
+        If the system refuses reverse mode, it is traced again in forward mode.
         """
         try:
             return trace()

@@ -36,9 +36,9 @@ KIND = "unfinished"
 
 
 class Unfinished:
-    """The folder of work that goes on when it is called again.
+    """The folder of work that continues when it is called again.
 
-    - `done`: set by whoever has the result; what is in the folder is removed then.
+    - `done`: set by the caller that has the result; the content of the folder is then removed.
     """
 
     def __init__(self, cache: Cache, folder: Path) -> None:
@@ -50,15 +50,15 @@ class Unfinished:
 
     @property
     def empty(self) -> bool:
-        """True while no simulation is kept."""
+        """True if no simulation is stored."""
         return not self.cache.names() and not any(self.folder.glob("*.rows"))
 
     def part(self, problem: Problem, *mode: object) -> "Part":
-        """Return the simulations of the next evaluator; a changed model has none yet.
+        """Return the stored simulations of the next evaluator; none if the model has changed.
 
         **Arguments:**
         - `problem`: the problem of the evaluator.
-        - `mode`: what else its verdicts depend on, as text.
+        - `mode`: a text of the other settings that affect its verdicts.
         """
         number, self._parts = self._parts, self._parts + 1
         formulas = {name: str(formula) for name, formula in problem.formulas.items()}
@@ -82,7 +82,7 @@ class Unfinished:
         return Part(self, number, jax.tree.structure(problem.space.feature_form))
 
     def settle(self, number: int) -> None:
-        """Note which files a part has read by now, and which ones it has written."""
+        """Record which files a part has read so far, and which it has written."""
         name = f"part/{number}"
         noted = self.cache.note(name)
         if noted is not None:
@@ -91,7 +91,7 @@ class Unfinished:
 
     @contextlib.contextmanager
     def writing(self) -> Iterator[None]:
-        """Keep no more where nothing can be written: the work itself needs no disk."""
+        """Stop storing if nothing can be written; the work itself needs no disk."""
         try:
             yield
         except (OSError, CacheError) as error:
@@ -100,7 +100,7 @@ class Unfinished:
             self._keeps = False
 
     def put(self, number: int, entries: Mapping[str, Arrays]) -> None:
-        """Keep finished simulations of a part."""
+        """Store finished simulations of a part."""
         if self._keeps:
             with self.writing():
                 self.cache.put(entries)
@@ -129,10 +129,10 @@ class Part:
         temperature: Float[np.ndarray, " n"] | float,
         simulate: Callable[[], Verdicts],
     ) -> Verdicts:
-        """Return verdicts of these points: those that are kept, or else those of `simulate`.
+        """Return verdicts of these points: the stored ones, or else those of `simulate`.
 
         **Arguments:**
-        - `numbers`: the numbers of the simulations, which their random keys come from.
+        - `numbers`: the numbers of the simulations, from which their random keys are derived.
         """
         known = self.recall(points, numbers, temperature)
         if known is not None:
@@ -156,7 +156,7 @@ class Part:
         numbers: Int[np.ndarray, " n"],
         temperature: Float[np.ndarray, " n"] | float,
     ) -> Verdicts | None:
-        """Return verdicts of these points; None if not all of them are kept."""
+        """Return stored verdicts of these points; None if some are missing."""
         if not self._known:
             return None
         found = [self._known.get(k) for k in _keys(_asked(points, numbers, temperature))]
@@ -165,7 +165,7 @@ class Part:
         return Verdicts.concatenate([_verdict(*one, self._form) for one in found if one])
 
     def settle(self) -> None:
-        """Note what the first simulations have read."""
+        """Record which files the first simulations have read."""
         if not self._settled:
             self._settled = True
             with self.of.writing():
@@ -186,12 +186,12 @@ class _Rows(Journal):
 
 @contextlib.contextmanager
 def keeping(folder: Path, work: Mapping[str, Any]) -> Iterator[Unfinished]:
-    """Keep the simulations of all evaluators that are used within, until the work is done.
+    """Store the simulations of all evaluators used inside the block, until the work is done.
 
     **Arguments:**
-    - `folder`: which is made, and removed once the work is done, or if nothing is in it.
+    - `folder`: the folder; it is made, and removed when the work is done, or if it is empty.
     - `work`: the arguments of the call, as plain data.
-    **Raises:** `FolderInUse` and `ValueError` as `locked_cache`; `CacheError` for a folder of
+    **Raises:** `FolderInUse` and `ValueError` as in `locked_cache`; `CacheError` for a folder of
     other work.
     """
     with locked_cache(folder, KIND) as cache:

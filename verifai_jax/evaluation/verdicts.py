@@ -26,19 +26,20 @@ from verifai_jax.problem.problem import Problem
 class Verdicts(NamedTuple):
     """Verdicts of `n` simulations, on the host, one row each.
 
-    - `rho`: `[n, formulas]`, hard robustness; NaN where the status is not OK.
+    - `rho`: `[n, formulas]`, hard robustness; NaN unless the status is OK.
     - `status`: `[n]`, codes of `Status`.
     - `violated`: `[n]`, whether the simulation ended properly and breaks a formula.
     - `features`: the simulated values, `[n, ...]` each; None if the caller has them already.
-    - `gradient`: `[n, d]`, of the least smooth robustness by the coordinates; None unless wanted.
+    - `gradient`: `[n, d]`, gradient of the least smooth robustness by the coordinates, or None.
     - `clauses`: `[n, clauses]`, scaled values of the clauses of the goal that is nearest to being
       broken (`mtl.clauses`); None unless wanted.
-    - `clause_gradients`: `[n, clauses, d]`, of the clauses by the coordinates; None unless wanted.
-    - `messages`: what a host system raised, one a row, empty if nothing; None for systems that
-      JAX traces.
-    - `coverage_ids`: what each trace shows (`problem.behaviour`), -1 for nothing; None without one.
-    - `guidance`: what else a search learns (`evaluation.guidance`); None unless wanted.
-    - `traces`: the traces themselves, None if there is none; None unless they are kept.
+    - `clause_gradients`: `[n, clauses, d]`, gradients of the clauses by the coordinates, or None.
+    - `messages`: the error of each row of a host system, empty if there was none; None for systems
+      that JAX traces.
+    - `coverage_ids`: the ids of the items that each trace covers (`problem.behaviour`), -1 for
+      none; None without a `behaviour`.
+    - `guidance`: additional results for a search (`evaluation.guidance`); None unless wanted.
+    - `traces`: the traces, None for a row without one; None unless they are kept.
     """
 
     rho: Float[np.ndarray, "n formulas"]
@@ -55,7 +56,7 @@ class Verdicts(NamedTuple):
 
     @property
     def proper(self) -> Bool[np.ndarray, " n"]:
-        """Rows whose simulation ended properly and so has a verdict."""
+        """Rows whose simulation ended properly and therefore has a verdict."""
         return self.status == Status.OK
 
     @property
@@ -65,7 +66,7 @@ class Verdicts(NamedTuple):
 
     @classmethod
     def nothing(cls, formulas: int, dim: int) -> "Verdicts":
-        """Return the verdicts of no simulation."""
+        """Return verdicts without rows."""
         rho, no = np.zeros((0, formulas), np.float32), np.zeros(0, bool)
         gradient = np.zeros((0, dim), np.float32)
         return cls(rho, np.zeros(0, np.int32), no, gradient=gradient, messages=[])
@@ -86,7 +87,7 @@ class Verdicts(NamedTuple):
         return whole._replace(messages=messages)
 
     def split(self, parts: int) -> "list[Verdicts]":
-        """Return the rows in so many parts of equal length; the inverse of `concatenate`."""
+        """Split the rows into this many parts of equal length; the inverse of `concatenate`."""
         count = len(self.status) // parts
         blocks = [slice(i * count, (i + 1) * count) for i in range(parts)]
         rows = self._replace(messages=None, traces=None)
@@ -100,15 +101,16 @@ class Verdicts(NamedTuple):
 
 
 class RowVerdict(NamedTuple):
-    """The verdict of one simulation of a host system, before those of its batch are complete.
+    """The verdict of one simulation of a host system, before its batch is complete.
 
-    - `rho`: `[formulas]`, or one number that stands for all; NaN without a verdict.
+    - `rho`: `[formulas]`, or one number for all; NaN without a verdict.
     - `status`: a code of `Status`.
     - `holds`: `[formulas]`, or one truth value for all: the Boolean semantics.
-    - `message`: what the system raised; empty if nothing.
-    - `coverage_ids`: what its trace shows, `[ids]`; None without a trace, or a `problem.behaviour`.
-    - `guidance`: what else a search learns, `[guidance]`; None unless there is a trace, and it
-      is wanted.
+    - `message`: the error of the system; empty if there was none.
+    - `coverage_ids`: the ids that its trace covers, `[ids]`; None without a trace, or without a
+      `problem.behaviour`.
+    - `guidance`: additional results for a search, `[guidance]`; None unless there is a trace, and
+      they are wanted.
     """
 
     rho: Float[np.ndarray, " formulas"] | Float[np.ndarray, ""]
@@ -127,11 +129,11 @@ def violations(
     """Decide which simulations violate the property.
 
     **Arguments:**
-    - `rho`: hard robustness; NaN where there is no verdict.
+    - `rho`: hard robustness; NaN without a verdict.
     - `status`: codes of `Status`.
-    - `holds`: gives the Boolean semantics of each formula; called only where a robustness of
-      exactly zero needs it, because it may have to simulate again.
-    **Returns:** for each simulation whether it ended properly and breaks a formula.
+    - `holds`: a function that returns the Boolean semantics of each formula; called only if some
+      robustness is exactly zero, because it may have to simulate again.
+    **Returns:** whether each simulation ended properly and breaks a formula.
     """
     proper = status == Status.OK
     # A formula without a verdict leaves it to the others.
@@ -148,8 +150,9 @@ def trace_verdict(
 ) -> tuple[Float[Array, " formulas"], Int[Array, ""]]:
     """Return the robustness of each formula on one trace, and the status; traced by JAX.
 
-    A simulation whose monitored signals are not finite has status `NONFINITE` and robustness NaN;
-    one whose `valid` is no number of its samples, or whose status is none, has status `ERROR`.
+    A simulation whose monitored signals are not finite has status `NONFINITE` and robustness NaN.
+    If its `valid` is not a possible number of samples, or its status is not a code, it has status
+    `ERROR`.
     """
     counted = _counted(trace)
     trace = trace.hold()
@@ -171,7 +174,7 @@ def trace_verdict(
 
 
 def trace_coverage_ids(problem: Problem, trace: Trace) -> Int[Array, " ids"]:
-    """Return what a trace shows of a problem with a `behaviour`; traced by JAX."""
+    """Return the coverage ids of a trace, for a problem with a `behaviour`; traced by JAX."""
     if problem.behaviour is None:
         return jnp.zeros(0, jnp.int32)
     return problem.behaviour(trace, problem.end)
@@ -195,9 +198,9 @@ def boolean_semantics(problem: Problem, trace: Trace) -> Bool[Array, " formulas"
 def with_status(
     rho: Float[Array, " formulas"], status: Int[Array, ""], finite: Bool[Array, ""]
 ) -> tuple[Float[Array, " formulas"], Int[Array, ""]]:
-    """Return robustness and status given whether all signals are finite; NaN unless it is OK.
+    """Return robustness and status, given whether all signals are finite; NaN unless OK.
 
-    A status that is not a code of `Status` is an error.
+    A status that is not a code of `Status` becomes an error.
     """
     known = (status >= min(Status)) & (status <= max(Status))
     status = jnp.where(known, status, jnp.int32(Status.ERROR))

@@ -42,14 +42,14 @@ ARRAYS = (
 
 
 class BlockMode(NamedTuple):
-    """The way in which blocks are evaluated; the same for all of a run.
+    """The options for evaluating blocks, equal for all blocks of a run.
 
-    - `lanes`: rows that a device works on together.
-    - `gradient`, `clauses`, `precision`: as of `Engine`.
-    - `padded_to`: rows that a host system's features are computed of together.
+    - `lanes`: number of rows that a device processes together.
+    - `gradient`, `clauses`, `precision`: as in `Engine`.
+    - `padded_to`: minimum number of rows whose features are computed together, for a host system.
     - `backend`: the backend of a system that has several.
-    - `guidance`: what is computed for a search in addition to the robustness.
-    - `given`: whether points are rows of given features, as of `CubePoints`.
+    - `guidance`: additional results for a search.
+    - `given`: whether points are rows of given features, as in `CubePoints`.
     """
 
     lanes: int
@@ -82,12 +82,12 @@ def evaluate_block(
     """Simulate and evaluate the rows `first` to `first + n - 1`; called by a worker.
 
     **Arguments:**
-    - `shipment`: with the problem.
-    - `mode`: how.
+    - `shipment`: the pickled problem.
+    - `mode`: the options of the evaluation.
     - `key`: words of the run's random key.
     - `first`: number of the first row.
     - `u`: points of the unit cube.
-    - `temperature`: the temperature of the smooth robustness, one for all or one each.
+    - `temperature`: the temperature of the smooth robustness, one for all rows or one for each.
     **Returns:** arrays by the names of `ARRAYS`; the `leaves` of the features; `messages`; the
     `seconds` without compilation; the `processor`; the engine's `notes`; the `remarks` of the
     simulations; the `question` that this answers.
@@ -118,7 +118,7 @@ def question_of(
     first: int,
     u: Float[np.ndarray, "n d"],
 ) -> tuple[str, tuple[int, ...], int, int]:
-    """Return what tells a call of `evaluate_block` from all others of a run."""
+    """Return a value that identifies a call of `evaluate_block` among all calls of a run."""
     return shipment.token, tuple(int(word) for word in key), int(first), len(u)
 
 

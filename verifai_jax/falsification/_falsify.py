@@ -372,7 +372,8 @@ def _resume(
     if search is None:
         if run.search_data is None:
             raise ValueError(
-                f"search {run.search} is none of verifai_jax.search; give it: resume(..., search=)"
+                f"search {run.search} is not one of verifai_jax.search; give it: resume(..., "
+                "search=)"
             )
         search = recorded_search(run)
     asking, search = without_suggestions(search)
@@ -421,8 +422,8 @@ def _resume(
     usual = batch_size(None, search, budget, ends.stop_after)
     if search.learns and usual != run.batch:
         notes.append(
-            f"resumed in batches of {run.batch}: a run of {budget} simulations from the start has "
-            f"batches of {usual} by default, and so other points"
+            f"resumed in batches of {run.batch}: a run of {budget} simulations from the start "
+            f"would use batches of {usual} by default, and so simulate other points"
         )
     running = Running(
         rounds, ends, choice, run.seed, run.target, notes, lasting, sources, resumed=True,

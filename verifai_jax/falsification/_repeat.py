@@ -50,13 +50,12 @@ class Trials(InNotebook):
     - `batch`: simulations in a round.
     - `rho`: `[seeds, simulations]`, the least robustness of the formulas; NaN without a verdict.
     - `violated`: `[seeds, simulations]`, which simulations violate the property, as in `falsify`.
-    - `failures`: `[seeds, d]`, the first failing point of each seed in the unit cube, NaN without
-      one.
+    - `failures`: `[seeds, d]`, the first failing point of each seed in the unit cube, or NaN.
     - `not_claimed`: `[seeds, simulations]`, which violating simulations closer replays reject, as
       in `falsify`; None without closer replays. Unless all violations were replayed, replays of a
       seed end with its first claimed failure.
-    - `differentiated`: `[seeds, simulations]`, which simulations were differentiated; None if none
-      or all were.
+    - `differentiated`: `[seeds, simulations]`, the differentiated simulations; None if none or all
+      were.
     - `sources`: the files of the model, as a run records them.
     """
 
@@ -187,7 +186,7 @@ def repeat(
     ):
         if there:
             raise ValueError(
-                f"problem {problem.name!r} has {what}, which is dealt with between rounds; use "
+                f"problem {problem.name!r} has {what}, which needs work between rounds; use "
                 "falsify with one seed after the other"
             )
     if search.wants.traces is not None:

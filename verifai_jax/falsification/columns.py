@@ -136,7 +136,7 @@ def column_to_arrow(values: Shaped[np.ndarray, " n"]) -> "pa.Array":
 
 
 def column_checksum(values: Shaped[np.ndarray, " n"], before: int | None = None) -> int:
-    """Return the checksum of a column, continued from `before`, that of its earlier part."""
+    """Return a column's checksum, continuing `before`, the checksum of its earlier part."""
     import pandas as pd
 
     if values.dtype == object and len(values) and not isinstance(values[0], str):

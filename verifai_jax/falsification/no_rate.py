@@ -20,7 +20,7 @@ _REMEDY: dict[str, str] = {
 }
 _BETWEEN: dict[str, str] = {
     "prior": (
-        "The points between the {rows} samples: of them nothing but the rate is known, with its "
+        "The points between the {rows} samples: only their failure rate is known, with its "
         "interval."
     ),
     "first": (
@@ -37,11 +37,11 @@ _BETWEEN: dict[str, str] = {
     ),
     "coverage": (
         "The search chose its points by what it had covered before. Where it did not look nothing "
-        "is shown, and the share of failing rows is no probability."
+        "is shown, and the share of failing rows is not a probability."
     ),
     "learned": (
-        "The search chose its points by what it found before. Where it did not look nothing is "
-        "shown, and the share of failing rows is no probability."
+        "The search chose its points by what it had found before. Where it did not look nothing "
+        "is shown, and the share of failing rows is not a probability."
     ),
 }
 _NO_RATE = "The points between the {rows} samples: nothing is known of them."

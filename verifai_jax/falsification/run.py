@@ -263,12 +263,12 @@ class Run(InNotebook):
         """Say what may be the reason where no file has changed."""
         then = sources_of_row(self.sources, row)
         if then is None or self.problem is None:
-            return "what its model was made of is not recorded, so that it may be another one"
+            return "the files of its model were not recorded, so it may have changed"
         if versions := then.other_versions(self.problem.sources()):
-            return f"no file of its model has changed, and versions have: {', '.join(versions)}"
+            return f"no file of its model has changed, but these versions: {', '.join(versions)}"
         why = "the system has memory, chance or state of its own, or reads what is not recorded"
         if self.engine == "native":
-            why = "native code rounds otherwise, which a chaotic system makes grow"
+            why = "native code rounds differently, which a chaotic system amplifies"
         return f"no file of its model has changed: {why}"
 
     def improbability(self, rows: "pd.DataFrame | None" = None) -> "pd.DataFrame":
@@ -382,7 +382,9 @@ class Run(InNotebook):
         seen = self._replayed(problem.on_backend("native"), values, number, self.precision)
         if finding_of(seen, stored, self._several, ROUNDING):
             return None
-        return replace(seen, engine="native MuJoCo, which gives the number of the row as MJX does")
+        return replace(
+            seen, engine="native MuJoCo, which reproduces the number that MJX computed for the row"
+        )
 
     def save_counterexamples(self, folder: str | Path, **options: Any) -> list[Path]:
         """Write counterexamples as small files for version control; returns their paths.

@@ -164,7 +164,7 @@ def _read_state(
     try:
         checkpoint = read_checkpoint(folder)
     except DamagedError as error:
-        damage.append(f"{error}; its rows are there all the same: {ANEW}")
+        damage.append(f"{error}; its rows can still be read: {ANEW}")
     seen = int(checkpoint["rows"]) if checkpoint else 0
     if checkpoint and checkpoint[RECORD_CHECKSUM] != deciding_checksum(record):
         damage.append(

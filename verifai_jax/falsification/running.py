@@ -332,7 +332,9 @@ def _failure_message(name: str, simulations: int, folder: Path | None, cause: Ex
     if folder is None:
         return f"{message}They are in the .run of this error"
     if isinstance(cause, OSError) and not folder.is_dir():
-        return f"{message}{folder} is there no more: all are in the .run of this error, to be saved"
+        return (
+            f"{message}{folder} does not exist any more: save the .run of this error, which has all"
+        )
     if isinstance(cause, OSError):
         return (
             f"{message}All of them are in the .run of this error, and in {folder} those up to the "

@@ -126,8 +126,8 @@ def simulate_shard(
     if search.learns:
         names = [name for name in searches.names() if not searches.named(name).learns]
         raise ValueError(
-            f"search {search!r} learns from all rows, so that no part of it can be simulated by "
-            f"itself; use one that does not ({', '.join(names)}), or a cluster"
+            f"search {search!r} learns from all rows, so a part of the run cannot be simulated "
+            f"alone; use one that does not ({', '.join(names)}), or a cluster"
         )
     if problem.system.backends and backend is None:
         raise ValueError(
@@ -290,7 +290,7 @@ class _StoredRows:
         self._blocks = sorted(blocks, key=lambda block: (block[0].start, block[0].stop))
 
     def submit(self, function: Callable[..., Any], /, *arguments: Any) -> "Future[dict[str, Any]]":
-        """Return a future with the stored rows in path of those that `function` would simulate.
+        """Return a future with the stored rows, instead of simulating them with `function`.
 
         Rows that are replayed before they are claimed are simulated here.
         """
@@ -387,7 +387,7 @@ def merge(
     twice = sorted({number for number, _ in numbers if numbers.count([number, of]) > 1})
     missing = sorted(set(range(1, of + 1)) - {number for number, _ in numbers})
     if any(each != of for _, each in numbers) or twice or missing:
-        what = f"part {twice[0]} is there twice" if twice else "they are cut in different numbers"
+        what = f"part {twice[0]} is there twice" if twice else "they are of different divisions"
         if missing:
             listed = ", ".join(f"{number}/{of}" for number in missing[:8])
             what = f"{listed}{', ...' if len(missing) > 8 else ''} missing"

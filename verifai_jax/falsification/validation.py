@@ -135,7 +135,7 @@ def check_gradient(problem: Problem, search: Search) -> None:
     needs = search.needs_derivatives
     if needs and problem.rulebook is not None and search.wants.clauses:
         raise ValueError(
-            f"search {search!r} descends on clauses, which have no order; problem "
+            f"search {search!r} descends on clauses and ignores priorities; problem "
             f"{problem.name!r} has a priority. Use 'portfolio' or 'cross_entropy'"
         )
     if problem.black_box and needs:
@@ -155,8 +155,8 @@ def check_guide(problem: Problem, search: Search) -> None:
         return
     raise ValueError(
         f"problem {problem.name!r} has a guide, which steers searches that learn, and search "
-        f"{search!r} does not: its points are the same whatever they come to. Use one that learns, "
-        "such as 'portfolio', or dataclasses.replace(problem, guide=None)"
+        f"{search!r} does not: results do not influence its points. Use one that learns, such as "
+        "'portfolio', or dataclasses.replace(problem, guide=None)"
     )
 
 
@@ -399,7 +399,9 @@ def check_same_space(run: Run, problem: Problem) -> None:
             )
     # The name of a constraint may change with the line it is written in.
     if list(was) != list(now) or bool(run.space_data["where"]) != bool(data["where"]):
-        raise ValueError(f"the run of {run.name!r} was over a space of another order or constraint")
+        raise ValueError(
+            f"the run of {run.name!r} was over a space with another order or constraint"
+        )
 
 
 def earlier_rows(warm_start: object, problem: Problem) -> "pd.DataFrame | None":
@@ -416,7 +418,7 @@ def earlier_rows(warm_start: object, problem: Problem) -> "pd.DataFrame | None":
         rows = cast("pd.DataFrame", frame)
         check_columns(problem.space, {str(name): rows[name] for name in columns}, held=False)
     except ValueError as error:
-        raise ValueError(f"warm_start holds what this space does not: {error}") from error
+        raise ValueError(f"warm_start does not fit this space: {error}") from error
     return cast("pd.DataFrame", frame)
 
 
@@ -444,8 +446,8 @@ def _check_empty(folder: Path) -> None:
     if folder.exists() and (not folder.is_dir() or {p.name for p in folder.iterdir()} - leftover):
         if (folder / RECORD).is_file():
             raise ValueError(
-                f"folder {str(folder)!r} exists and is not empty: it holds a run, with which "
-                f"vj.resume, or verifai-jax falsify --resume {folder}, goes on; a new one needs "
-                "another folder"
+                f"folder {str(folder)!r} exists and is not empty: it holds a run, which vj.resume "
+                f"or verifai-jax falsify --resume {folder} continues; a new run needs another "
+                "folder"
             )
         raise ValueError(f"folder {str(folder)!r} exists and is not empty; a run needs a new one")

@@ -106,8 +106,8 @@ class Automaton(Domain):
         if longest < min_events:
             raise ValueError(
                 f"min_events={min_events} events are impossible: no sequence from {start!r} has "
-                f"more than {longest}, after which no event is enabled; allow fewer, or add "
-                "events that go on"
+                f"more than {longest}, after which no event is enabled; require fewer, or add "
+                "events that can follow"
             )
 
     def _check_parameters(self) -> None:

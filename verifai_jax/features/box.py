@@ -249,8 +249,8 @@ class DiscreteBox(_Between):
             raise ValueError(f"low must not be above high in a DiscreteBox; {shown}")
         if max(self.levels) > MAX_LEVELS:
             raise ValueError(
-                f"a DiscreteBox has at most {MAX_LEVELS} values, which a float32 coordinate can "
-                f"tell apart (use a Box and round); {shown}"
+                f"a DiscreteBox has at most {MAX_LEVELS} values, the number that a float32 "
+                f"coordinate can distinguish (use a Box and round); {shown}"
             )
 
     @classmethod

@@ -94,8 +94,8 @@ class Categorical(Domain):
         numbers = tuple(as_number(weight, "a weight of a Categorical") for weight in weights)
         if len(numbers) != len(self.choices):
             raise ValueError(
-                f"a Categorical with {len(self.choices)} choices needs as many weights; "
-                f"got {len(numbers)}"
+                f"a Categorical with {len(self.choices)} choices needs as many weights; got "
+                f"{len(numbers)}"
             )
         if not all(weight > 0 for weight in numbers):
             raise ValueError(
@@ -104,8 +104,8 @@ class Categorical(Domain):
             )
         if min(numbers) < 1 / MAX_LEVELS:
             raise ValueError(
-                f"a weight must be at least {1 / MAX_LEVELS:z.1g}, which a float32 coordinate can "
-                f"tell from nothing; got {short(numbers)}"
+                f"a weight must be at least {1 / MAX_LEVELS:z.1g}, the smallest that a float32 "
+                f"coordinate can represent; got {short(numbers)}"
             )
         if abs(math.fsum(numbers) - 1) > 1e-6:
             raise ValueError(

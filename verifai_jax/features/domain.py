@@ -188,7 +188,7 @@ class Domain(ForUsers, abc.ABC):
         return u
 
     def settled(self, u: Float[Array, " size"]) -> Float[Array, " size"]:
-        """Return coordinates of the same value in which unused ones have a fixed value."""
+        """Return `u` with unused coordinates set to a fixed value; the value stays the same."""
         return u
 
     def used(self, u: Float[Array, " size"]) -> Bool[Array, " size"]:

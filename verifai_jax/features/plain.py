@@ -79,7 +79,7 @@ def from_plain(
     try:
         return _build(data, distributions or {})
     except (KeyError, TypeError) as error:
-        raise ValueError(f"this describes no domain ({error}): {data!r}") from error
+        raise ValueError(f"this does not describe a domain ({error}): {data!r}") from error
 
 
 def _build(data: Mapping[str, Any], distributions: Mapping[str, Distribution]) -> Domain:
@@ -106,8 +106,8 @@ def _build(data: Mapping[str, Any], distributions: Mapping[str, Distribution]) -
         case "Distribution":
             if data["name"] not in distributions:
                 raise ValueError(
-                    f"the functions of Distribution {data['name']!r} are code, which JSON does "
-                    "not hold; give it: from_json(data, distributions={...})"
+                    f"the functions of Distribution {data['name']!r} are code, which JSON cannot "
+                    "contain; give it: from_json(data, distributions={...})"
                 )
             return distributions[data["name"]]
         case "Automaton":
@@ -141,7 +141,7 @@ def _automaton_to_plain(domain: Automaton) -> dict[str, Any]:
     events = []
     for each in domain.transitions:
         if each.guard is not None:
-            raise ValueError(f"the guard of {each.label} is code, which JSON cannot describe")
+            raise ValueError(f"the guard of {each.label} is code, which JSON cannot contain")
         options = {"to": each.to, "weight": each.weight, "after": list(each.after)}
         domains = [[name, to_plain(part)] for name, part in each.parameters]
         event = {**options, "at_most": each.at_most, "wait": to_plain(each.wait)}

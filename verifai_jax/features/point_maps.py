@@ -138,8 +138,7 @@ class PointMaps:
     def flatten(self, features: Mapping[str, Any]) -> Float[Array, " dim"]:
         """Convert features to the point `[dim]` of the unit cube; discrete ones to cell middles.
 
-        Pure JAX for values returned by `unflatten`; also takes plain Python values. Nothing is
-        checked.
+        Pure JAX for values of `unflatten`; also takes plain Python values, unchecked.
 
         **Arguments:**
         - `features`: features by name; constant and fixed ones and events may be left out.

@@ -89,8 +89,7 @@ class FeatureRanges:
     def _dependence(self) -> list[tuple[np.ndarray, np.ndarray, bool, bool]]:
         """Return for each leaf on which coordinates its numbers depend, their size, and more.
 
-        That is whether the map of its domain to its ends is exact, and whether it is of real
-        numbers.
+        That is whether its domain's map to its ends is exact, and whether it is of real numbers.
         """
         levels = [np.full((1, self.dim), level) for level in (0.0, 0.25, 0.75)]
         probes = np.concatenate([levels[0], np.eye(self.dim), *levels[1:]])

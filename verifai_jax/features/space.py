@@ -123,7 +123,7 @@ class FeatureSpace(PointMaps, ForUsers):
         **Arguments:**
         - `features`: as in `coerce`.
         **Returns:** the features in the form of `unflatten`.
-        **Raises:** `ValueError` that names the first feature that is unknown, missing or of another
+        **Raises:** `ValueError` with the first feature that is unknown, missing or of another
         shape.
         """
         complete = self.completed(features)
@@ -184,7 +184,7 @@ class FeatureSpace(PointMaps, ForUsers):
         - `key`: a random key of JAX.
         - `count`: number of samples.
         **Returns:** the features by name, stacked along a leading axis `[count, ...]`.
-        **Raises:** the errors of `check_where`; `ValueError` for a count that is not a positive
+        **Raises:** the errors of `check_where`; `ValueError` unless the count is a positive
         integer.
         """
         self.check_where()
@@ -243,8 +243,7 @@ class FeatureSpace(PointMaps, ForUsers):
         **Arguments:**
         - `features`: names of the features that vary.
         - `nominal`: values of the others, by name, as a user writes them.
-        **Raises:** `ValueError` for no or an unknown feature, or a fixed one without a nominal
-        value.
+        **Raises:** `ValueError` for an unknown or no feature, or a fixed one without nominal value.
         """
         if not features:
             raise ValueError("name at least one feature that varies")
@@ -303,10 +302,10 @@ class FeatureSpace(PointMaps, ForUsers):
         **Raises:** `ValueError` for data that describes no space, or missing code.
         """
         if not isinstance(data, Mapping) or "features" not in data:
-            raise ValueError(f"this describes no feature space: {data!r}")
+            raise ValueError(f"this does not describe a feature space: {data!r}")
         if data.get("where") is not None and where is None:
             raise ValueError(
-                f"the constraint {data['where']} of this space is code, which JSON does not hold; "
+                f"the constraint {data['where']} of this space is code, which JSON cannot contain; "
                 "give it: from_json(data, where=...)"
             )
         root = from_plain({"kind": "Struct", "fields": data["features"]}, distributions)

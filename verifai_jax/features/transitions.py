@@ -145,7 +145,8 @@ def check_states(start: str, transitions: tuple[Transition, ...]) -> None:
             if near and not _is_numbered(each.to, near[0]):
                 raise ValueError(
                     f"no event leaves the state {each.to!r} that {each.label} leads to; did you "
-                    f"mean {near[0]!r}? A state in which a sequence ends needs a name less like it"
+                    f"mean {near[0]!r}? A state in which a sequence ends needs a more different "
+                    "name"
                 )
     reached, added = {start}, True
     while added:
@@ -155,8 +156,8 @@ def check_states(start: str, transitions: tuple[Transition, ...]) -> None:
         if each.source not in reached:
             raise ValueError(
                 f"no sequence of events leads from {start!r} to the state {each.source!r} of "
-                f"{each.label}; it leads to {', '.join(sorted(reached))}: correct its name, or add "
-                f"an event with to={each.source!r}"
+                f"{each.label}, only to {', '.join(sorted(reached))}: correct its name, or add an "
+                f"event with to={each.source!r}"
             )
 
 
@@ -195,8 +196,8 @@ def unfold(start: str, transitions: tuple[Transition, ...], limit: int) -> Graph
                     found.append(target)
                     if len(nodes) > MAX_NODES:
                         raise ValueError(
-                            f"the guards tell more than {MAX_NODES} pasts of at most {limit} "
-                            "events apart; allow fewer events, or let fewer have guards"
+                            f"the guards distinguish more than {MAX_NODES} pasts of at most "
+                            f"{limit} events; allow fewer events, or guard fewer of them"
                         )
                 leads[number] = nodes[target]
             following.append(leads)
@@ -247,8 +248,8 @@ def _tables(
         node, number = (int(i) for i in np.argwhere(enabled & (shares < MIN_SHARE))[0])
         raise ValueError(
             f"the weight of {transitions[number].label}, {transitions[number].weight:zg}, is too "
-            f"small next to the others of its state: its probability must be at least "
-            f"{MIN_SHARE:z.1g}; leave out what never happens"
+            "small next to the others of its state: its probability must be at least "
+            f"{MIN_SHARE:z.1g}; leave out events that never happen"
         )
     last = np.where(
         enabled.any(axis=1), shape[1] - 1 - np.argmax(enabled[:, ::-1], axis=1), -1

@@ -150,10 +150,9 @@ def explain(
 
     **Arguments:**
     - `formula`, `trace`, `end`: as in `robustness`; the trace must be concrete, not under `jit`.
-    - `k`: maximum number of critical instants to report: the peaks, over time, of each predicate's
-      influence.
-    - `tau`: temperature at which influence is measured; a tenth of the predicates' spread when
-      left out.
+    - `k`: maximum number of critical instants: the peaks, over time, of each predicate's influence.
+    - `tau`: temperature at which influence is measured; by default a tenth of the predicates'
+      spread.
     **Raises:** the errors of `robustness`, and `ValueError` for a NaN among the relevant samples.
     """
     check_trace(trace)

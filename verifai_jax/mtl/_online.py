@@ -187,8 +187,7 @@ def advance(
     - `now`: index of the sample.
     - `leaves`: margins of the plan's leaves.
     - `cells`: memory before the step.
-    **Returns:** the result of each formula, NaN before its first result, and the memory after the
-    sample.
+    **Returns:** the result of each formula, NaN before its first, and the memory after the sample.
     """
     step = _Step(now, leaves, cells)
     values: list[Value] = []

@@ -39,8 +39,7 @@ def parse(
     **Arguments:**
     - `text`: see the grammar in the documentation; times are in seconds unless a unit follows.
     - `constants`: numbers by name, which may also be ends of intervals.
-    - `definitions`: sub-formulas by name, as text or formulas; a definition may use the earlier
-      names.
+    - `definitions`: sub-formulas by name, as text or formulas; a definition may use earlier ones.
 
     A text has at most 10 000 words and symbols. Parentheses may be nested 100 deep, and so may
     operators (`<->`, `xor`, weak until and release count as several); temporal operators may be

@@ -41,7 +41,7 @@ def robustness(
 
     **Arguments:**
     - `formula`: a `Formula`, or its text.
-    - `trace`: a trace with signals `[time]` or `[time, k]`, evenly sampled; use `jax.vmap` for
+    - `trace`: an evenly sampled trace with signals `[time]` or `[time, k]`; use `jax.vmap` for
       batches.
     - `semantics`: `hard` (in the unit of the predicates), `smooth(tau)`, or `boolean` (+1 / -1).
     - `end`: how the trace continues after the last sample. `"hold"`: the last sample is held for

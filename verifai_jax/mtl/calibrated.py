@@ -157,7 +157,7 @@ def predictive_monitor(
     margins, worst = ([np.broadcast_to(v(f), v.length) for v in values] for f in (within, ahead))
     x, y = (np.concatenate([each[k] for k in teach]) for each in (rows, worst))
     if not np.isfinite(y).all():
-        raise ValueError(f"the robustness of {within} is infinite or NaN, and cannot be foretold")
+        raise ValueError(f"the robustness of {within} is infinite or NaN, and cannot be predicted")
     kept = np.random.default_rng(seed).permutation(len(x))[:TAUGHT]
     taught: Model = model or _quadratic()
     taught.fit(x[kept], y[kept])

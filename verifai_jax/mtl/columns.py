@@ -123,8 +123,7 @@ def seconds_of(source: str, name: str, column: Any) -> tuple[np.ndarray, Fractio
     Dates, times of day and durations, also as ISO 8601 texts, become seconds since the first one,
     which is subtracted before rounding.
 
-    **Returns:** the times, and their origin in seconds since 1970; 0 for numbers that are seconds
-    already.
+    **Returns:** the times, and their origin in seconds since 1970; 0 for numbers in seconds.
     **Raises:** the errors of `numbers_of`; `ValueError` for lists of numbers.
     """
     from pyarrow import types
@@ -160,8 +159,7 @@ def seconds_of(source: str, name: str, column: Any) -> tuple[np.ndarray, Fractio
 def epoch_unit(values: np.ndarray) -> str:
     """Return the unit of sample times: `s`, or the unit of a calendar clock.
 
-    A unit is chosen if the same numbers in seconds would lie more than three thousand years after
-    1970.
+    A unit is chosen if the numbers in seconds would lie over three thousand years after 1970.
     """
     known = values[np.isfinite(values)]
     size = float(np.min(known)) if known.size and known.ndim == 1 else 0.0

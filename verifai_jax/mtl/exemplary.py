@@ -103,7 +103,7 @@ def examples(
     """
     formula = as_formula(formula)
     if not formula.signals():
-        raise ValueError(f"{formula} speaks of no signal, so that it has no examples")
+        raise ValueError(f"{formula} has no signal, so there are no examples")
     traces = () if like is None else tuple(named_traces(like).values())
     free = FreeTraces.of([formula], traces, dt, duration, end)
     found: dict[str, Signals | None] = {}

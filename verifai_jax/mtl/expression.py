@@ -223,8 +223,8 @@ class Duration(Signal):
         for part in self.operand.subformulas(valued=True):
             if part.side == "ahead":
                 raise ValueError(
-                    f"what is counted is known by now, and {part} looks ahead: use an operator "
-                    "that looks back, such as once"
+                    f"what is counted must be known at the present sample, but {part} looks ahead: "
+                    "use an operator that looks back, such as once"
                 )
 
     @property

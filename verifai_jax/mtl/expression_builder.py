@@ -161,7 +161,7 @@ class ExpressionBuilder:
         within = '"s" < {}' if str(words[0]) == "**" else "{}"
         offer = self._offered("write ", right, left, within=within)
         return self._fail(
-            f"a chain of {str(words[0])!r} is ambiguous: {offer or 'say by parentheses how'}",
+            f"a chain of {str(words[0])!r} is ambiguous: {offer or 'use parentheses'}",
             words[1].start_pos,
             words[1].start_pos + len(word),
         )

@@ -181,8 +181,8 @@ class Predicate(Leaf):
             raise unknown_name("comparison", self.comparison, COMPARISONS)
         if not (self.left.signals() or self.right.signals()):
             raise ValueError(
-                f"{self} compares numbers and no signal, so that all traces are alike: compare a "
-                f"signal, as in x {self.comparison} {self.right}, or write TRUE or FALSE"
+                f"{self} compares numbers but no signal, so its truth is the same on all traces: "
+                f"compare a signal, as in x {self.comparison} {self.right}, or write TRUE or FALSE"
             )
 
     def terms(self) -> tuple[Term, ...]:

@@ -197,7 +197,7 @@ def _clock(
     if length > MAX_SAMPLES:
         raise ValueError(
             f"a free trace of {duration:zg} s every {dt:zg} s has {length} samples, more than "
-            f"{MAX_SAMPLES}: give a longer period dt, of which all windows are multiples"
+            f"{MAX_SAMPLES}: give a longer period dt that divides all windows"
         )
     samples = {round(t / dt) + more for t in ends for more in (0, 1)} | {0, 1, length - 1}
     return dt, length, tuple(sorted(k for k in samples if k < length))

@@ -172,7 +172,7 @@ class _Linter:
             if part.side == "back" and last <= part.span(0.0)[0]:
                 yield self._found(
                     "window", part,
-                    f"{part} is asked at the first sample alone, before which there is nothing",
+                    f"{part} is evaluated only at the first sample, before which there is nothing",
                     f"Write always ({part}) if it is meant at every instant.",
                 )  # fmt: skip
 
@@ -182,7 +182,7 @@ class _Linter:
             if isinstance(part, ast.Window) and part.sign > 0 and _implied(part.operand):
                 left, right = surface(part.operand)[1]
                 yield self._found(
-                    "vacuous", part, f"{part} holds as soon as {left} does not hold at one instant",
+                    "vacuous", part, f"{part} holds as soon as {left} is false at one instant",
                     f"If both are meant together, write {left} & {right} within it.",
                 )  # fmt: skip
             if not _implied(part) or not self.recordings:
@@ -193,7 +193,7 @@ class _Linter:
             if self.asked[part] == (0.0, 0.0) and (later := self._ever(left, everywhere=True)):
                 yield self._found(
                     "vacuous", left,
-                    f"{left} is asked at the first sample alone, where it never holds; it holds "
+                    f"{left} is evaluated only at the first sample, where it never holds; it holds "
                     f"later, as in {later[0]}",
                     f"Write always ({part}) if it is meant at every instant.",
                 )  # fmt: skip
@@ -236,8 +236,10 @@ class _Linter:
             for value in (TRUE, FALSE):
                 if self._same(drawn, self.formula, replaced(self.formula, {part: value})):
                     yield self._found(
-                        "no effect", part, f"{part} changes the truth of the formula on no trace "
-                        "that was tried", "Leave it out, or check what was meant by it.",
+                        "no effect",
+                        part,
+                        f"{part} affects the truth of the formula on no trace that was tried",
+                        "Leave it out, or check what was meant by it.",
                     )  # fmt: skip
                     break
 
@@ -339,15 +341,15 @@ class _Linter:
                 yield self._found(
                     "until", part,
                     f"the formula fails in {len(only)} of "
-                    f"{counted(len(self.recordings), 'recording')} only because {part.right} does "
-                    f"not come, while {part.left} holds to the end, as in {only[0]}",
-                    f"If {part.right} need not come, write weak_until.",
+                    f"{counted(len(self.recordings), 'recording')} only because {part.right} never "
+                    f"happens, while {part.left} holds to the end, as in {only[0]}",
+                    f"If {part.right} need not happen, write weak_until.",
                 )  # fmt: skip
             elif part.interval.start == 0 and self._at_once(part):
                 yield self._found(
                     "vacuous", part.left,
-                    f"{part.right} holds at once wherever {part} is asked, so that {part.left} is "
-                    f"never asked in {self._all}",
+                    f"{part.right} holds at once wherever {part} is evaluated, so {part.left} is "
+                    f"never required in {self._all}",
                 )  # fmt: skip
 
     def _comes(self, each: _Recording, part: Formula) -> bool:

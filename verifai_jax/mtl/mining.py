@@ -52,10 +52,8 @@ class Mined(Drawn, InNotebook):
     - `front`: the corners for two parameters: neither can be tighter unless the other gets looser.
       One entry for one parameter.
     - `formula`: the formula with `values`, which the recordings satisfy.
-    - `tightest`: for each name `"least"` or `"greatest"`, the direction in which the formula is
-      tighter.
-    - `sampled`: parameters in which the formula was found monotone by trying values, not from its
-      form.
+    - `tightest`: for each name `"least"` or `"greatest"`, the direction of a tighter formula.
+    - `sampled`: parameters in which the formula was found monotone by trying values.
     - `recordings`, `satisfied`: number of recordings, and of those that satisfy `formula`.
     - `broken`: the rate of recordings that break it, with its interval.
     - `searched`: number of simulations that did not break it, if a problem was searched; else None.
@@ -155,8 +153,8 @@ def mine_template(
     """Find the tightest parameters of a parsed formula; see `mine`."""
     if len(template.names) == 2 and template.together(*template.names):
         raise ValueError(
-            f"{' and '.join('?' + name for name in template.names)} stand in one comparison, so "
-            "that every value of one has another of the other: write a number for one of them"
+            f"{' and '.join('?' + name for name in template.names)} occur in one comparison, so "
+            "each value of one determines the other: write a number for one of them"
         )
     values = [HostValues.of(trace, end) for trace in traces]
     satisfied = _Satisfied(template, values, math.ceil(share * len(values) - 1e-9))
@@ -295,8 +293,8 @@ def _tried(template: Parametric, name: str, satisfied: _Satisfied, values: Seque
     others = [other for other in template.names if other != name]
     if others:
         raise ValueError(
-            f"the formula does not tell whether it is monotone in ?{name}, and that can be tried "
-            f"for one parameter alone: write a number for ?{others[0]}"
+            f"the form of the formula does not show whether it is monotone in ?{name}, and this "
+            f"can be tried only for a single parameter: write a number for ?{others[0]}"
         )
     rises = falls = False
     for each in satisfied.values:
@@ -307,8 +305,8 @@ def _tried(template: Parametric, name: str, satisfied: _Satisfied, values: Seque
     if rises and falls:
         raise ValueError(
             f"{template.text!r} is not monotone in ?{name}: as it grows the formula becomes both "
-            "true and false, so that there is no tightest value. Give the places where it stands "
-            "names of their own"
+            "true and false, so there is no tightest value. Use different names where it occurs "
+            "several times"
         )
     if not (rises or falls):
         raise ValueError(f"no value of ?{name} that was tried changes the truth of the formula")
@@ -342,7 +340,8 @@ def _one(axis: _Axis, satisfied: _Satisfied) -> list[tuple[float, ...]]:
         raise ValueError(f"no value of ?{axis.name} satisfies {satisfied.template.text!r}")
     if axis.is_free(number):
         raise ValueError(
-            f"every value of ?{axis.name} satisfies {satisfied.template.text!r}: nothing bounds it"
+            f"every value of ?{axis.name} satisfies {satisfied.template.text!r}: the data do "
+            "not bound it"
         )
     return [(axis.value(number),)]
 
@@ -366,7 +365,7 @@ def _staircase(one: _Axis, other: _Axis, satisfied: _Satisfied) -> list[tuple[fl
     if not corners:
         raise ValueError(
             f"{satisfied.template.text!r} has no tightest pair of ?{one.name} and ?{other.name}: "
-            "one of them is bounded by nothing, or no values satisfy it"
+            "the data do not bound one of them, or no values satisfy it"
         )
     return corners
 

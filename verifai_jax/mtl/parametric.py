@@ -194,7 +194,8 @@ def read_parametric(
             return word
         if names.setdefault(name, inside) != inside:
             raise ValueError(
-                f"?{name} is an end of an interval and a number in {text!r}: give them two names"
+                f"?{name} is used both as an end of an interval and as a number in {text!r}: "
+                "use two names"
             )
         if not inside:
             return f'"?{name}"'

@@ -367,8 +367,9 @@ def read_csv(path: Path) -> Table:
     if unclear and separator != ";":
         cell = next(cell for cell in table.column(unclear[0]).to_pylist() if cell and "," in cell)
         raise ValueError(
-            f"{path} has {cell.strip()!r} in column {unclear[0]!r}, which may have a decimal comma "
-            "or one between thousands: write it without, or put semicolons between the columns"
+            f"{path} has {cell.strip()!r} in column {unclear[0]!r}, whose comma may be a decimal "
+            "comma or separate thousands: write it without a comma, or separate the columns by "
+            "semicolons"
         )
     again = csv.read_csv(
         path,
@@ -380,7 +381,7 @@ def read_csv(path: Path) -> Table:
         if is_numeric(before) and not is_numeric(after):
             raise ValueError(
                 f"{path} has decimal commas in column {commas[0]!r} and decimal points in column "
-                f"{name!r}: write all numbers in one way"
+                f"{name!r}: use the same for all numbers"
             )
     return _with_units(again, below[0]) if units else again
 

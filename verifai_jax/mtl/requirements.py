@@ -49,8 +49,7 @@ class Requirement:
     """A requirement with an identifier, and its formula.
 
     - `id`: its identifier in tables and reports.
-    - `formula`: the required property; None if a problem has the formula, or if it is not written
-      yet.
+    - `formula`: the required property; None if a problem has the formula, or it is not written yet.
     - `text`: the sentence that the formula formalises.
     - `unit`: the unit of its robustness.
     - `source`: a standard or a document, with its number.
@@ -95,8 +94,8 @@ Requirements = Formula | str | Mapping[str, Formula | str] | Iterable[Formula | 
 def requirements_of(formulas: Requirements) -> tuple[Requirement, ...]:
     """Return formulas as requirements; those without an identifier become `R1`, `R2`, ...
 
-    **Raises:** `ValueError` for no formulas, for a duplicate identifier, and for a text that is not
-    a formula.
+    **Raises:** `ValueError` for no formulas, a duplicate identifier, and a text that is not a
+    formula.
     """
     if isinstance(formulas, Formula | str):
         formulas = [formulas]
@@ -167,7 +166,7 @@ def write_requirements(requirements: Iterable[Requirement], path: str | Path) ->
     """Write requirements to a CSV or a ReqIF file, which `read_requirements` reads again.
 
     **Returns:** the path.
-    **Raises:** `ValueError` for another file ending, and for content that `read_requirements` would
+    **Raises:** `ValueError` for another file ending, and content that `read_requirements` would
     refuse.
     """
     path = Path(path)

@@ -112,8 +112,8 @@ def _positions(cells: Int[np.ndarray, " passed"], count: int) -> Int[np.ndarray,
     each = (1 << int(rank.max() + 1).bit_length()) - 1
     if count * (each + 1) > MAX_SAMPLES:
         raise ValueError(
-            f"resampling to {count} samples has up to {int(rank.max()) + 1} recorded samples "
-            "between two of them, more than can be judged: take a shorter period, or cut the "
+            f"resampling to {count} samples leaves up to {int(rank.max()) + 1} recorded samples "
+            "between two of them, more than can be evaluated: take a shorter period, or cut the "
             "recording into parts"
         )
     positions = np.repeat(np.arange(count)[:, None], each, axis=1)
@@ -212,7 +212,9 @@ def without_gaps(trace: Trace, missing: Missing | Mapping[str, Missing]) -> Trac
             clock = np.asarray(trace.clock())
             signals[name] = held(signals[name]) if way == "hold" else filled(signals[name], clock)
     if not kept.any():
-        raise ValueError("no instant is left: at each one a signal whose gaps are dropped has one")
+        raise ValueError(
+            "no instant is left: at each instant some signal whose gaps are dropped has a gap"
+        )
     signals = {name: signal[kept] for name, signal in signals.items()}
     if trace.times is None and kept.all():
         return replace(trace, signals=signals, notes=notes)

@@ -226,8 +226,8 @@ def plain_period(dt: float, error: float) -> float:
 
 def _too_coarse(trace: Trace, resolution: float) -> str:
     return (
-        f": at {_at(trace, -1)} they are {np.asarray(trace.times).dtype} numbers, which lie "
-        f"{resolution:z.3g} s apart; give them in double precision, or in seconds since the first"
+        f": at {_at(trace, -1)} they are {np.asarray(trace.times).dtype} numbers, whose spacing is "
+        f"{resolution:z.3g} s; give them in double precision, or in seconds since the first"
     )
 
 

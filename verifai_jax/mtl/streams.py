@@ -228,8 +228,8 @@ class _Layout:
     def refuse_endless(self, f: Formula, b: float) -> None:
         if math.isinf(b):
             raise ValueError(
-                f"{f} looks ahead without end within another operator, which no bounded "
-                "memory can follow: give it an end, or monitor the recorded trace"
+                f"{f} looks ahead without end within another operator, which would need unbounded "
+                "memory: give it an end, or monitor the recorded trace"
             )
 
     def delay(self, slot: int, n: int, number: float) -> int:
@@ -240,7 +240,7 @@ class _Layout:
         return self.op("window", (slot,), n, sign, number) if n > 1 else slot
 
     def align(self, parts: Sequence[tuple[int, int]]) -> tuple[list[int], int]:
-        """Return streams of one delay, that of the slowest."""
+        """Delay all streams as much as the slowest; return them and the delay."""
         slowest = max(delay for _, delay in parts)
         return [self.delay(slot, slowest - delay, 0.0) for slot, delay in parts], slowest
 

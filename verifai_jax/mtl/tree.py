@@ -209,7 +209,7 @@ class Tree(Node):
         return self._total_reach(dt, "ahead")
 
     def history(self, dt: float = 0.0) -> float:
-        """Return the number of seconds before an instant on which its value there depends.
+        """Return how many seconds before an instant the formula's value there depends on.
 
         **Arguments:**
         - `dt`: sampling period in seconds, by which `prev` looks back.

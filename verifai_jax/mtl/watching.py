@@ -152,10 +152,8 @@ class Watch(Generic[R]):
     def steps(self, signals: Mapping[str, Any]) -> Float[np.ndarray, "time *formulas"]:
         """Process many samples, `[time]` (or `[time, k]`) by signal name.
 
-        **Returns:** the results of `step` for each sample; a column for each formula if there are
-        several.
-        **Raises:** `UnknownNameError` for a missing signal; `ValueError` for signals of different
-        lengths.
+        **Returns:** the results of `step` for each sample; several formulas have a column each.
+        **Raises:** `UnknownNameError` for a missing signal; `ValueError` for different lengths.
         """
         arrays: dict[str, np.ndarray] = {}
         for name, _ in self._columns:

@@ -31,7 +31,7 @@ FORMAT = "verifai_jax detector 1"
 class Detection(NamedTuple):
     """The output of a detector, for one image; batches have leading axes.
 
-    - `presence`: logit that the object is there; positive where it is more likely than not.
+    - `presence`: logit of the probability that the object is present; positive above one half.
     - `kinds`: logits of its kinds, `[kinds]`.
     - `values`: estimates of its numbers (a distance, the corners of a box), `[values]`.
     """
@@ -42,7 +42,7 @@ class Detection(NamedTuple):
 
 
 class DetectorFileError(ValueError):
-    """A file that holds no detector."""
+    """An error for a file without a detector."""
 
 
 Layer = tuple[Array, Array]
@@ -55,8 +55,8 @@ class Detector:
 
     - `convolutions`: weights `[9 * channels in, channels out]` and biases.
     - `dense`: weights and biases of the hidden layers and the last one.
-    - `centre`, `scale`: of the values, `[values]`; the last layer gives standardised ones.
-    - `kinds`: number of kinds to tell apart; 0 for one kind of object.
+    - `centre`, `scale`: those of the values, `[values]`; the last layer gives standardised values.
+    - `kinds`: number of kinds to distinguish; 0 if there is only one.
     - `shape`: height and width of its images.
     """
 
@@ -75,7 +75,7 @@ class Detector:
         return self._outputs(x.reshape(-1))
 
     def batch(self, images: Float[Array, "n height width 3"]) -> Detection:
-        """Detect in a batch by XLA's convolutions: for training, outside of loops of JAX."""
+        """Detect in a batch with XLA's convolutions: for training, outside of JAX loops."""
         x = images - 0.5
         for weights, bias in self.convolutions:
             kernel = weights.reshape(3, 3, x.shape[-1], -1)
@@ -134,11 +134,11 @@ def detector(
     **Arguments:**
     - `key`: the key of the weights.
     - `shape`: height and width of the images.
-    - `kinds`: number of kinds of objects to tell apart.
-    - `values`: numbers to estimate of an object.
-    - `channels`: the channels of the convolutions, each of which halves the image.
-    - `hidden`: units of the dense layers.
-    **Raises:** `ValueError` for images that are smaller than the convolutions make of them.
+    - `kinds`: number of kinds of objects to distinguish.
+    - `values`: number of values to estimate for an object.
+    - `channels`: the numbers of channels of the convolutions, each of which halves the image.
+    - `hidden`: numbers of units of the dense layers.
+    **Raises:** `ValueError` for images that are too small for this number of convolutions.
     """
     height, width = shape
     if min(height, width) < 2 ** len(channels):
@@ -191,9 +191,9 @@ def save_detector(path: str | Path, network: Detector) -> None:
 
 
 def load_detector(path: str | Path) -> Detector:
-    """Read a detector that `save_detector` wrote.
+    """Read a detector written by `save_detector`.
 
-    **Raises:** `DetectorFileError` for a file that holds something else.
+    **Raises:** `DetectorFileError` for any other file.
     """
     try:
         with np.load(path, allow_pickle=False) as file:

@@ -27,7 +27,7 @@ Description = TypeVar("Description")
 
 @dataclass_transform(frozen_default=True, field_specifiers=(dataclasses.field,))
 def described(kind: type[Description]) -> type[Description]:
-    """Make a class of descriptions: a frozen dataclass, its fields leaves of a pytree."""
+    """Make a class of descriptions: a frozen dataclass that is a pytree of its fields."""
     return jax.tree_util.register_dataclass(dataclasses.dataclass(frozen=True)(kind))
 
 
@@ -45,7 +45,7 @@ def vector(value: Vector) -> Float[Array, " n"]:
 def computed_once(arrays: Tree) -> Tree:
     """Return arrays that are stored before they are used.
 
-    Without it XLA computes what is small, or used many times, again for each pixel that needs it.
+    Otherwise XLA recomputes small or frequently used arrays for each pixel that needs them.
     """
     return jax.lax.optimization_barrier(arrays)
 
@@ -63,11 +63,11 @@ def normalized(a: Float[Array, "*n 3"]) -> Float[Array, "*n 3"]:
 class Rays(NamedTuple):
     """The rays of a camera: through pixel (i, j) goes `forward + down * v[i] + right * u[j]`.
 
-    - `eye`: where they start.
+    - `eye`: their origin.
     - `right`, `down`, `forward`: the axes of the image in the world.
     - `u`, `v`: coordinates of columns and rows at distance one.
     - `focal`: focal length in pixels.
-    - `level`: True where the horizon is known to be a row of the image.
+    - `level`: True if the horizon is known to be a row of the image.
     """
 
     eye: Float[Array, "3"]
@@ -87,7 +87,7 @@ class Rays(NamedTuple):
         return rows[..., :, None] + columns[..., None, :]
 
     def slopes(self, n: Float[Array, "*stack 3"]) -> tuple[Array, Array]:
-        """Return the derivatives of `linear(n)` to the right and down, in one pixel."""
+        """Return the change of `linear(n)` from one pixel to the next, to the right and down."""
         return dot(n, self.right) / self.focal, dot(n, self.down) / self.focal
 
     def pixels(self, n: Float[Array, "*stack 3"]) -> Float[Array, "*stack height width"]:
@@ -107,16 +107,16 @@ class Rays(NamedTuple):
 
 
 def coverage(pixels: Array) -> Array:
-    """Return the share of a pixel on the positive side of a line at this distance, in pixels.
+    """Return the share of a pixel on the positive side of a line at this distance in pixels.
 
-    It is exact for lines along the rows or columns of pixels, and a ramp of one pixel for others.
-    Its derivative is what gives geometry a gradient.
+    It is exact for lines along rows or columns, and a ramp of one pixel for others. Its derivative
+    gives geometry a gradient.
     """
     return jnp.clip(0.5 + pixels, 0.0, 1.0)
 
 
 def strip(one: Array, other: Array) -> Array:
-    """Return the share of a pixel between two parallel lines, exact for less than a pixel too."""
+    """Return the share of a pixel between two parallel lines, also exact below one pixel."""
     return jnp.maximum(coverage(one) + coverage(other) - 1.0, 0.0)
 
 
@@ -127,13 +127,13 @@ def round_edge(
     other: Float[Array, "*stack 3"],
     within: tuple[Float[Array, "*stack 3"], Float[Array, "*stack"]],
 ) -> Float[Array, "*stack height width"]:
-    """Return the distance in pixels within a conic, `radius . d >= |(one . d, other . d)|`.
+    """Return the distance in pixels inside a conic, `radius . d >= |(one . d, other . d)|`.
 
-    `within` is a ball around the curve, as its middle, seen from the eye, and its radius. It bounds
-    curves that are thinner than a pixel: from the whole of their axis the first-order distance is
-    small.
+    `within` is a ball around the curve, given by its centre as seen from the eye, and its radius.
+    It limits curves that are thinner than a pixel, whose first-order distance is small along the
+    whole axis.
 
-    The distance is that of first order: the function's value over the norm of its gradient
+    The distance is of first order: the function's value divided by the norm of its gradient
     (Sampson, "Fitting conic sections to very scattered data", 1982).
     """
     first, second = rays.linear(one), rays.linear(other)
@@ -153,7 +153,7 @@ def round_edge(
 def ball_edge(
     rays: Rays, away: Float[Array, "*stack 3"], radius: Float[Array, "*stack"]
 ) -> Float[Array, "*stack height width"]:
-    """Return the distance in pixels within the outline of a ball at `away` from the eye."""
+    """Return the distance in pixels inside the outline of a ball at `away` from the eye."""
     beyond = dot(away, away) - radius**2
     tangent = jnp.sqrt(jnp.maximum(beyond, TINY))[..., None, None]
     length = rays.lengths()
@@ -169,14 +169,14 @@ class Camera:
     """A pinhole camera.
 
     **Arguments:**
-    - `height`, `width`: pixels of the image.
+    - `height`, `width`: size of the image in pixels.
     - `field_of_view`: horizontal angle of view in rad.
-    - `position`: the position of the eye, in m.
+    - `position`: the position of the eye in m.
     - `yaw`: heading in rad, counterclockwise from the x axis.
-    - `pitch`: elevation of the optical axis in rad; -pi/2 looks down, the top of the image then
-      being ahead.
-    - `roll`: rotation about the optical axis in rad, clockwise. While it is the number 0.0, the
-      horizon is a row of the image, and quantities of a row are computed once a row.
+    - `pitch`: elevation of the optical axis in rad; with -pi/2 the camera looks down, and the top
+      of the image is ahead.
+    - `roll`: rotation about the optical axis in rad, clockwise. If it is the number 0.0, the
+      horizon is a row of the image, and quantities of a row are computed once for each row.
     - `rotation`: instead of the three angles, a matrix `[3, 3]` whose columns are the directions
       right, down and forward in the world.
     """

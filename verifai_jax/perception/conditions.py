@@ -24,16 +24,16 @@ SPOTS = 12
 class Conditions:
     """Weather, lens and sensor.
 
-    - `fog`: extinction in 1/m: what is d metres away keeps `exp(-fog d)` of its contrast.
+    - `fog`: extinction in 1/m: an object at d metres keeps `exp(-fog d)` of its contrast.
     - `fog_colour`: red, green and blue.
-    - `rain`: opacity in [0, 1] of streaks, elsewhere in each frame.
-    - `glare`: strength of a bright spot at `glare_at`, `(across, down)` in [0, 1], which has
+    - `rain`: opacity in [0, 1] of streaks, whose positions differ in each frame.
+    - `glare`: strength of a bright spot at `glare_at`, `(across, down)` in [0, 1], whose size is
       `glare_size` of the image's height.
-    - `dirt`: opacity in [0, 1] of spots on the lens, in the same places in all frames of a lens.
+    - `dirt`: opacity in [0, 1] of spots on the lens, at the same positions in all frames.
     - `blur`: standard deviation in pixels.
-    - `brightness`, `contrast`, `saturation`: factors; 1 changes nothing.
+    - `brightness`, `contrast`, `saturation`: factors; 1 has no effect.
     - `noise`: standard deviation of each channel of each pixel.
-    - `dead`: share of black pixels, the same in all frames of a lens.
+    - `dead`: share of black pixels, the same ones in all frames with a lens.
     """
 
     fog: Number = None
@@ -52,7 +52,7 @@ class Conditions:
 
 
 def transmission(conditions: Conditions, distance: Array) -> Array | None:
-    """Return the share of light that comes through the fog; None without fog."""
+    """Return the share of light transmitted by the fog; None without fog."""
     if conditions.fog is None:
         return None
     return jnp.exp(-jnp.asarray(conditions.fog, float) * distance)
@@ -72,13 +72,13 @@ def taken(
     key: Key[Array, ""] | None,
     lens: Key[Array, ""] | None,
 ) -> Float[Array, "3 height width"]:
-    """Return the image that a sensor behind a lens gives of `image`, in [0, 1].
+    """Return the image that a sensor with a lens records of `image`, in [0, 1].
 
     **Arguments:**
     - `image`: colours of the scene.
-    - `conditions`: fog apart, which is part of the scene.
-    - `key`: the key of what is drawn anew for each frame: noise and rain.
-    - `lens`: the key of what belongs to the lens and the sensor: dirt and dead pixels.
+    - `conditions`: the conditions, except fog, which is part of the scene.
+    - `key`: the key of random effects that differ between frames: noise and rain.
+    - `lens`: the key of random effects of the lens and the sensor: dirt and dead pixels.
     """
     _, height, width = image.shape
     if conditions.rain is not None:
@@ -131,7 +131,7 @@ def _bell(offset: Array, size: Array) -> Array:
 
 
 def blurred(image: Float[Array, "3 height width"], sigma: Number) -> Float[Array, "3 height width"]:
-    """Blur an image by a Gaussian of standard deviation `sigma`, in pixels."""
+    """Blur an image with a Gaussian of standard deviation `sigma`, in pixels."""
     sigma = jnp.maximum(jnp.asarray(sigma, float), 0.05)
 
     def kernel(pixels: int) -> Array:

@@ -37,10 +37,10 @@ NEAREST_FALL = 1e-4
 
 @described
 class Line:
-    """A line without ends through `position`, along the heading `yaw`.
+    """An infinite line through `position`, along the heading `yaw`.
 
-    - `width`: in m.
-    - `dash`, `gap`: lengths in m of what is painted and of what is not; no gap paints all of it.
+    - `width`: its width in m.
+    - `dash`, `gap`: lengths in m of the painted and unpainted pieces; without a gap all is painted.
     """
 
     position: Position = (0.0, 0.0)
@@ -53,7 +53,7 @@ class Line:
 
 @described
 class Rectangle:
-    """A rectangle about `position`, `size` its length along the heading `yaw` and its width."""
+    """A rectangle about `position`; `size` is its length along the heading `yaw`, and width."""
 
     position: Position = (0.0, 0.0)
     size: PyTree = (1.0, 1.0)
@@ -63,7 +63,7 @@ class Rectangle:
 
 @described
 class Disc:
-    """A disc about `position`."""
+    """A disc centred at `position`."""
 
     position: Position = (0.0, 0.0)
     radius: Number = 1.0
@@ -72,7 +72,7 @@ class Disc:
 
 @described
 class Ring:
-    """A ring about `position`, `radius` that of the middle of its `width`."""
+    """A ring centred at `position`; `radius` is that of the middle of its `width`."""
 
     position: Position = (0.0, 0.0)
     radius: Number = 1.0
@@ -82,7 +82,7 @@ class Ring:
 
 @described
 class Cross:
-    """A cross about `position`: two bars of length `size` and of `width`, one along `yaw`."""
+    """A cross centred at `position`: two bars of length `size` and of `width`, one along `yaw`."""
 
     position: Position = (0.0, 0.0)
     size: Number = 1.0

@@ -14,12 +14,12 @@ from verifai_jax.perception.camera import STATIC, Number, Vector, described, dot
 
 @described
 class Sun:
-    """Light from one direction, and from all.
+    """Directional light, and ambient light.
 
     - `azimuth`: direction towards the sun in rad, counterclockwise from the x axis.
-    - `elevation`: above the horizon in rad.
-    - `ambient`: share of the light that comes from everywhere; what faces the sun has light 1, what
-      is in shadow this much.
+    - `elevation`: elevation above the horizon in rad.
+    - `ambient`: share of ambient light; a surface facing the sun has brightness 1, one in shadow
+      this share.
     - `shadows`: whether solids cast shadows on the ground.
     """
 

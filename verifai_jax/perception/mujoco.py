@@ -29,7 +29,7 @@ NAMES = {1: "hfield", 4: "ellipsoid", 7: "mesh", 8: "sdf"}
 
 
 class Model(Protocol):
-    """The fields of an `MjModel` that are read."""
+    """The fields of an `MjModel` that are used."""
 
     geom_type: Int[np.ndarray, " geoms"]
     geom_size: Float[np.ndarray, "geoms 3"]
@@ -43,7 +43,7 @@ class Model(Protocol):
 
 
 class Data(Protocol):
-    """The fields of an `MjData` or an `mjx.Data` that are read."""
+    """The fields of an `MjData` or an `mjx.Data` that are used."""
 
     geom_xpos: Float[Array, "geoms 3"] | np.ndarray
     geom_xmat: Float[Array, "geoms ..."] | np.ndarray
@@ -54,11 +54,11 @@ class Data(Protocol):
 def mujoco_scene(
     model: Model, data: Data, *, sky: Sky | None = None, sun: Sun | None = None
 ) -> Scene:
-    """Return the scene of a model's geoms at the state that `data` holds.
+    """Return the scene of a model's geoms in the state of `data`.
 
-    Boxes, spheres and cylinders are drawn as they are, capsules as a cylinder and two spheres, and
-    the first plane is the ground, which must be level at z = 0. Invisible geoms are left out.
-    Textures are not drawn.
+    Boxes, spheres and cylinders are drawn exactly, capsules as a cylinder and two spheres. The
+    first plane is the ground, which must be level at z = 0. Invisible geoms and textures are not
+    drawn.
 
     **Raises:** `ValueError` for geoms of other kinds, with their name.
     """
@@ -77,7 +77,7 @@ def mujoco_scene(
         if kind not in (SPHERE, CAPSULE, CYLINDER, BOX):
             name = getattr(model.geom(number), "name", "") or f"geom {number}"
             raise ValueError(
-                f"{name!r} is a geom of kind {NAMES.get(kind, kind)}; the camera draws plane, "
+                f"{name!r} is a geom of kind {NAMES.get(kind, kind)}; the camera draws only plane, "
                 "sphere, capsule, cylinder, box"
             )
         solids += _solids(kind, positions[number], axes[number], size, colour)
@@ -105,9 +105,9 @@ def _solids(
 
 
 def mujoco_camera(model: Model, data: Data, name: str, height: int = 24, width: int = 48) -> Camera:
-    """Return a camera of a model at the state that `data` holds.
+    """Return a camera of a model in the state of `data`.
 
-    **Raises:** `UnknownNameError` for a name that the model's cameras do not have.
+    **Raises:** `UnknownNameError` for a camera that the model does not have.
     """
     names = [getattr(model.camera(number), "name", "") for number in range(model.ncam)]
     if name not in names:

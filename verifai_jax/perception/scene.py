@@ -43,7 +43,7 @@ class Scene:
     """Solids on a ground, under a sky.
 
     - `solids`: boxes, cones, cylinders, spheres.
-    - `ground`: the plane z = 0 with its markings; None has sky all around.
+    - `ground`: the plane z = 0 with its markings; with None there is sky in all directions.
     - `sky`, `sun`: colours and light.
     """
 
@@ -59,13 +59,13 @@ class Scene:
         key: Key[Array, ""] | None = None,
         lens: Key[Array, ""] | None = None,
     ) -> Float[Array, "height width 3"]:
-        """Return the image that a camera takes.
+        """Return the image taken by a camera.
 
         **Arguments:**
-        - `camera`: its pose must be above the ground.
-        - `conditions`: weather, lens and sensor; None is a clear day and a perfect camera.
-        - `key`: the key of what differs from frame to frame (noise, rain).
-        - `lens`: the key of what stays (dirt, dead pixels).
+        - `camera`: the camera, which must be above the ground.
+        - `conditions`: weather, lens and sensor; None for a clear day and a perfect camera.
+        - `key`: the key of random effects that differ between frames (noise, rain).
+        - `lens`: the key of random effects of the lens (dirt, dead pixels).
         **Returns:** red, green and blue in [0, 1].
         **Raises:** `ValueError` that names what does not fit.
         """
@@ -78,10 +78,10 @@ class Scene:
         return jnp.moveaxis(taken(jnp.stack(image), conditions, key, lens), 0, -1)
 
     def depth(self, camera: Camera) -> Float[Array, "height width"]:
-        """Return the distance in m along the optical axis of what each pixel's ray meets.
+        """Return the distance in m along the optical axis of the surface in each pixel.
 
-        It is infinite where that is the sky. A pixel that solids cover by less than half shows what
-        is behind them.
+        It is infinite for the sky. A pixel of which solids cover less than half shows what is
+        behind them.
         """
         check_scene(self, camera, None)
         rays = camera.rays()
@@ -194,8 +194,7 @@ SOLIDS = (Box, Cone, Cylinder, Sphere)
 def check_scene(scene: Any, camera: Camera, conditions: Conditions | None) -> Conditions:
     """Check a scene, a camera and conditions; None stands for a clear day.
 
-    **Raises:** `ValueError` or `TypeError` that names the description, its field and what it should
-    be.
+    **Raises:** `ValueError` or `TypeError` with the description, its field and the allowed values.
     """
     conditions = Conditions() if conditions is None else conditions
     if not isinstance(camera, Camera):

@@ -56,7 +56,7 @@ class Box:
 class Cone:
     """A cone on its base.
 
-    - `position`: middle of the base, in m.
+    - `position`: middle of the base in m.
     - `radius`, `height`: in m.
     - `colour`: red, green and blue in [0, 1].
     - `axis`: direction from the base to the tip; `(1, 0, 0)` for one that has fallen forwards.
@@ -93,13 +93,13 @@ Solid: TypeAlias = Box | Cone | Cylinder | Sphere
 
 
 class Look(NamedTuple):
-    """The look of solids of one kind.
+    """The appearance of solids of one kind.
 
     - `cover`: share of each pixel that each of them covers.
-    - `depth`: distance along the optical axis in m of what a ray meets; meaningful where covered.
-    - `light`: brightness of the surface there.
+    - `depth`: distance along the optical axis in m of the surface; only meaningful where covered.
+    - `light`: brightness of the surface.
     - `shadow`: share of each pixel of the ground in their shadow; None without shadows.
-    - `centre`: a point within each.
+    - `centre`: a point inside each solid.
     """
 
     cover: Float[Array, "solids height width"]
@@ -110,7 +110,7 @@ class Look(NamedTuple):
 
 
 def look(rays: Rays, solids: Sequence[Solid], sun: Sun, shadows: bool) -> Look:
-    """Return how solids of one kind look."""
+    """Return the appearance of solids of one kind."""
     kind = type(solids[0])
     if kind is Box:
         return _boxes(rays, solids, sun, shadows)  # pyright: ignore[reportArgumentType]

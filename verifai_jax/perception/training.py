@@ -25,8 +25,8 @@ class Labels(NamedTuple):
     """The truth about images.
 
     - `present`: whether the object is in the image.
-    - `values`: numbers of it, `[n, values]`; ignored where it is absent.
-    - `kinds`: its kind, from 0; None if there is one kind only.
+    - `values`: its values, `[n, values]`; ignored if it is absent.
+    - `kinds`: its kind, from 0; None if there is only one kind.
     """
 
     present: Bool[Array, " n"] | Float[Array, " n"] | np.ndarray
@@ -48,22 +48,22 @@ def train_detector(
     seed: int = 0,
     progress: bool | None = None,
 ) -> tuple[Detector, Float[np.ndarray, " steps"]]:
-    """Train a detector by Adam with a cosine schedule of the learning rate.
+    """Train a detector with Adam and a cosine schedule of the learning rate.
 
-    One step is compiled; the loop is Python's, because convolutions within loops of JAX are slow on
+    One step is compiled; the loop runs in Python, because convolutions inside JAX loops are slow on
     CPUs. Rows are drawn without replacement, epoch by epoch.
 
     **Arguments:**
     - `images`: colours in [0, 1].
     - `labels`: the labels of each image.
-    - `network`: one to go on from; None begins anew, with the layers that `detector` chooses.
+    - `network`: a detector to train further; None for a new one with default layers.
     - `steps`, `batch`: number of steps, and images in each.
     - `learning_rate`: the learning rate of the first step.
-    - `noise`: standard deviation of what is added to each pixel, anew in each step.
+    - `noise`: standard deviation of noise added to each pixel in each step.
     - `seed`: the seed of the weights, the order of the images and the noise.
     - `progress`: whether to show one line of progress; see `core.display.progress` for the default.
     **Returns:** the network, and the loss of each step.
-    **Raises:** `ValueError` where images and labels do not fit.
+    **Raises:** `ValueError` if images and labels do not match.
     """
     images = jnp.asarray(images, jnp.float32)
     labels = _checked(images, labels)
@@ -111,7 +111,7 @@ def _checked(images: Array, labels: Labels) -> Labels:
 
 
 def standardized(network: Detector, labels: Labels) -> Detector:
-    """Return a detector whose values have the mean and deviation of objects that are there."""
+    """Return a detector with values scaled by the mean and deviation over present objects."""
     there = np.asarray(labels.present) > 0.5
     if not there.any():
         return network
@@ -150,9 +150,9 @@ def _step_of(optimizer: optax.GradientTransformation, noise: float):
 
 
 def losses_of(network: Detector, seen: Detection, labels: Labels) -> Float[Array, " n"]:
-    """Return the loss of each image: cross-entropy, and Huber's of the standardised values.
+    """Return the loss of each image: cross-entropy, and the Huber loss of the standardised values.
 
-    Values and kinds count where the object is there.
+    Values and kinds count only if the object is present.
     """
     present = jnp.asarray(labels.present, jnp.float32)
     loss = optax.sigmoid_binary_cross_entropy(seen.presence, present)
@@ -171,8 +171,8 @@ class Score(InNotebook):
     - `images`: number of images.
     - `precision`: share of the detections that are right; NaN without any.
     - `recall`: share of the objects that are detected.
-    - `error`: median absolute error of each value, of objects that are detected.
-    - `wrong`: for each image, whether presence, or a value by more than the tolerance, is wrong.
+    - `error`: median absolute error of each value, over detected objects.
+    - `wrong`: for each image, whether presence is wrong, or a value by more than the tolerance.
     """
 
     images: int
@@ -183,7 +183,7 @@ class Score(InNotebook):
 
     @property
     def error_rate(self) -> float:
-        """Share of the images that are judged wrongly."""
+        """Share of the images with a wrong output."""
         return float(np.mean(self.wrong))
 
     def __str__(self) -> str:

@@ -49,8 +49,7 @@ class Behaviour:
     - `cells`: signal -> `(low, high, cells)`: the range and the number of equally wide cells of the
       signal. A cell of the behaviour is one combination of cells of all these signals.
     - `formulas`: the formulas whose clause nearest to breaking also counts; none when left out.
-    **Raises:** `ValueError` for a signal without a range, or if the cells of all signals are too
-    many.
+    **Raises:** `ValueError` for a signal without a range, or too many cells of all signals.
     """
 
     axes: tuple[Axis, ...]
@@ -73,8 +72,8 @@ class Behaviour:
         total = math.prod(axis.cells for axis in axes)
         if total > MAX_CELLS:
             raise ValueError(
-                f"the signals {', '.join(cells)} have {total} cells together, and at most "
-                f"{MAX_CELLS} can be told apart; give fewer cells or fewer signals"
+                f"the signals {', '.join(cells)} give {total} combinations of cells, and at most "
+                f"{MAX_CELLS} are allowed; give fewer cells or fewer signals"
             )
         object.__setattr__(self, "axes", tuple(axes))
         object.__setattr__(self, "formulas", tuple(formulas))

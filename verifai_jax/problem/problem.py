@@ -266,8 +266,7 @@ class Problem(InNotebook):
         - `of`: the argument of the function: `"unit"`, a point `[dim]` of the unit cube, or
           `"features"`, a dictionary by name.
         - `key`: random key of the simulation; `jax.random.key(0)` when left out.
-        - `formula`: name of the one formula to evaluate; the least robustness over all when left
-          out.
+        - `formula`: name of the formula to evaluate; by default the least robustness over all.
         **Returns:** a function `(point, key=key)` to a scalar: positive where the property holds,
         NaN where the simulation has no verdict. It does not check that a point lies in its domains
         and keeps the constraint of the space.
@@ -414,8 +413,7 @@ def _requirements(given: str | Path | Iterable[Requirement] | None) -> tuple[Req
     found = tuple(given or ())
     if other := next((each for each in found if not isinstance(each, Requirement)), None):
         raise ProblemError(
-            f"requirements must be a file or Requirements, as mtl.read_requirements gives; got "
-            f"{other!r}"
+            f"requirements must be a file or Requirements from mtl.read_requirements; got {other!r}"
         )
     return found
 

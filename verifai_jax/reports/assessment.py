@@ -62,7 +62,7 @@ STEPS = (
 
 
 def with_assessment(page: Page) -> Page:
-    """Return a page with the claims as a tree, the nine steps of credibility, and signatures."""
+    """Return a page with a tree of claims, the nine steps of credibility, and signatures."""
     titles = {section.anchor: section.title for section in page.sections}
     content: list[Markup] = [
         paragraph(
@@ -101,7 +101,7 @@ def claims_tree(subject: str, headline: str, claims: Sequence[Mapping[str, Any]]
 
     **Arguments:**
     - `headline`: the goal at the root.
-    - `claims`: as plain data.
+    - `claims`: the claims as plain data.
     """
     shared = list(dict.fromkeys(text for each in claims for text in each["assumptions"]))
     parts: list[Markup] = []

@@ -16,11 +16,11 @@ FORMAT = 1
 class Claim:
     """A sentence that the evidence supports.
 
-    - `identifier`: by which a safety case cites it, such as `C2`.
+    - `identifier`: the identifier for safety cases to cite, such as `C2`.
     - `claim`: the sentence.
-    - `evidence`: what it rests on.
-    - `assumptions`: what must hold besides, for the claim to hold.
-    - `requirements`: identifiers of those that it is about; empty for all of the report's.
+    - `evidence`: the evidence on which it rests.
+    - `assumptions`: assumptions under which the claim holds.
+    - `requirements`: identifiers of its requirements; empty for all requirements of the report.
     """
 
     identifier: str
@@ -37,7 +37,7 @@ def claims_json(
 
     **Arguments:**
     - `chain`: last hash of the chain over all inputs of the report.
-    - `about`: what `vj.trace_matrix` compares with what there is later, see `about_json`.
+    - `about`: the subject of the claims, for comparison in `vj.trace_matrix`; see `about_json`.
     """
     return {
         "format": FORMAT,
@@ -55,14 +55,14 @@ def about_json(
     model: str = "",
     backend: str | None = None,
 ) -> dict[str, Any]:
-    """Describe what claims are about as plain data.
+    """Describe the subject of claims as plain data.
 
     **Arguments:**
     - `result`: `"run"` or `"estimate"`.
     - `formulas`: their texts by name.
-    - `requirements`: what they stand for, by name.
-    - `model`: a hash of what was simulated; empty where that is not known.
-    - `backend`: that simulated it.
+    - `requirements`: the requirements of the formulas, by name.
+    - `model`: a hash of the simulated model; empty if unknown.
+    - `backend`: the backend that simulated it.
     """
     return {
         "result": result,

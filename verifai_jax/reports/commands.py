@@ -14,9 +14,9 @@ from verifai_jax.search import named
 
 
 def run_command(run: Run) -> str | None:
-    """Return the command that repeats a run; None if no command can.
+    """Return the command that repeats a run; None if there is none.
 
-    A run of a problem that no file names, or with a search that has no name, is repeated in Python.
+    A run of a problem without a file, or a search without a name, is repeated in Python.
     """
     search = run.search_data or {}
     objective = ["--objective", "likelihood"] if "likeliest" in search else []
@@ -77,7 +77,7 @@ def report_command(
     studies: bool | None = None,
     modes: int | None = None,
 ) -> str:
-    """Return the command that builds a report from a folder again, with its options."""
+    """Return the command that builds a report from a folder again, including its options."""
     words = ["verifai-jax", "report", shown_folder(folder)]
     for option, texts in (("--unit", units), ("--reason", reasons)):
         for name, text in texts.items():

@@ -24,7 +24,7 @@ def comparison_page(comparison: Comparison, about: About, problem: Problem | Non
     """Make the report on a comparison.
 
     **Arguments:**
-    - `problem`: the baseline; None if it is not at hand.
+    - `problem`: the baseline problem; None if not available.
     """
     # That of one side says nothing of the files of the others.
     model = Model.of(comparison.sources.values())

@@ -58,29 +58,29 @@ def write_report(
 
     **Arguments:**
     - `result`: a run, a sweep, an estimate, a verification, a comparison, a transfer, a failure
-      table or a judgement. The failures of a run that has its problem are simulated again.
+      table or a judgement. The failures of a run with its problem are simulated again.
     - `path`: the path of the HTML file; the claims go to the same name with the ending
       `.claims.json`.
     - `units`: the units of features, by name.
-    - `reasons`: why a feature has the range that it has, by name.
-    - `traces`: rows of a run that are simulated beforehand at most; 24 by default, 5 for a black
-      box that takes long.
-    - `studies`: whether the worst failure of a run is explained and shrunk; by default unless the
-      system is a black box that takes long.
-    - `modes`: simulations spent on all ways of failing of a run and their probabilities, as
-      `vj.modes` finds them; none when left out.
-    - `problem`: the problem of an estimate, a verification or a failure table without a failure, or
-      the baseline of a comparison, for its property and prior.
-    - `errors`: how wrong the number can be, as `vj.error_budget` says: a section and a claim.
-    - `odd`: the operational design domain, of `vj.read_odd`: a section on what a run covers of it;
-      its units, and its reasons with their sources, are those of features without others.
-    - `assessment`: whether sections for an assessor follow: the claims as a tree, the nine steps of
-      credibility with boxes to be filled in, and a page to be signed.
+    - `reasons`: the reasons for the ranges of features, by name.
+    - `traces`: maximum number of rows of a run that are simulated for the report; 24 by default, 5
+      for a slow black box.
+    - `studies`: whether to explain and shrink the worst failure of a run; by default unless the
+      system is a slow black box.
+    - `modes`: number of simulations for the modes of failure of a run and their probabilities, as
+      in `vj.modes`; none when left out.
+    - `problem`: the problem of an estimate, of a verification, or of a failure table without a
+      failure, or the baseline of a comparison; the report shows its property and prior.
+    - `errors`: a result of `vj.error_budget`, for a section and a claim on how wrong the number can
+      be.
+    - `odd`: the operational design domain, from `vj.read_odd`; adds a section on how much of it a
+      run covers. Features without their own units and reasons take those of the domain.
+    - `assessment`: whether to add sections for an assessor: the claims as a tree, the nine steps of
+      credibility with boxes to fill in, and a page to sign.
     - `progress`: whether to show one line of progress; see `core.display.progress` for the default.
     **Raises:** `UnknownNameError` for a unit or a reason of a feature that does not exist;
-    `ValueError` for a number of simulations that is none, and for a run whose rows have changed
-    since they were written;
-    `TypeError` for something that is not a result.
+    `ValueError` for an invalid number of simulations, and for a run whose rows have changed since
+    they were written; `TypeError` for an object that is not a result.
     """
     path = Path(path)
     about = About(

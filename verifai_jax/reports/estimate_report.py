@@ -19,7 +19,7 @@ def estimate_page(estimate: Estimate, about: About, problem: Problem | None) -> 
     """Make the report on an estimate.
 
     **Arguments:**
-    - `problem`: what was asked; None if it is not at hand.
+    - `problem`: the problem of the estimate; None if not available.
     """
     model = Model.of([estimate.sources], None if problem is None else problem.sources())
     sure = format_percent(estimate.confidence)

@@ -20,7 +20,7 @@ def failure_table_page(found: FailureTable, about: About, problem: Problem | Non
     """Make the report on a failure table.
 
     **Arguments:**
-    - `problem`: the problem with its faults; None if it is not at hand.
+    - `problem`: the problem with its faults; None if not available.
     """
     run, sure = found.run, format_percent(found.confidence)
     model = Model.of(() if run is None else run.sources, problem and problem.sources())

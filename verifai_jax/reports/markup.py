@@ -20,7 +20,7 @@ VOID = frozenset({"br", "hr", "img", "meta", "input"})
 
 
 class Markup(str):
-    """A text that is HTML already."""
+    """A text that is already HTML."""
 
 
 Child: TypeAlias = "str | int | float | Iterable[Child] | None"
@@ -28,12 +28,12 @@ Child: TypeAlias = "str | int | float | Iterable[Child] | None"
 
 
 def escape(text: object) -> Markup:
-    """Return a text as HTML that shows it; characters that steer are shown as escapes."""
+    """Return a text as HTML that displays it, with control characters as escapes."""
     return Markup(html.escape(printable(str(text))))
 
 
 def join(*children: Child) -> Markup:
-    """Return the HTML of several children, one after another."""
+    """Return the HTML of several children, concatenated."""
     parts = []
     for child in children:
         if child is None:
@@ -48,10 +48,11 @@ def join(*children: Child) -> Markup:
 
 
 def element(tag: str, *children: Child, **attributes: str | int | None) -> Markup:
-    """Return an element.
+    """Return an HTML element.
 
     **Arguments:**
-    - `attributes`: by name; `class_` is `class`, `aria_label` is `aria-label`, None is left out.
+    - `attributes`: attributes by name; `class_` is `class`, `aria_label` is `aria-label`, None is
+      left out.
     """
     words = [
         f' {name.rstrip("_").replace("_", "-")}="{escape(value)}"'
@@ -73,17 +74,17 @@ def bullets(items: Iterable[Child]) -> Markup:
 
 
 def preformatted(text: str) -> Markup:
-    """Return lines of text as they are, such as a command."""
+    """Return preformatted lines of text, such as a command."""
     return element("pre", element("code", text))
 
 
 def table(heads: Sequence[str], rows: Iterable[Sequence[Child]], caption: str = "") -> Markup:
-    """Return a table that scrolls by itself where the page is narrow.
+    """Return a table that scrolls on its own on narrow pages.
 
     **Arguments:**
-    - `heads`: the heads of the columns.
-    - `rows`: their cells; the first of each is the head of its row.
-    - `caption`: above the table, if any.
+    - `heads`: the headings of the columns.
+    - `rows`: their cells; the first cell is the heading of its row.
+    - `caption`: the text above the table, if any.
     """
     body = [
         element("tr", element("th", first, scope="row"), [element("td", cell) for cell in others])
@@ -105,11 +106,11 @@ def table(heads: Sequence[str], rows: Iterable[Sequence[Child]], caption: str = 
 
 
 def picture(content: bytes, alternative: str, caption: str = "", kind: str = "png") -> Markup:
-    """Return a figure with a picture inside of the page.
+    """Return a figure with an embedded picture.
 
     **Arguments:**
     - `alternative`: text for readers who cannot see the picture.
-    - `caption`: below it; the words again when left out.
+    - `caption`: the text below it; by default the alternative text.
     - `kind`: `"png"` or `"gif"`.
     """
     data = base64.b64encode(content).decode()
@@ -121,7 +122,7 @@ def picture(content: bytes, alternative: str, caption: str = "", kind: str = "pn
 
 
 def data_block(name: str, value: Mapping[str, Any] | Sequence[Any]) -> Markup:
-    """Return plain data as JSON inside of the page, which no text of it can end.
+    """Return plain data as an embedded JSON block that no text in the data can close.
 
     **Arguments:**
     - `name`: id of the block.

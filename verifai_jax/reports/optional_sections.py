@@ -24,7 +24,7 @@ ADDED = (
 
 
 def with_errors(page: Page, errors: ErrorBudget) -> Page:
-    """Return a page with the section before what was not shown, and its claim as `E1`."""
+    """Return a page with this section before the limits, and its claim as `E1`."""
     rows: list[Sequence[Child]] = [
         (
             part.name,
@@ -51,7 +51,7 @@ def with_errors(page: Page, errors: ErrorBudget) -> Page:
 
 
 def with_odd(page: Page, found: OddCoverage) -> Page:
-    """Return a page with the section before what was not shown."""
+    """Return a page with this section before the limits."""
     rows = []
     for each in found.domain.attributes:
         row = found.table.loc[each.name].to_dict()
@@ -87,7 +87,7 @@ MAX_MODES = 8
 
 
 def modes_section(found: Modes, about: About) -> Section:
-    """Write the ways of failing, the most probable first."""
+    """Write the modes of failure, the most probable first."""
     content: list[Markup] = [paragraph(_whole(found))]
     if found.modes:
         rows = [
@@ -113,7 +113,7 @@ def modes_section(found: Modes, about: About) -> Section:
 
 
 def mode_claims(found: Modes) -> list[tuple[str, tuple[str, ...], tuple[str, ...]]]:
-    """Return sentence, evidence and assumptions of what the modes let one claim."""
+    """Return sentence, evidence and assumptions of the claims that the modes support."""
     evidence = (f"{found.simulations:,} simulations of their own",)
     assumptions = (MODEL, SAMPLES, NOT_SEEN)
     claims: list[tuple[str, tuple[str, ...], tuple[str, ...]]] = [

@@ -22,7 +22,7 @@ from verifai_jax.reports.markup import Markup, bullets, data_block, element, joi
 
 @dataclass(frozen=True)
 class Section:
-    """A part of a page: `anchor` that links lead to, `title`, and `content` below it."""
+    """A part of a page: `anchor` for links, `title`, and `content`."""
 
     anchor: str
     title: str
@@ -31,15 +31,15 @@ class Section:
 
 @dataclass(frozen=True)
 class Page:
-    """A report before it is written.
+    """The parts of a report before it is rendered.
 
     - `title`: the title of the page.
     - `headline`: the finding in a sentence.
-    - `tone`: `"fails"`, `"holds"` or `"open"`: how the headline is marked.
-    - `sections`: in their order.
-    - `claims`: as plain data.
+    - `tone`: how the headline is marked: `"fails"`, `"holds"` or `"open"`.
+    - `sections`: the sections in order.
+    - `claims`: the claims as plain data.
     - `view`: data of the interactive table; None without one.
-    - `warnings`: what a reader must know before anything else, below the headline.
+    - `warnings`: warnings below the headline.
     """
 
     title: str
@@ -52,27 +52,27 @@ class Page:
 
 
 def before_limits(page: Page, section: Section) -> Page:
-    """Return a page with a section before the one on what was not shown."""
+    """Return a page with a section inserted before the one on its limits."""
     index = next(i for i, each in enumerate(page.sections) if each.anchor == "limits")
     return replace(page, sections=(*page.sections[:index], section, *page.sections[index:]))
 
 
 def asset(name: str) -> str:
-    """Return the text of a file that lies next to this one."""
+    """Return the text of a file next to this module."""
     return resources.files("verifai_jax.reports").joinpath(name).read_text(encoding="utf-8")
 
 
 def write_page(page: Page, path: str | Path) -> None:
-    """Write a page as an HTML file, whole or not at all.
+    """Write a page as an HTML file, atomically.
 
-    **Raises:** `OSError` that names the file, for whatever the file system refuses.
+    **Raises:** `OSError` that names the file, if the file system refuses.
     """
     with replacing(path) as partial:
         partial.write_text(render(page), encoding="utf-8", newline="\n")
 
 
 def render(page: Page) -> str:
-    """Write a page as HTML."""
+    """Convert a page to HTML."""
     style = asset("page.css") + asset("view.css")
     script = "" if page.view is None else asset("view.js") + asset("page.js")
     policy = "; ".join(

@@ -23,14 +23,14 @@ PACKAGES = ("jax", "jaxlib", "numpy", "scipy", "pandas", "scikit-learn", "matplo
 
 
 class Link(NamedTuple):
-    """An input with the hash of the chain up to it."""
+    """An input with the hash of the chain up to and including it."""
 
     input: Input
     chain: str
 
 
 def chained(inputs: Iterable[Input]) -> list[Link]:
-    """Chain the hashes of inputs in their order."""
+    """Chain the hashes of inputs in order."""
     chain, links = "", []
     for each in inputs:
         chain = hashlib.sha256(f"{chain}\n{each.name}\n{each.sha256}".encode()).hexdigest()
@@ -42,7 +42,7 @@ def folder_inputs(folder: Path, roles: Sequence[tuple[str, str]]) -> list[Input]
     """Hash files of a folder of results.
 
     **Arguments:**
-    - `roles`: patterns of file names, and what these files are; the order is that of the chain.
+    - `roles`: patterns of file names with their description, in the order of the chain.
     """
     return [
         Input(file.relative_to(folder).as_posix(), role, file_hash(file))
@@ -53,11 +53,10 @@ def folder_inputs(folder: Path, roles: Sequence[tuple[str, str]]) -> list[Input]
 
 
 class Model(NamedTuple):
-    """The files that a result was made of, and those of them that are others by now.
+    """The files from which a result was made, and those that have changed since.
 
-    - `parts`: as it was recorded, once for each part of a run with a model of its own; none where
-      that is not recorded.
-    - `changes`: since then.
+    - `parts`: the recorded files, for each part of a run with its own model; none if not recorded.
+    - `changes`: the changes since then.
     """
 
     parts: tuple[Sources, ...]
@@ -65,14 +64,14 @@ class Model(NamedTuple):
 
     @classmethod
     def of(cls, recorded: Iterable[Mapping[str, Any]], now: Sources | None = None) -> "Model":
-        """Compare what was recorded with what is there now, on the disk where `now` is None."""
+        """Compare the recorded files with the present ones, on disk if `now` is None."""
         parts = tuple(Sources.from_json(each) for each in recorded if each)
         changes = [change for part in parts for change in part.changes(now)]
         return cls(parts, tuple(dict.fromkeys(changes)))
 
     @property
     def inputs(self) -> list[Input]:
-        """The files of the model with the hashes that they had."""
+        """The files of the model with their recorded hashes."""
         found = {}
         for part in self.parts:
             for file in part.files:
@@ -82,7 +81,7 @@ class Model(NamedTuple):
 
     @property
     def answer(self) -> str:
-        """A sentence on whether the model is still the one that ran."""
+        """A sentence on whether the model has changed."""
         if not self.parts:
             return "Not recorded: nobody can say whether the model is still the one that ran."
         if self.changes:
@@ -93,7 +92,7 @@ class Model(NamedTuple):
 
 
 def versions() -> list[tuple[str, str]]:
-    """Return names and versions of what rebuilds a report: Python, this package, and others."""
+    """Return names and versions of the software for a report: Python, this package, and others."""
     found = [("verifai_jax", __version__), ("Python", platform.python_version())]
     for package in PACKAGES:
         try:

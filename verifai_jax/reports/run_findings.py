@@ -37,14 +37,14 @@ _NOT_AGAIN = "Not all rows give their numbers when they are simulated again."
 
 
 def findings(run: Run) -> Section:
-    """Write what was found, in numbers."""
+    """Write the findings in numbers."""
     content = [table(["number", "value"], number_rows(run))]
     content += [element("h3", "The summary, as the tool prints it"), preformatted(run.summary())]
     return Section("found", "What was found", tuple(content))
 
 
 def number_rows(run: Run) -> list[tuple[str, Child]]:
-    """Return the numbers of a run, each with its words."""
+    """Return the numbers of a run, each with its description."""
     counts = run.table.counts
     rows: list[tuple[str, Child]] = [
         ("simulations", f"{run.simulations:,}"),
@@ -76,7 +76,7 @@ def number_rows(run: Run) -> list[tuple[str, Child]]:
 
 
 def no_rate(run: Run) -> str:
-    """Say why a run has no failure rate."""
+    """Explain why a run has no failure rate."""
     if not run.prior:
         return f"not given: {why_no_rate(run)}, so that the rows are no sample of the prior"
     return "not given: no simulation has a verdict"
@@ -156,7 +156,7 @@ def _improbability(run: Run, number: int) -> dict[str, float]:
 
 
 def reasons(studies: Studies) -> Section | None:
-    """Write why the worst failure fails, and the least departure that still does."""
+    """Write why the worst failure fails, and the smallest departure that still fails."""
     content: list[Markup] = []
     if (why := studies.explained) is not None:
         content += [
@@ -189,7 +189,7 @@ def analysis(studies: Studies) -> Section:
 
 
 def explore(run: Run, view: dict, studies: Studies) -> Section:
-    """Write the place of the interactive table, and what stands there without JavaScript."""
+    """Write the element of the interactive table, with its replacement without JavaScript."""
     shown, all_rows = view["shown"], run.simulations
     thinned = (
         f"Of {all_rows:,} rows {shown:,} are shown, spread evenly over each verdict."
@@ -219,7 +219,7 @@ def explore(run: Run, view: dict, studies: Studies) -> Section:
 
 
 def not_claimed_rows(run: Run, maximum: int = 20) -> Iterable[Child]:
-    """Write rows that violate as simulated, and that closer replays did not let be claimed."""
+    """Write the rows that violate as simulated but that closer replays did not confirm."""
     rows = run.table.unconfirmed.sort_values("rho")
     for row_number, row in list(rows.to_dict("index").items())[:maximum]:
         again = float(row.get("rho_again", math.nan))
@@ -230,7 +230,7 @@ def not_claimed_rows(run: Run, maximum: int = 20) -> Iterable[Child]:
 
 
 def limits(run: Run, studies: Studies, assumptions: list[str]) -> Section:
-    """Write what was not shown, and what each interval assumes."""
+    """Write the limits of the results, and the assumptions of each interval."""
     content = [
         element("h3", "Not sampled"),
         bullets(not_sampled(run, studies)),
@@ -250,7 +250,7 @@ def limits(run: Run, studies: Studies, assumptions: list[str]) -> Section:
 
 
 def not_sampled(run: Run, studies: Studies) -> list[str]:
-    """Say which inputs no simulation had."""
+    """Say which inputs no simulation covered."""
     items = [
         "Values outside of the ranges above: nothing is known of them.",
         "Whatever the system does not take from the features, such as other disturbances, parts "

@@ -29,14 +29,14 @@ DEMANDED = ("text", "source", "severity", "rationale", "links")
 
 @dataclass(frozen=True)
 class About:
-    """Words of a person on the features: their `units` and the `reasons` of their ranges."""
+    """A user's descriptions of the features: their `units` and the `reasons` of their ranges."""
 
     units: Mapping[str, str]
     reasons: Mapping[str, str]
 
 
 def question(run: Run, about: About) -> Section:
-    """Write what was asked."""
+    """Write the question that the run answers."""
     space = space_of(run)
     content = [
         *property_content(run.formulas, run.problem, run.requirements),
@@ -50,7 +50,7 @@ def question(run: Run, about: About) -> Section:
 
 
 def space_of(run: Run) -> FeatureSpace | None:
-    """Return the feature space of a run; None if the record cannot say."""
+    """Return the feature space of a run; None if the record does not contain it."""
     if run.problem is not None:
         return run.problem.space
     try:
@@ -67,12 +67,12 @@ def _unknown(features: Any) -> Any:
 def property_content(
     texts: Mapping[str, str], problem: Problem | None, requirements: Mapping[str, Mapping[str, str]]
 ) -> list[Markup]:
-    """Write properties as formulas and in words.
+    """Write properties as formulas and in English.
 
     **Arguments:**
     - `texts`: the texts of the formulas by name.
-    - `problem`: for what else is known; None if it is not.
-    - `requirements`: what the formulas stand for, by name.
+    - `problem`: the problem, for further information; None if not available.
+    - `requirements`: the requirements of the formulas, by name.
     """
     rows = [
         (name, element("code", text), formula_words(parse(text))) for name, text in texts.items()
@@ -101,7 +101,7 @@ def _all(count: int) -> str:
 
 
 def prior_rows(space: FeatureSpace) -> list[tuple[str, str]]:
-    """Return each feature with its prior in words."""
+    """Return each feature with a description of its prior."""
     return [(name, domain.words()) for name, domain in space.domains.items()]
 
 
@@ -115,7 +115,7 @@ def _space(run: Run, space: FeatureSpace | None, about: About) -> Markup:
 
 
 def space_table(space: FeatureSpace, nominal: Mapping[str, Any], about: About) -> Markup:
-    """Write each feature with its prior, unit, nominal value and the reason of its range."""
+    """Write each feature with its prior, unit, nominal value and the reason for its range."""
     rows: list[list[Child]] = []
     for name, words in prior_rows(space):
         usual = _nominal(nominal[name]) if name in nominal else NO_REASON
@@ -147,7 +147,7 @@ def _constraint(run: Run, space: FeatureSpace | None) -> list[Markup]:
 
 
 def system_rows(run: Run) -> list[tuple[str, Child]]:
-    """Return what simulated and what searched, by name."""
+    """Return names and descriptions of the system and the search."""
     problem = run.problem
     rows: list[tuple[str, Child]] = []
     if run.target is not None:

@@ -89,8 +89,7 @@ def run_page(
 
     **Arguments:**
     - `traces`, `studies`, `modes`: as in `write_report`.
-    - `words`: further ones of the command that builds the report again; None if there is no command
-      for all of it.
+    - `words`: further words of the command that builds the report again; None without a command.
     """
     found = study(run, traces, studies, modes)
     now = None if run.problem is None else run.problem.sources()
@@ -137,7 +136,7 @@ def run_page(
 
 
 def headline(run: Run) -> str:
-    """Write the finding in a sentence or two."""
+    """Write the main finding in a sentence or two."""
     counts, text = run.table.counts, _finding(run)
     if run.simulations in (0, counts.without_verdict):
         return text
@@ -162,7 +161,7 @@ def _finding(run: Run) -> str:
 
 
 def assumptions(run: Run) -> list[str]:
-    """Return what must hold for the numbers to mean what they say."""
+    """Return the assumptions under which the numbers are valid."""
     items = [FROM_DATA.format(run.precision), MODEL]
     if (rate := run.failure_rate) is not None:
         items.append(
@@ -188,7 +187,7 @@ def assumptions(run: Run) -> list[str]:
 
 
 def run_claims(run: Run, studies: Studies) -> list[Claim]:
-    """Return what a run lets one claim."""
+    """Return the claims that a run supports."""
     counts, table_ = run.table.counts, "the table of all simulations"
     common = (FROM_DATA.format(run.precision), MODEL)
     texts: list[tuple[str, tuple[str, ...], tuple[str, ...]]] = []
@@ -240,7 +239,7 @@ def run_claims(run: Run, studies: Studies) -> list[Claim]:
 
 
 def chain_of(run: Run) -> str:
-    """Return the last hash of the chain that a report on the run would have now."""
+    """Return the last hash of the chain for a present report on the run."""
     links = chained(_inputs(run, Model.of(run.sources)))
     return links[-1].chain if links else ""
 

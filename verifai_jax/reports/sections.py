@@ -27,7 +27,7 @@ SAMPLES = "The guaranteed bound rests on independent samples of the prior, and o
 
 
 def claims_section(claims: list[Claim]) -> Section:
-    """Write claims with their evidence, and the assumptions that they share once each."""
+    """Write claims with their evidence, and shared assumptions only once."""
     shared = list(dict.fromkeys(text for each in claims for text in each.assumptions))
     rows = [
         (
@@ -54,10 +54,11 @@ def claims_section(claims: list[Claim]) -> Section:
 
 
 def model_warnings(model: Model, findings: Sequence[str] = ()) -> tuple[Markup, ...]:
-    """Write that the model is another one by now, with both hashes of each file; often nothing.
+    """Write that the model has changed, with both hashes of each file; often empty.
 
     **Arguments:**
-    - `model`: what the result was made of.
+    - `model`: the files of the model. `findings`: sentences on rows that did not reproduce their
+      numbers.
     - `findings`: rows that did not give their numbers again, as sentences.
     """
     content: list[Markup] = []
@@ -98,7 +99,7 @@ def model_warnings(model: Model, findings: Sequence[str] = ()) -> tuple[Markup, 
 
 
 def model_answer(model: Model) -> tuple[str, str, str]:
-    """Answer whether the model is still the one that ran: question, answer, anchor."""
+    """Return whether the model has changed, as question, answer and anchor."""
     return "Is the model still the one that ran?", model.answer, "reproduce"
 
 
@@ -125,7 +126,7 @@ def version_table(model: Model) -> Markup:
 
 
 def chain_words(chain: str) -> Markup:
-    """Write how the chain is made, and its last hash."""
+    """Explain the chain, and write its last hash."""
     return paragraph(
         "Each link is the SHA-256 of the link before (empty for the first), a line break, the name "
         "of the input, a line break, and its SHA-256. The last link stands for all inputs: ",
@@ -136,7 +137,7 @@ def chain_words(chain: str) -> Markup:
 
 
 def provenance_content(links: Sequence[Link], model: Model) -> list[Markup]:
-    """Write the versions and the inputs of a report, and the chain of their hashes."""
+    """Write the versions and the inputs of a report, with their hash chain."""
     content = [element("h3", "Versions"), version_table(model)]
     if links:
         content += [
@@ -159,10 +160,10 @@ def problem_content(problem: Problem, about: About) -> list[Markup]:
 
 
 def answers_section(rows: Sequence[tuple[str, str, str]]) -> Section:
-    """Answer the questions of an auditor, with links to the long answers.
+    """Answer an auditor's questions, with links to the detailed answers.
 
     **Arguments:**
-    - `rows`: question, answer, and the anchor of the section that says more.
+    - `rows`: question, answer, and the anchor of the section with details.
     """
     cells: list[list[Child]] = [
         [asked, answer, element("a", anchor, href=f"#{anchor}")] for asked, answer, anchor in rows
@@ -191,16 +192,16 @@ def result_page(
     about: Mapping[str, Any] | None = None,
     warned: Model | None = None,
 ) -> Page:
-    """Make the report on a result, which has the same sections whatever it is about.
+    """Make the report on a result; all kinds of results have the same sections.
 
     **Arguments:**
-    - `name`, `kind`: the subject of the claims, and the kind of the report: its title.
-    - `headline`, `tone`, `claims`: the finding, as in `Page`, and what it lets one claim.
-    - `model`, `files`: files of the model, and those of the result.
-    - `answers`: questions as in `answers_section`, besides what was claimed and of which model.
+    - `name`, `kind`: the subject of the claims, and the kind of report, which is its title.
+    - `headline`, `tone`, `claims`: the finding, as in `Page`, and the supported claims.
+    - `model`, `files`: files of the model, and of the result.
+    - `answers`: further questions and answers, as in `answers_section`.
     - `asked`, `found`, `limits`, `reproduce`: content of these sections.
-    - `about`: what the claims are about, as in `claims_json`.
-    - `warned`: the model of whose changes the page warns, if it is not `model`.
+    - `about`: the subject of the claims, as in `claims_json`.
+    - `warned`: the model whose changes the page warns of, if it is not `model`.
     """
     links = tuple(chained([*files, *model.inputs]))
     chain = links[-1].chain if links else ""

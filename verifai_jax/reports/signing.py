@@ -9,7 +9,7 @@ ROLES = ("prepared by", "checked by", "approved by")
 
 
 def signing_section(sentence: str) -> Section:
-    """Return the section that persons sign."""
+    """Return the section with fields for signatures."""
     rows = [(role, *(blank(name) for name in ("name", "date", "signature"))) for role in ROLES]
     content = (
         paragraph(f"By signing, each person confirms that {sentence}."),
@@ -20,7 +20,7 @@ def signing_section(sentence: str) -> Section:
 
 
 def blank(name: str) -> Markup:
-    """Return an empty cell to be written into, which says for readers what belongs there."""
+    """Return an empty cell to fill in by hand, with a description for screen readers."""
     return element("span", class_="blank", role="img", aria_label=f"{name}: to be filled in")
 
 

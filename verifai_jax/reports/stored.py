@@ -27,15 +27,14 @@ OPTIONAL = ("probability", "method", "p0", "backend", "stopped")
 def read_result(
     file: Path, space: FeatureSpace | None = None
 ) -> Estimate | Comparison | Verification:
-    """Read an estimate, a comparison or a verification from the JSON that a command wrote.
+    """Read an estimate, a comparison or a verification from the JSON written by a command.
 
     **Arguments:**
-    - `file`: the output of `verifai-jax estimate --json` or `verifai-jax compare --json`, or what
-      `verifai-jax verify --into` wrote.
-    - `space`: the space of the problems that were compared, which the JSON does not have.
-    **Returns:** the result; a comparison without its single pairs.
-    **Raises:** `FileNotFoundError` where there is no such file; `ValueError` for anything else than
-    such a result.
+    - `file`: the output of `verifai-jax estimate --json` or `verifai-jax compare --json`, or the
+      file of `verifai-jax verify --into`.
+    - `space`: the space of the compared problems, which the JSON does not contain.
+    **Returns:** the result; a comparison does not have its single pairs.
+    **Raises:** `FileNotFoundError` if there is no such file; `ValueError` for other content.
     """
     try:
         data = json.loads(file.read_text(encoding="utf-8"))

@@ -45,7 +45,7 @@ LARGEST_ANIMATION = 1_500_000
 
 @dataclass(frozen=True)
 class Failure:
-    """A failure that a report shows: `number` in the report, `row`, `why` it is shown, `replay`.
+    """A failure shown in a report: `number` in the report, `row`, `why` it is shown, `replay`.
 
     The replay is None for a run that was loaded without its problem.
     """
@@ -58,16 +58,16 @@ class Failure:
 
 @dataclass(frozen=True)
 class Studies:
-    """The studies of a run that its report shows.
+    """The studies of a run for its report.
 
-    - `failures`: a few, the worst first.
-    - `traces`: data of rows that were simulated beforehand, by number.
+    - `failures`: a few failures, the worst first.
+    - `traces`: data of rows simulated for the report, by row number.
     - `animation`: the animation of the first failure, a GIF; None without one.
-    - `explained`, `shrunk`: of the worst failure; None if that was not possible.
+    - `explained`, `shrunk`: those of the worst failure; None if not possible.
     - `analysis`: the analysis of the table.
-    - `modes`: ways of failing with their probabilities; None if they were not asked for.
-    - `left_out`: what was not done and why, as whole sentences.
-    - `findings`: rows that did not give their numbers when they were simulated again, likewise.
+    - `modes`: the modes of failure with their probabilities; None if not requested.
+    - `left_out`: whole sentences on what was not done, and why.
+    - `findings`: sentences on rows that did not reproduce their numbers.
     """
 
     failures: tuple[Failure, ...]
@@ -84,14 +84,14 @@ class Studies:
 def study(
     run: Run, traces: int | None = None, studies: bool | None = None, modes: int | None = None
 ) -> Studies:
-    """Study a run for its report: everything is decided by the run and its seed.
+    """Study a run for its report; the run and its seed determine the result.
 
     **Arguments:**
     - `run`: the run.
-    - `traces`: rows simulated beforehand at most; chosen when left out.
-    - `studies`: whether the worst failure is explained and shrunk, which takes up to 2000
-      simulations; by default unless the system is a black box that takes long.
-    - `modes`: simulations spent on all ways of failing and their probabilities; none when left out.
+    - `traces`: maximum number of rows to simulate; a default when left out.
+    - `studies`: whether to explain and shrink the worst failure, with up to 2000 simulations; by
+      default unless the system is a slow black box.
+    - `modes`: number of simulations for the modes of failure and their probabilities; or none.
     """
     left_out: list[str] = []
     found = analyze(run)
@@ -205,7 +205,7 @@ def _attempt(what: str, work: Callable[[], Result], left_out: list[str]) -> Resu
 
 
 def png(figure: Figure) -> bytes:
-    """Return a figure as PNG of 128 colours; the same figure gives the same bytes."""
+    """Return a figure as PNG with 128 colours; equal figures give equal bytes."""
     from PIL import Image
 
     buffer = io.BytesIO()

@@ -27,7 +27,7 @@ def verification_page(result: Verification, about: About, problem: Problem | Non
     """Make the report on a verification.
 
     **Arguments:**
-    - `problem`: what was asked; None if it is not at hand.
+    - `problem`: the verified problem; None if not available.
     """
     model = Model.of([result.sources], None if problem is None else problem.sources())
     proved, broken, undecided = result.proved, result.broken, result.undecided

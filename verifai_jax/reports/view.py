@@ -53,10 +53,10 @@ def view_data(
     """Describe a run's table for `view.js`.
 
     **Arguments:**
-    - `run`: a run with a row at least.
-    - `traces`: by number of row, as `trace_data` describes them; these rows are among those shown.
-    - `command`: the command that a number of a row follows, to simulate it again.
-    **Returns:** plain data; `shown` and `simulations` tell how much it was thinned.
+    - `run`: a run with at least one row.
+    - `traces`: traces by row number, from `trace_data`; these rows are among those shown.
+    - `command`: the command that simulates a row again, to which its number is appended.
+    **Returns:** plain data; `shown` and `simulations` tell how many rows were left out.
     """
     table = run.table.all
     columns = {str(name): table[name].to_numpy() for name in table.columns}
@@ -129,7 +129,7 @@ def _column(name: str, values: "pd.Series") -> dict[str, Any] | None:
 
 
 def numbers_of(values: Any) -> list[float | int | None]:
-    """Return numbers with six digits; None for those that are not finite."""
+    """Return numbers with six digits; None if not finite."""
     return [_number(value) for value in np.asarray(values).tolist()]
 
 
@@ -144,7 +144,7 @@ def trace_data(replay: Replay, label: str = "") -> dict[str, Any]:
     """Describe the trace of a replay: the signals of its formulas, their bounds, the instant.
 
     **Arguments:**
-    - `label`: words for the list of traces; the number of the row when left out.
+    - `label`: its name in the list of traces; the row number when left out.
     """
     trace, problem = replay.trace, replay.problem
     clock = np.asarray(trace.clock())
@@ -183,13 +183,13 @@ def trace_data(replay: Replay, label: str = "") -> dict[str, Any]:
 
 
 def rows_to_trace(run: Run, maximum: int, first: Sequence[int] = ()) -> dict[int, str]:
-    """Choose the rows that matter most, with a word on each.
+    """Choose the most important rows, each with a word of explanation.
 
-    The worst ones that are claimed, those nearest to the bound on either side, those not claimed.
+    These are the worst claimed rows, those nearest to the bound on both sides, and unclaimed ones.
 
     **Arguments:**
-    - `maximum`: rows at most.
-    - `first`: rows that come first, such as the failures that a report shows.
+    - `maximum`: maximum number of rows.
+    - `first`: rows that come first, such as the failures shown in a report.
     """
     chosen = {int(number): f"row {number}: shown above" for number in first[:maximum]}
     table = run.table

@@ -16,12 +16,12 @@ from verifai_jax.reports.view import trace_data, view_data
 
 
 def explore(run: Run) -> Any:
-    """Return a widget of a run's table, or its still picture where there are no widgets.
+    """Return a widget of a run's table, or a picture if widgets are not available.
 
-    A row under the pointer shows its values. A clicked one is simulated again, and shows its trace.
+    Hovering over a row shows its values. Clicking on it simulates it again and shows its trace.
 
     **Arguments:**
-    - `run`: a run with a row at least.
+    - `run`: a run with at least one row.
     **Returns:** a widget of anywidget; without that package the figure of `run.plot()`.
     """
     try:

@@ -38,10 +38,10 @@ def evaluate(
     """Simulate episodes with the policy's most likely actions and return their returns.
 
     **Arguments:**
-    - `task`: the task. An episode ends where it says so, or at its time limit.
+    - `task`: the task. An episode ends where the task says so, or at its time limit.
     - `policy`: the policy to measure.
-    - `seed`: the seed of the episodes' starts and of what is random in their steps.
-    - `episodes`: their number.
+    - `seed`: the seed of the episodes' starts and of random steps.
+    - `episodes`: number of episodes.
     - `progress`: whether to show one line of progress; see `core.display.progress` for the default.
     **Returns:** `[episodes]`, the sum of rewards of each episode.
     """
@@ -53,7 +53,7 @@ def evaluate(
 def mean_returns(
     task: Task, policies: Sequence[Policy], *, seed: int = 0, episodes: int = EPISODES
 ) -> Float[np.ndarray, " policies"]:
-    """Measure the mean return of each policy's most likely actions over the same episodes.
+    """Measure the mean return of each policy's most likely actions, over the same episodes for all.
 
     **Arguments:** as in `evaluate`.
     **Returns:** `[policies]`.
@@ -67,9 +67,9 @@ def mean_returns(
 def batched_mean_returns(
     task: Task, policies: Sequence[PyTree], *, seed: int = 0, episodes: int = EPISODES
 ) -> Iterator[tuple[list[int], Float[np.ndarray, " batch"]]]:
-    """Measure the same batch by batch.
+    """Measure the mean returns of policies batch by batch.
 
-    **Yields:** numbers of policies, and their mean returns.
+    **Yields:** indices of policies, and their mean returns.
     """
     enable_compile_cache()
     devices = tuple(jax.local_devices())

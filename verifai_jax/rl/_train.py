@@ -23,7 +23,7 @@ from verifai_jax.rl.task.task import Task
 
 
 class Checkpoint(NamedTuple):
-    """A policy on the way of a training.
+    """A policy during a training.
 
     - `steps`: environment steps taken so far.
     - `policy`: the policy learnt so far, without exploration.
@@ -39,9 +39,9 @@ class Training:
 
     - `policy`: the policy at the end, without exploration.
     - `steps`: `[updates]`, environment steps taken by the end of each update.
-    - `mean_return`: `[updates]`, of the episodes that ended in each update, exploration included;
-      NaN where none did.
-    - `checkpoints`: policies on the way, where they were asked for.
+    - `mean_return`: `[updates]`, the mean return of the episodes that ended in each update, with
+      exploration; NaN if none did.
+    - `checkpoints`: the policies at the requested checkpoints.
     """
 
     policy: Policy
@@ -63,22 +63,22 @@ def train(
 ) -> Training:
     """Train a policy on a task.
 
-    The same seed gives the same policy on the same machine. Compiled once for each task and shape;
-    other hyper-parameters re-use the program.
+    The same seed gives the same policy on the same machine. It compiles once for each task and
+    shape; other hyper-parameters reuse the program.
 
     **Arguments:**
     - `task`: the task to learn; see `Task`.
     - `algorithm`: the algorithm with its hyper-parameters; `PPO()` when left out.
-    - `seed`: the seed of everything random in the training.
-    - `steps`: environment steps, rounded up to whole updates.
-    - `checkpoints`: environment steps at which to keep the policy too.
+    - `seed`: the seed of all random numbers in the training.
+    - `steps`: number of environment steps, rounded up to whole updates.
+    - `checkpoints`: environment steps at which the policy is kept as well.
     - `callbacks`: functions called for each update, in groups every two seconds, with the
-      environment steps so far and a dictionary of plain numbers: `update`, and `mean_return` where
-      an episode ended in it.
+      environment steps so far and a dictionary of plain numbers: `update`, and `mean_return` if an
+      episode ended in it.
     - `progress`: whether to show one line of progress; see `core.display.progress` for the default.
     **Returns:** the policy with its learning curve.
-    **Raises:** `ValueError` for hyper-parameters that cannot train, an algorithm that does not fit
-    the task's actions, no steps, or checkpoints outside of the training.
+    **Raises:** `ValueError` for invalid hyper-parameters, an algorithm that does not fit the task's
+    actions, no steps, or checkpoints outside the training.
     """
     algorithm = PPO() if algorithm is None else algorithm
     called, reported = check_callbacks(callbacks), 0

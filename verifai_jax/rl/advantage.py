@@ -14,7 +14,7 @@ from verifai_jax.rl.algorithm import Number
 
 
 class Ends(NamedTuple):
-    """The ends of episodes at each time: terminated for good, or (also) cut off."""
+    """The ends of episodes at each time: terminated for good, or terminated or truncated."""
 
     terminated: Bool[Array, "*time"]
     truncated: Bool[Array, "*time"]
@@ -28,14 +28,15 @@ def advantages(
     discount: Number,
     gae_lambda: Number,
 ) -> Float[Array, " time"]:
-    """Estimate the advantage of each action taken; advantage plus `value` is the critic's target.
+    """Estimate the advantage of each action; advantage plus `value` is the critic's target.
 
     **Arguments:**
-    - `reward`: of each step.
+    - `reward`: the reward of each step.
     - `value`: the value of the state in which the action was taken.
     - `next_value`: the value of the state that the step led to, *before* any reset.
     - `ends`: the steps that ended an episode.
-    - `discount`, `gae_lambda`: of future rewards, and of longer looks ahead, in `[0, 1]`.
+    - `discount`, `gae_lambda`: the discount of future rewards, and the weight of longer
+      look-aheads, in `[0, 1]`.
 
     Source: Schulman et al., High-dimensional continuous control using generalized advantage
     estimation (2016), eqs. 10 and 16.

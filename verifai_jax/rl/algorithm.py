@@ -29,7 +29,7 @@ AlgorithmState: TypeAlias = PyTree
 class Progress(NamedTuple):
     """The episodes that ended in one update.
 
-    - `mean_return`: mean of their returns, exploration included; NaN where none ended.
+    - `mean_return`: mean of their returns, with exploration; NaN if none ended.
     - `episodes`: their number.
     """
 
@@ -39,21 +39,21 @@ class Progress(NamedTuple):
 
 @runtime_checkable
 class Algorithm(Protocol):
-    """A training algorithm with its hyper-parameters. The state is any pytree of arrays.
+    """A training algorithm with its hyper-parameters. Its state is any pytree of arrays.
 
-    - `actions`: the kinds of action it can learn, of `Discrete` and `Continuous`.
-    - `steps_per_update`: environment steps that one `step` takes.
+    - `actions`: the kinds of action that it can learn, `Discrete` or `Continuous`.
+    - `steps_per_update`: number of environment steps in one `step`.
     """
 
     actions: ClassVar[tuple[type, ...]]
 
     @property
     def steps_per_update(self) -> int:
-        """Environment steps of one update."""
+        """Number of environment steps in one update."""
         ...
 
     def check(self) -> None:
-        """Refuse hyper-parameters that cannot train.
+        """Refuse invalid hyper-parameters.
 
         **Raises:** `ValueError`, naming the hyper-parameter and its value.
         """
@@ -66,13 +66,13 @@ class Algorithm(Protocol):
 
         **Arguments:**
         - `task`: the task to learn.
-        - `key`: a random key, from which all randomness of the training run comes.
-        - `updates`: the number of updates, at whose end schedules end.
+        - `key`: a random key, from which all random numbers of the training are derived.
+        - `updates`: the number of updates, after which schedules end.
         """
         ...
 
     def step(self, task: Task, state: AlgorithmState) -> tuple[AlgorithmState, Progress]:
-        """Take some steps of the environments and learn from them: one update.
+        """Perform one update: take some steps of the environments and learn from them.
 
         **Returns:** the state after it, and the episodes that ended in it.
         """
@@ -84,7 +84,7 @@ class Algorithm(Protocol):
 
 
 def static_field(default: T) -> T:
-    """Make a dataclass field that decides shapes or structure: static under `jit`."""
+    """Make a dataclass field that determines shapes or structure: static under `jit`."""
     return dataclasses.field(default=default, metadata={"static": True})
 
 
@@ -97,7 +97,7 @@ def check_values(
     - `algorithm`: the object with the hyper-parameters.
     - `names`: fields to check.
     - `holds(value) -> bool`: the condition on each value.
-    - `wanted`: the condition in words, which follow "must be".
+    - `wanted`: the condition in words that follow "must be".
     **Raises:** `ValueError`: "PPO's clip must be positive; got -1".
     """
     for name in names:

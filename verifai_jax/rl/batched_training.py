@@ -51,8 +51,8 @@ class Configuration:
 
     - `task`: the task to learn.
     - `algorithm`: the algorithm with its hyper-parameters.
-    - `steps`: environment steps, rounded up to whole updates; schedules end there.
-    - `seed`: the seed of everything random in the run.
+    - `steps`: number of environment steps, rounded up to whole updates; schedules end there.
+    - `seed`: the seed of all random numbers in the run.
     """
 
     task: Task
@@ -62,15 +62,15 @@ class Configuration:
 
     @property
     def updates(self) -> int:
-        """Number of updates that take `steps`."""
+        """Number of updates for `steps`."""
         return self.updates_for(self.steps)
 
     def updates_for(self, steps: int) -> int:
-        """Return the least number of updates that take as many environment steps."""
+        """Return the smallest number of updates with at least this many environment steps."""
         return -(-steps // self.algorithm.steps_per_update)
 
     def check(self) -> None:
-        """Refuse a configuration that cannot train.
+        """Refuse a configuration that cannot be trained.
 
         **Raises:** `ValueError`, naming the hyper-parameter, or the action that does not fit.
         """
@@ -107,14 +107,14 @@ class _Structure(NamedTuple):
 
 
 class BatchedTraining:
-    """Training runs that can be advanced side by side, any of them to any step.
+    """Training runs that advance in parallel, each to any step.
 
     **Arguments:**
-    - `configurations`: the runs; numbers below are indices in this sequence.
+    - `configurations`: the runs; methods refer to them by index.
     - `devices`: JAX devices to spread them over; all of this process when left out.
-    - `per_device`: runs under one `vmap` on a device; when left out 1 on CPUs, else 64.
-    - `watch`: called every few seconds with the number of each run and its learning curve so far.
-    **Raises:** `ValueError` for a configuration that cannot train.
+    - `per_device`: number of runs under one `vmap` on a device; by default 1 on CPUs, else 64.
+    - `watch`: a function called every few seconds with each run's number and learning curve so far.
+    **Raises:** `ValueError` for a configuration that cannot be trained.
     """
 
     def __init__(
@@ -138,13 +138,12 @@ class BatchedTraining:
         self._rates: dict[_Structure, float] = {}
 
     def advance(self, targets: Mapping[int, int]) -> Iterator[int]:
-        """Advance runs until each has used its target of environment steps.
+        """Advance runs until each has made its target number of environment steps.
 
         **Arguments:**
-        - `targets`: environment steps to reach, by number of the run.
-        **Yields:** each number as it gets there, those of one structure after another. Between
-        updates, every few seconds, it can be interrupted; numbers not yielded yet may be requested
-        again.
+        - `targets`: environment steps to reach, by number of the run. **Yields:** each number when
+          it gets there, grouped by structure. It can be interrupted between updates, every few
+          seconds; numbers not yielded yet may be requested again.
         """
         groups: dict[tuple[_Structure, int, int], list[int]] = {}
         for number, steps in targets.items():
@@ -161,7 +160,7 @@ class BatchedTraining:
                 yield from part
 
     def change_task(self, number: int, task: Task) -> None:
-        """Go on with other numbers in the task of a run; nothing is compiled again.
+        """Continue a run with other numbers in its task; nothing is compiled again.
 
         **Raises:** `ValueError` for a task of another structure.
         """
@@ -171,7 +170,7 @@ class BatchedTraining:
         self.configurations[number] = changed
 
     def policy(self, number: int) -> Policy:
-        """Return the policy that a run has reached, on the host, without exploration."""
+        """Return the present policy of a run, on the host, without exploration."""
         configuration, lane = self.configurations[number], self._lanes[number]
         task, index = StaticTask(configuration.task), np.int32(lane.index)
         return jax.device_get(_policy(configuration.algorithm, task, lane.batch.states, index))
@@ -182,7 +181,7 @@ class BatchedTraining:
         """Return the learning curve of a run so far.
 
         **Returns:** environment steps by the end of each update; mean return of the episodes that
-        ended in it, exploration included, NaN where none did.
+        ended in it, with exploration, NaN if none did.
         """
         lane = self._lanes[number]
         per_update = self.configurations[number].algorithm.steps_per_update
@@ -190,11 +189,11 @@ class BatchedTraining:
         return steps, np.asarray(lane.batch.curves)[lane.index, : lane.done]
 
     def seconds(self, number: int) -> float:
-        """Return the seconds of a core that a run has taken so far, compilation not counted."""
+        """Return the processor time of a run so far in core seconds, without compilation."""
         return self._lanes[number].seconds
 
     def discard(self, number: int) -> None:
-        """Free the state of a run, which starts anew if it is advanced again."""
+        """Free the state of a run, which starts again from the beginning if it is advanced."""
         self._lanes.pop(number, None)
 
     def _advance(self, structure: _Structure, numbers: list[int], done: int, until: int) -> None:
@@ -268,7 +267,7 @@ class BatchedTraining:
 
 
 class StaticTask:
-    """A task as a static argument: by its structure if it is a pytree, else by itself."""
+    """A task as a static argument: compared by structure if it is a pytree, else by identity."""
 
     def __init__(self, task: Task) -> None:
         leaves, self.structure = jax.tree.flatten(task)
@@ -285,7 +284,7 @@ class StaticTask:
         )
 
     def with_numbers(self, leaves: Sequence[ArrayLike]) -> Task:
-        """Return the task with these numbers in it."""
+        """Return the task with these numbers."""
         if self.task is not None:
             return self.task
         return jax.tree.unflatten(self.structure, leaves)
@@ -313,7 +312,7 @@ def _number(leaf: ArrayLike) -> np.ndarray:
 
 
 def policy_structure(configuration: Configuration) -> tuple[Hashable, Hashable, Shapes]:
-    """Return task, algorithm and shapes: equal for runs whose policies have one structure."""
+    """Return task, algorithm and shapes: equal for runs with policies of one structure."""
     task, algorithm = numbers_of(configuration.task), numbers_of(configuration.algorithm)
     shapes = tuple((leaf.shape, leaf.dtype.str) for leaf in task[0] + algorithm[0])
     return StaticTask(configuration.task), algorithm[1], shapes

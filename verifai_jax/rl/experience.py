@@ -23,8 +23,8 @@ class Episodes(NamedTuple):
     """The present episode of each environment.
 
     - `state`: states of the task with a leading axis `[environments]`.
-    - `age`: steps of the episode so far.
-    - `total`: rewards of the episode so far.
+    - `age`: number of steps in the episode so far.
+    - `total`: sum of rewards in the episode so far.
     """
 
     state: State
@@ -33,12 +33,12 @@ class Episodes(NamedTuple):
 
 
 class Transition(NamedTuple):
-    """One step of each environment, or several.
+    """One or several steps of each environment.
 
-    - `reward`: of the step.
+    - `reward`: the reward of the step.
     - `next_observation`: the observation of the state that the step led to, before any reset.
-    - `ends`: the episodes that it ended.
-    - `total`: the episode's return with this step in it.
+    - `ends`: which episodes it ended.
+    - `total`: the episode's return including this step.
     """
 
     reward: Float[Array, "*steps"]
@@ -48,18 +48,18 @@ class Transition(NamedTuple):
 
     @property
     def over(self) -> Bool[Array, "*steps"]:
-        """The ends of episodes, for good or cut off."""
+        """The ends of episodes, terminated or truncated."""
         return self.ends.terminated | self.ends.truncated
 
 
 def start_episodes(task: Task, key: Key[Array, ""], environments: int) -> Episodes:
-    """Start an episode in each of so many environments."""
+    """Start an episode in each of this many environments."""
     state = jax.vmap(task.reset)(jax.random.split(key, environments))
     return Episodes(state, jnp.zeros(environments, jnp.int32), jnp.zeros(environments))
 
 
 def observation_size(task: Task, episodes: Episodes) -> int:
-    """Return the number of entries of an observation."""
+    """Return the number of entries in an observation."""
     return jax.eval_shape(jax.vmap(task.observe), episodes.state).shape[-1]
 
 
@@ -69,10 +69,10 @@ def advance(
     """Take one step of each environment.
 
     **Arguments:**
-    - `episodes`: the episodes before it.
-    - `action`: the action of each environment, as `task.step` takes it.
-    - `key`: a random key, of this step of all environments.
-    **Returns:** the episodes after it, new ones where it ended one; the transition.
+    - `episodes`: the episodes before the step.
+    - `action`: the action of each environment, in the form of `task.step`.
+    - `key`: a random key for this step of all environments.
+    **Returns:** the episodes after the step, with new ones where it ended one; the transition.
     """
     step_key, reset_key = jax.random.split(key)
     environments = len(episodes.age)
@@ -98,7 +98,7 @@ def advance(
 
 
 def progress(transition: Transition) -> Progress:
-    """Summarise the episodes that ended in some steps: their mean return and number."""
+    """Summarise the episodes that ended in some steps by their mean return and number."""
     count = jnp.sum(transition.over)
     total = jnp.sum(jnp.where(transition.over, transition.total, 0.0))
     return Progress(jnp.where(count > 0, total / jnp.maximum(count, 1), jnp.nan), count)

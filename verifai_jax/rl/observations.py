@@ -13,8 +13,8 @@ from jaxtyping import Array, Float
 class ObservationStatistics(NamedTuple):
     """Statistics of the observations so far.
 
-    - `count`: their number.
-    - `mean`, `variance`: of each of the `k` numbers of an observation.
+    - `count`: number of observations.
+    - `mean`, `variance`: those of each of the `k` numbers of an observation.
     """
 
     count: Float[Array, ""]
@@ -23,7 +23,7 @@ class ObservationStatistics(NamedTuple):
 
     @classmethod
     def initial(cls, size: int) -> "ObservationStatistics":
-        """Return mean 0 and variance 1 for observations of `size` numbers, before there is one."""
+        """Return mean 0 and variance 1 as initial statistics of observations of `size` numbers."""
         return cls(jnp.zeros(()), jnp.zeros(size), jnp.ones(size))
 
 
@@ -44,14 +44,14 @@ def update(
 def mean_and_scale(
     statistics: ObservationStatistics,
 ) -> tuple[Float[Array, " k"], Float[Array, " k"]]:
-    """Return the number to subtract from an observation, and the one to divide by afterwards."""
+    """Return the number to subtract from an observation, and the number to divide by."""
     return statistics.mean, jnp.sqrt(statistics.variance + 1e-8)
 
 
 def normalise(
     statistics: ObservationStatistics, observation: Float[Array, "*batch k"], enabled: bool = True
 ) -> Float[Array, "*batch k"]:
-    """Return the observation in units of its running deviation; unchanged if not `enabled`."""
+    """Return the observation normalised by its running statistics; unchanged if not `enabled`."""
     if not enabled:
         return observation
     mean, scale = mean_and_scale(statistics)

@@ -29,16 +29,16 @@ def minibatch_epochs(
     epochs: int,
     minibatches: int,
 ) -> tuple[Weights, PyTree]:
-    """Descend the loss, one step for each minibatch.
+    """Minimise the loss, with one gradient step for each minibatch.
 
     **Arguments:**
-    - `loss(weights, minibatch) -> number`: what is descended.
-    - `start`: weights, and the optimizer's state.
+    - `loss(weights, minibatch) -> number`: the loss.
+    - `start`: the initial weights and optimizer state.
     - `batch`: a pytree of arrays with two leading axes, such as environments and time.
-    - `key`: a random key, of the order.
-    - `optimizer`, `rate`: the direction of a step, and its length.
-    - `epochs`, `minibatches`: passes over the batch, and parts in a pass.
-    **Returns:** weights, and the optimizer's state.
+    - `key`: a random key for the order of minibatches.
+    - `optimizer`, `rate`: the optimizer, and the learning rate.
+    - `epochs`, `minibatches`: number of passes over the batch, and of minibatches in a pass.
+    **Returns:** the weights, and the optimizer's state.
     """
     rows = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), batch)
     count = len(jax.tree.leaves(rows)[0])
@@ -67,9 +67,9 @@ def minibatch_epochs(
 def permutation(key: Key[Array, ""], n: int) -> Int[Array, " n"]:
     """Return the numbers from 0 to `n - 1` in the order of `jax.random.permutation(key, n)`.
 
-    XLA sorts one array of integers on a CPU six times as fast as keys with values, and a shuffle
-    would take a tenth of the time of PPO. So the keys are sorted alone and the rank of each is
-    searched for. Not for use under `vmap`, where both branches would be computed.
+    On a CPU, XLA sorts one array of integers six times as fast as keys with values, and a shuffle
+    would take a tenth of PPO's time. So only the keys are sorted, and the rank of each is searched
+    for. Do not use it under `vmap`, where both branches would be computed.
     """
     order = jnp.arange(n, dtype=jnp.int32)
     if n > 1600:  # Where JAX sorts more than once.

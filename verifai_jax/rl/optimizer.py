@@ -17,21 +17,21 @@ EPSILON = 1e-5
 
 @runtime_checkable
 class Optimizer(Protocol):
-    """The functions of `optax.GradientTransformation`, for any pytree of weights."""
+    """An optimizer with the functions of `optax.GradientTransformation`."""
 
     @property
     def init(self) -> Callable[[PyTree], PyTree]:
-        """The function from weights to the optimizer's state."""
+        """A function from weights to the optimizer's state."""
         ...
 
     @property
     def update(self) -> Callable[..., tuple[PyTree, PyTree]]:
-        """The function from a gradient and a state to a direction and the next state."""
+        """A function from a gradient and a state to a direction and the next state."""
         ...
 
 
 def adam(max_gradient: Number | None = None) -> Optimizer:
-    """Make Adam at rate 1, of gradients cut to the norm `max_gradient` where it is given."""
+    """Make Adam with rate 1, with gradients clipped to the norm `max_gradient` if it is given."""
     import optax
 
     if max_gradient is None:
@@ -45,7 +45,7 @@ def adam(max_gradient: Number | None = None) -> Optimizer:
 def annealed(rate: Number, done: Int[Array, ""], updates: Int[Array, ""], enabled: bool) -> Number:
     """Return the learning rate after `done` of `updates` updates.
 
-    It falls linearly from `rate` to 0 if `enabled`, and else is `rate`.
+    It falls linearly from `rate` to 0 if `enabled`, and otherwise stays `rate`.
     """
     left = 1.0 - done * (1.0 / updates) if enabled else 1.0
     return rate * left

@@ -43,25 +43,26 @@ _KINDS: dict[str, type[Discrete] | type[Continuous]] = {
 
 
 class PolicyFileError(ValueError):
-    """A file that holds no policy written by `save_policy`."""
+    """An error for a file without a policy written by `save_policy`."""
 
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True, eq=False)
 class Policy:
-    """A network with the scale of its observations and the meaning of its outputs.
+    """A network with the normalisation of its observations and the kind of its actions.
 
     - `layers`: weights `[inputs, outputs]` and biases `[outputs]`, first layer first.
-    - `mean`, `scale`: `[k]`; the network is given `(observation - mean) / scale`. None: the
-      observation itself.
-    - `log_std`: `[size]`, logarithm of the deviation of the Gaussian that explores; None for
-      discrete actions, and where the deviation depends on the observation.
+    - `mean`, `scale`: `[k]`; the network receives `(observation - mean) / scale`. None: it receives
+      the observation itself.
+    - `log_std`: `[size]`, logarithm of the standard deviation for exploration; None for discrete
+      actions, and if the deviation depends on the observation.
     - `action`: the kind of action.
-    - `activation`: name of the function between the layers, of `ACTIVATIONS`. All are 0 at 0, so
-      that units whose weights are 0 change nothing.
-    - `squash`: the outputs of a continuous policy go through tanh; otherwise they are clipped.
+    - `activation`: name of the activation, one of `ACTIVATIONS`. All are 0 at 0, so that units with
+      weights 0 have no effect.
+    - `squash`: whether a continuous policy's outputs are squashed by tanh; otherwise they are
+      clipped.
 
-    **Raises:** `UnknownNameError` for another activation; `ValueError` for squashed logits.
+    **Raises:** `UnknownNameError` for an unknown activation; `ValueError` for squashed logits.
     """
 
     # JAX rebuilds the class with stacked arrays and placeholders, which have other shapes.
@@ -102,7 +103,7 @@ class Policy:
         """Write the policy as `.npz` (`save_policy`), or its action as `.onnx` or `.safetensors`.
 
         **Returns:** the path.
-        **Raises:** `PolicyError` for another ending.
+        **Raises:** `PolicyError` for another file ending.
         """
         if Path(path).suffix == ".npz":
             save_policy(self, path)
@@ -113,7 +114,7 @@ class Policy:
         )
 
     def as_graph(self, observation: object = None) -> tuple[Any, Any, Any]:
-        """Return the policy as a graph of ONNX operators, as policies of other frameworks do."""
+        """Return the policy as a graph of ONNX operators, like policies of other frameworks."""
         as_any = lazy_import("verifai_jax.rl.policies.base", "Policy")(self, _act)
         return as_any.as_graph(np.zeros(self.layers[0][0].shape[0]))
 
@@ -136,11 +137,11 @@ def network(
 def scalar_network(
     layers: Layers, inputs: Sequence[Float[Array, ""]], activation: str = "tanh"
 ) -> list[Float[Array, ""]]:
-    """Evaluate the same network number by number, for a few hundred weights that are constants.
+    """Evaluate the same network with scalars, for a few hundred weights that are constants.
 
-    Under `vmap` each number is a row of lanes and all of them fuse into straight-line vector code:
-    in a rollout of hundreds of lanes 1.5 times as fast as small matrix products, at more compile
-    time. Not for weights that are themselves being traced.
+    Under `vmap` each scalar becomes a row of lanes, and all fuse into straight-line vector code: in
+    a rollout of hundreds of lanes it is 1.5 times as fast as small matrix products, but takes
+    longer to compile. Not for weights that are traced themselves.
     """
     values, between = list(inputs), ACTIVATIONS[activation]
     for i, (weight, bias) in enumerate(layers):
@@ -156,7 +157,7 @@ def scalar_network(
 
 
 def new_layers(key: Key[Array, ""], sizes: Sequence[int], gain: float) -> Layers:
-    """Draw orthogonal weights and zero biases; `gain` scales the last layer, sqrt(2) the others.
+    """Draw orthogonal weights and zero biases, scaled by `gain` in the last layer, else sqrt(2).
 
     Source: Saxe, McClelland and Ganguli (2014), section 3.
     """
@@ -177,7 +178,7 @@ def new_layers(key: Key[Array, ""], sizes: Sequence[int], gain: float) -> Layers
 def most_likely_action(
     action: Action, outputs: Float[Array, " outputs"]
 ) -> Int[Array, ""] | Float[Array, " size"]:
-    """Return the mode of the distribution over actions that a network's outputs describe."""
+    """Return the mode of the action distribution given by a network's outputs."""
     if isinstance(action, Discrete):
         return jnp.argmax(outputs).astype(jnp.int32)
     return scale_to_range(action, outputs)
@@ -186,7 +187,7 @@ def most_likely_action(
 def scale_to_range(
     action: Continuous, unit: Float[Array, "*batch size"]
 ) -> Float[Array, "*batch size"]:
-    """Turn units of half the range around its middle into the action itself, clipped."""
+    """Map [-1, 1] to the range of the action, clipped."""
     middle, half = (action.high + action.low) / 2, (action.high - action.low) / 2
     return jnp.clip(middle + half * unit, action.low, action.high)
 
@@ -199,9 +200,9 @@ def save_policy(
     **Arguments:**
     - `policy`: the policy to write.
     - `path`: the file.
-    - `sources`: what it was trained with, as a run records it; that of the modules that call this
-      function when left out. `policy_sources` reads it.
-    - `notes`: plain data that JSON can hold, kept next to the arrays; `policy_notes` reads them.
+    - `sources`: the files with which it was trained, as a run records them; by default those of the
+      modules that call this function. `policy_sources` reads them.
+    - `notes`: plain data for JSON, stored next to the arrays; `policy_notes` reads them.
     """
     kind = next(name for name, cls in _KINDS.items() if isinstance(policy.action, cls))
     about = {
@@ -223,11 +224,11 @@ def save_policy(
 
 
 def load_policy(path: str | Path) -> Policy:
-    """Read a policy that `save_policy` wrote. The file can hold numbers and text only.
+    """Read a policy written by `save_policy`. The file can only contain numbers and text.
 
     **Returns:** the policy, with JAX arrays of float32.
     **Raises:** `FileNotFoundError`; `PolicyFileError` for a file of another kind, and for arrays
-    that are missing, not finite, or of shapes that do not fit to each other and to the actions.
+    that are missing, not finite, or of shapes that do not fit each other and the actions.
     """
     arrays, about = _read(path)
     try:
@@ -322,7 +323,7 @@ def _check_fits(policy: Policy) -> None:
 
 
 def policy_notes(path: str | Path) -> dict[str, Any]:
-    """Read the notes that were saved with a policy: how it was trained, how well it did.
+    """Read the notes saved with a policy, for example on its training and its return.
 
     **Raises:** `FileNotFoundError`; `PolicyFileError` for a file of another kind.
     """
@@ -330,10 +331,9 @@ def policy_notes(path: str | Path) -> dict[str, Any]:
 
 
 def policy_sources(path: str | Path) -> dict[str, Any]:
-    """Read which files and versions a policy was made with, as a run records it.
+    """Read the files and versions with which a policy was made, as a run records them.
 
-    **Returns:** plain data with the hashes of `files` and the `versions`; empty for a file that
-    does not say so.
+    **Returns:** plain data with hashes of `files` and the `versions`; empty if the file has none.
     **Raises:** `FileNotFoundError`; `PolicyFileError` for a file of another kind.
     """
     return _plain_data(path, "sources")

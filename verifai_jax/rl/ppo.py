@@ -33,17 +33,18 @@ from verifai_jax.rl.task.task import Action, Continuous, Discrete, State, Task
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class PPO:
-    """Proximal policy optimisation, for discrete and continuous actions, by its hyper-parameters.
+    """Proximal policy optimisation, for discrete and continuous actions, with its hyper-parameters.
 
     - `learning_rate`: the learning rate of Adam; falls linearly to 0 over the training if `anneal`.
-    - `discount`, `gae_lambda`: of future rewards, and of longer looks ahead, in `[0, 1]`.
-    - `clip`: how far the ratio of new to old probability may leave 1.
-    - `entropy`, `value_weight`: weights in the loss.
-    - `max_gradient`: norm to which gradients are cut.
-    - `environments`, `horizon`: steps of experience in an update, wide and long.
-    - `epochs`, `minibatches`: passes over them, and parts in a pass.
+    - `discount`, `gae_lambda`: the discount of future rewards, and the weight of longer
+      look-aheads, in `[0, 1]`.
+    - `clip`: how far the ratio of new to old probability may differ from 1.
+    - `entropy`, `value_weight`: weights of entropy and value error in the loss.
+    - `max_gradient`: norm to which gradients are clipped.
+    - `environments`, `horizon`: number of environments, and of steps of each, in an update.
+    - `epochs`, `minibatches`: number of passes over these steps, and of minibatches in a pass.
     - `hidden`, `value_hidden`: widths of the policy's and the critic's hidden layers.
-    - `normalise`: observations by their running mean and deviation.
+    - `normalise`: whether to normalise observations by their running mean and deviation.
     """
 
     # JAX rebuilds the class with stacked numbers and placeholders in place of numbers.
@@ -67,11 +68,11 @@ class PPO:
 
     @property
     def steps_per_update(self) -> int:
-        """Environment steps of one update."""
+        """Number of environment steps in one update."""
         return self.environments * self.horizon
 
     def check(self) -> None:
-        """Refuse values that cannot train.
+        """Refuse invalid hyper-parameters.
 
         **Raises:** `ValueError`, naming the hyper-parameter and its value.
         """
@@ -135,10 +136,10 @@ class PPO:
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True, eq=False)
 class Weights:
-    """The numbers that are learnt.
+    """The learnt numbers.
 
     - `policy`, `critic`: layers of the two networks.
-    - `log_std`: `[size]`, logarithm of the deviation that explores; None for discrete actions.
+    - `log_std`: `[size]`, logarithm of the deviation for exploration; None for discrete actions.
     """
 
     # JAX rebuilds the class with stacked arrays and placeholders, which have other shapes.
@@ -151,11 +152,11 @@ class Weights:
 class PPOState(NamedTuple):
     """The state between two updates.
 
-    - `weights`, `moments`: what is learnt, and the optimizer's state.
+    - `weights`, `moments`: the learnt numbers, and the optimizer's state.
     - `statistics`: the statistics of the observations so far.
     - `episodes`: the present episode of each environment.
     - `key`: the random key of the next update.
-    - `done`, `updates`: updates so far, and in all.
+    - `done`, `updates`: number of updates so far, and in all.
     """
 
     weights: Weights
@@ -171,9 +172,9 @@ class Experience(NamedTuple):
     """Steps of the environments, `[environments, horizon]`.
 
     - `observation`: the policy's input.
-    - `action`: an index, or a vector in units of half its range.
+    - `action`: an index, or a vector scaled to [-1, 1].
     - `outputs`: the outputs of the policy's network.
-    - `transition`: what the action led to.
+    - `transition`: the result of the action.
     """
 
     observation: Float[Array, "*steps k"]
@@ -185,7 +186,7 @@ class Experience(NamedTuple):
 class Minibatch(NamedTuple):
     """Steps to learn from, with a leading axis `[rows]`.
 
-    - `observation`: normalised, if the algorithm does so.
+    - `observation`: the observation, normalised if the algorithm does so.
     - `action`: as in `Experience`.
     - `log_probability`: the log probability of the action under the policy that took it.
     - `advantage`: the advantage of the action.

@@ -39,20 +39,21 @@ from verifai_jax.rl.task.task import Discrete, Task
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class PQN:
-    """Parallelised Q network, for discrete actions, by its hyper-parameters.
+    """Parallelised Q network, for discrete actions, with its hyper-parameters.
 
     - `learning_rate`: the learning rate of Adam; falls linearly to 0 over the training if `anneal`.
-    - `discount`, `q_lambda`: of future rewards, and of longer looks ahead, in `[0, 1]`.
-    - `epsilon_start`, `epsilon_end`: part of the steps that explore; goes linearly from one to the
-      other over the part `exploration` of the state.
-    - `hold`: mean steps for which a random action is kept, at least 1. Long ones find what single
-      random steps never do (the hill of mountain car).
-    - `reward_scale`: rewards are multiplied by it; values around 1 are learnt best.
-    - `max_gradient`: norm to which gradients are cut.
-    - `environments`, `horizon`: steps of experience in an update, wide and long.
-    - `epochs`, `minibatches`: passes over them, and parts in a pass.
-    - `hidden`: widths of the hidden layers. `activation`: between them, "tanh" or "relu".
-    - `normalise`: observations by their running mean and deviation.
+    - `discount`, `q_lambda`: the discount of future rewards, and the weight of longer look-aheads,
+      in `[0, 1]`.
+    - `epsilon_start`, `epsilon_end`: share of exploring steps, which changes linearly from one to
+      the other over the share `exploration` of the training.
+    - `hold`: mean number of steps for which a random action is kept, at least 1. Long holds find
+      states that single random steps never reach (the hill of mountain car).
+    - `reward_scale`: a factor on rewards; values around 1 are learnt best.
+    - `max_gradient`: norm to which gradients are clipped.
+    - `environments`, `horizon`: number of environments, and of steps of each, in an update.
+    - `epochs`, `minibatches`: number of passes over these steps, and of minibatches in a pass.
+    - `hidden`: widths of the hidden layers. `activation`: their activation, "tanh" or "relu".
+    - `normalise`: whether to normalise observations by their running mean and deviation.
     """
 
     # JAX rebuilds the class with stacked numbers and placeholders in place of numbers.
@@ -78,11 +79,11 @@ class PQN:
 
     @property
     def steps_per_update(self) -> int:
-        """Environment steps of one update."""
+        """Number of environment steps in one update."""
         return self.environments * self.horizon
 
     def check(self) -> None:
-        """Refuse values that cannot train.
+        """Refuse invalid hyper-parameters.
 
         **Raises:** `ValueError`, naming the hyper-parameter and its value.
         """
@@ -143,12 +144,12 @@ class PQN:
 class PQNState(NamedTuple):
     """The state between two updates.
 
-    - `layers`, `moments`: the network that is learnt, and the optimizer's state.
+    - `layers`, `moments`: the learnt network, and the optimizer's state.
     - `statistics`: the statistics of the observations so far.
     - `episodes`: the present episode of each environment.
-    - `held`: the random action that an environment holds on to; -1 where it is greedy.
+    - `held`: the random action that an environment is repeating; -1 if it is greedy.
     - `key`: the random key of the next update.
-    - `done`, `updates`: updates so far, and in all.
+    - `done`, `updates`: number of updates so far, and in all.
     """
 
     layers: Layers
@@ -166,7 +167,7 @@ class Experience(NamedTuple):
 
     - `observation`: the policy's input.
     - `action`: indices.
-    - `transition`: what the actions led to.
+    - `transition`: the result of the actions.
     """
 
     observation: Float[Array, "horizon environments k"]
@@ -177,9 +178,9 @@ class Experience(NamedTuple):
 class Minibatch(NamedTuple):
     """Steps to learn from.
 
-    - `observation`: normalised, if the algorithm does so.
+    - `observation`: the observation, normalised if the algorithm does so.
     - `action`: indices.
-    - `target`: for the value of the action.
+    - `target`: the target for the value of the action.
     """
 
     observation: Float[Array, "*rows k"]
@@ -194,16 +195,17 @@ def q_lambda_targets(
     discount: Number,
     q_lambda: Number,
 ) -> Float[Array, "time *lanes"]:
-    """Compute targets for the values of the actions taken, lane by lane.
+    """Compute targets for the values of the actions taken, for each lane.
 
     **Arguments:**
-    - `reward`: of each step.
+    - `reward`: the reward of each step.
     - `next_value`: the value of the best action in the state that the step led to, *before*
       any reset.
     - `ends`: the steps that ended an episode, `[time, *lanes]`.
-    - `discount`, `q_lambda`: of future rewards, and of longer looks ahead, in `[0, 1]`.
+    - `discount`, `q_lambda`: the discount of future rewards, and the weight of longer look-aheads,
+      in `[0, 1]`.
 
-    Source: Gallici et al. (2024), section 4 (Peng's Q(lambda)); a look ahead ends with its episode.
+    Source: Gallici et al. (2024), section 4 (Peng's Q(lambda)); look-aheads end with the episode.
     """
     discount = discount * (1.0 - ends.terminated)
     longer = q_lambda * (1.0 - (ends.terminated | ends.truncated))
@@ -254,10 +256,10 @@ def _collect(
 def exploration_chances(
     pqn: PQN, done: int | Int[Array, ""], updates: int | Int[Array, ""]
 ) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    """Return the chances to go on holding a random action, and to begin with one.
+    """Return the probabilities of continuing to hold a random action, and of starting to.
 
-    With these the part of steps that explore is epsilon, whatever the hold: the stationary
-    distribution of the chain of two states, exploring or not.
+    With these the share of exploring steps is epsilon for any hold: it is the stationary
+    distribution of a Markov chain with two states, exploring or not.
     """
     progress = jnp.clip(done / (pqn.exploration * updates), 0.0, 1.0)
     epsilon = pqn.epsilon_start + progress * (pqn.epsilon_end - pqn.epsilon_start)
@@ -272,7 +274,7 @@ def next_held(
     keep: Float[Array, ""],
     start: Float[Array, ""],
 ) -> Int[Array, " environments"]:
-    """Return the random action that each environment holds in the next step; -1 for none."""
+    """Return the random action that each environment repeats in the next step; -1 for none."""
     goes_on = (held >= 0) & (chance < keep)
     # Given that the action is not held on, `chance` is uniform on [keep, 1).
     again = jnp.where(held >= 0, (chance - keep) / jnp.maximum(1.0 - keep, 1e-6), chance)

@@ -19,8 +19,8 @@ class ReplayBuffer(NamedTuple):
     """A ring of transitions.
 
     - `rows`: `[capacity, 2 * size + actions + 2]`. The widths of an observation and an action are
-      not stored: `unpack` is given the second.
-    - `index`: the row that is written next.
+      not stored; `unpack` receives the second.
+    - `index`: the row that will be written next.
     - `filled`: the number of rows that hold a transition.
     """
 
@@ -30,12 +30,12 @@ class ReplayBuffer(NamedTuple):
 
 
 class StoredTransitions(NamedTuple):
-    """Transitions of a buffer.
+    """Transitions from a buffer.
 
     - `observation`, `action`: the policy's input and output.
-    - `reward`: of the step.
+    - `reward`: the reward of the step.
     - `next_observation`: the observation of the state that the step led to, before any reset.
-    - `terminated`: 1.0 where the episode ended for good, else 0.0.
+    - `terminated`: 1.0 if the episode ended for good, else 0.0.
     """
 
     observation: Float[Array, "batch size"]
@@ -52,7 +52,7 @@ def empty_buffer(capacity: int, size: int, actions: int) -> ReplayBuffer:
 
 
 def add(buffer: ReplayBuffer, new: StoredTransitions) -> ReplayBuffer:
-    """Write transitions over the oldest rows. The capacity is a multiple of their number."""
+    """Overwrite the oldest rows with transitions. Their number must divide the capacity."""
     columns = (new.observation, new.next_observation, new.action)
     scalars = (new.reward[:, None], new.terminated[:, None])
     rows = jnp.concatenate([part.astype(jnp.float32) for part in (*columns, *scalars)], axis=1)
@@ -66,18 +66,18 @@ def add(buffer: ReplayBuffer, new: StoredTransitions) -> ReplayBuffer:
 def sample(
     buffer: ReplayBuffer, key: Key[Array, ""], count: int, actions: int
 ) -> StoredTransitions:
-    """Draw transitions uniformly, with replacement, from a buffer that is not empty.
+    """Draw transitions uniformly with replacement; the buffer must not be empty.
 
     **Arguments:**
     - `count`: the number of transitions.
-    - `actions`: the numbers in an action.
+    - `actions`: number of entries in an action.
     """
     indices = jax.random.randint(key, (count,), 0, buffer.filled)
     return unpack(buffer.rows[indices], actions)
 
 
 def unpack(rows: Float[Array, "batch width"], actions: int) -> StoredTransitions:
-    """Split rows into their parts; an action has `actions` numbers."""
+    """Split rows into their parts; an action has `actions` entries."""
     size = (rows.shape[1] - actions - 2) // 2
     return StoredTransitions(
         rows[:, :size], rows[:, size : 2 * size], rows[:, 2 * size : -2], rows[:, -2], rows[:, -1]

@@ -36,25 +36,27 @@ Beyond them a Gaussian under tanh is a constant, or a coin that shows only the t
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class SAC:
-    """Soft actor-critic, for continuous actions, by its hyper-parameters.
+    """Soft actor-critic, for continuous actions, with its hyper-parameters.
 
     - `learning_rate`: the learning rate of Adam, for the policy, the critics and the temperature;
       falls linearly to 0 over the training if `anneal`.
     - `discount`: the discount of future rewards, in `[0, 1]`.
-    - `target_rate`: how far the slow critics move to the fast ones in a step of learning.
-    - `temperature`: weight of entropy against reward at first; then it follows `target_entropy`,
-      which is wanted on average for each number of an action (of units of half its range).
-    - `correlation`: the correlation of the noise between one step and the next, in `[0, 1)`; 0 is
-      white noise. 0.9 and more reach what single random steps never do (the hill of mountain car).
-    - `warmup`: environment steps before any learning.
-    - `reward_scale`: rewards are multiplied by it; values of a few units are learnt best, and the
-      first temperature is one for these.
-    - `environments`, `horizon`: steps of experience in an update, wide and long.
-    - `learnings`: steps of learning after each step of all environments, from `batch` transitions.
-    - `capacity`: transitions that are remembered, a multiple of `environments`.
-    - `hidden`, `value_hidden`: widths of the policy's and the critics' hidden layers.
-      `activation`: between all of them, "tanh" or "relu".
-    - `normalise`: observations by their running mean and deviation.
+    - `target_rate`: how far the slow critics move towards the fast ones in a learning step.
+    - `temperature`: initial weight of entropy against reward; it then adapts to `target_entropy`,
+      the desired mean entropy for each number of an action (scaled to [-1, 1]).
+    - `correlation`: the correlation of the noise between consecutive steps, in `[0, 1)`; 0 is white
+      noise. Values from 0.9 on reach states that single random steps never reach (the hill of
+      mountain car).
+    - `warmup`: number of environment steps before learning starts.
+    - `reward_scale`: a factor on rewards; values of a few units are learnt best, and the initial
+      temperature is chosen for these.
+    - `environments`, `horizon`: number of environments, and of steps of each, in an update.
+    - `learnings`: number of learning steps, with `batch` transitions each, after each step of all
+      environments.
+    - `capacity`: number of transitions in the buffer, a multiple of `environments`.
+    - `hidden`, `value_hidden`: widths of the policy's and the critics' hidden layers. `activation`:
+      their activation, "tanh" or "relu".
+    - `normalise`: whether to normalise observations by their running mean and deviation.
     """
 
     # JAX rebuilds the class with stacked numbers and placeholders in place of numbers.
@@ -81,11 +83,11 @@ class SAC:
 
     @property
     def steps_per_update(self) -> int:
-        """Environment steps of one update."""
+        """Number of environment steps in one update."""
         return self.environments * self.horizon
 
     def check(self) -> None:
-        """Refuse values that cannot train.
+        """Refuse invalid hyper-parameters.
 
         **Raises:** `ValueError`, naming the hyper-parameter and its value.
         """
@@ -137,7 +139,7 @@ class SAC:
         )
 
     def step(self, task: Task, state: "SACState") -> tuple["SACState", Progress]:
-        """Step the environments `horizon` times, with some steps of learning after each step.
+        """Step the environments `horizon` times, with learning steps after each step.
 
         **Returns:** the state after it, and the episodes that ended in it.
         """
@@ -185,7 +187,7 @@ class SAC:
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True, eq=False)
 class Weights:
-    """The numbers that are learnt.
+    """The learnt numbers.
 
     - `policy`: layers of the network whose outputs are means, then logarithms of deviations.
     - `critics`: layers of two critics; their leaves have a leading axis of 2.
@@ -202,14 +204,14 @@ class Weights:
 class SACState(NamedTuple):
     """The state between two updates.
 
-    - `weights`, `moments`: what is learnt, and the optimizer's state.
-    - `slow`: the critics that targets are made of.
+    - `weights`, `moments`: the learnt numbers, and the optimizer's state.
+    - `slow`: the critics from which targets are computed.
     - `statistics`: the statistics of the observations so far.
     - `episodes`: the present episode of each environment.
     - `noise`: the noise of the next actions, in units of the policy's deviation.
-    - `buffer`: the transitions that are remembered.
+    - `buffer`: the stored transitions.
     - `key`: the random key of the next update.
-    - `done`, `updates`: updates so far, and in all.
+    - `done`, `updates`: number of updates so far, and in all.
     """
 
     weights: Weights
@@ -231,8 +233,8 @@ def squash_log_prob(
 ) -> Float[Array, "*batch"]:
     """Compute the log density of `tanh(mean + exp(log_std) * noise)`, a vector in the unit cube.
 
-    Source: Haarnoja et al. (2018), appendix C, eq. 26; the derivative of tanh at u is
-    `1 - tanh(u)^2 = 4 / (e^u + e^-u)^2`, here by its logarithm, which never cancels.
+    Source: Haarnoja et al. (2018), appendix C, eq. 26; the derivative of tanh at u is `1 -
+    tanh(u)^2 = 4 / (e^u + e^-u)^2`, computed here by its logarithm, which avoids cancellation.
     """
     u = mean + jnp.exp(log_std) * noise
     normal = -jnp.square(noise) / 2 - log_std - jnp.log(2 * jnp.pi) / 2
@@ -247,7 +249,7 @@ def act(
     noise: Float[Array, "environments actions"],
     key: Key[Array, ""],
 ) -> tuple[SACState, experience.Transition, Float[Array, "environments k"]]:
-    """Take one step of each environment, and write the transitions into the buffer."""
+    """Take one step of each environment, and write the transitions to the buffer."""
     observation = jax.vmap(task.observe)(state.episodes.state)
     normalised = normalise(state.statistics, observation, sac.normalise)
     mean, log_std = _gaussian(sac, state.weights.policy, normalised)
@@ -308,7 +310,7 @@ def total_loss(
     batch: StoredTransitions,
     noise: Float[Array, "2 batch actions"],
 ) -> Float[Array, ""]:
-    """Add up three losses, each with a gradient for its own part of the weights only."""
+    """Sum three losses, each with a gradient only for its own part of the weights."""
     fixed = jax.lax.stop_gradient(weights)
     temperature = jnp.exp(fixed.log_temperature)
     mean, log_std = _gaussian(sac, fixed.policy, batch.next_observation)

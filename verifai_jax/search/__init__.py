@@ -152,7 +152,7 @@ def from_json(data: Mapping[str, Any]) -> "Search":
                 options["suggest"] = Absent(str(data.get("source", "a function")))
             return lazy_import(__name__, kind)(**options)
     if not isinstance(data.get("options"), Mapping):
-        raise ValueError(f"this describes no search: {data!r}")
+        raise ValueError(f"this does not describe a search: {data!r}")
     options = {
         name: tuple(value) if isinstance(value, list) else value
         for name, value in data["options"].items()

@@ -39,8 +39,7 @@ class Observations(NamedTuple):
     - `gradient`: the gradient of the smooth robustness with respect to `u`.
     - `clauses`: dimensionless values of the clauses, which are all negative in a failure; very low
       values fill up to `CLAUSES`.
-    - `clause_gradients`: their gradients with respect to `u`; zero in rounds whose plan does not
-      differentiate.
+    - `clause_gradients`: their gradients by `u`; zero in rounds that do not differentiate.
     - `outcomes`: a description of what happened (`core.values.clauses`), NaN if unknown.
     - `coverage_ids`: ids of the items that each simulation covered, -1 for none; `coverage_ids //
       KIND` is the kind of item.

@@ -77,8 +77,7 @@ class Bayes(Search[BayesState]):
     - `exploration`: share of points that are always drawn from the prior; it grows while there is
       neither a failure nor progress.
 
-    Hyper-parameters are refitted, starting from the last ones, whenever there are a quarter more
-    points.
+    Hyper-parameters are refitted, from the last ones, for every quarter more points.
 
     **Raises:** `ValueError` for values out of range.
     """

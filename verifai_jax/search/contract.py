@@ -42,7 +42,7 @@ def check_contract(search: Search, cube: Cube) -> None:
 
     Nothing compiles and nothing is simulated.
 
-    **Raises:** `SearchError` that names the function, and the line of the user's file where it
+    **Raises:** `SearchError` with the function's name, and the line of the user's file where it
     raised.
     """
     if not is_user_defined(search):

@@ -77,8 +77,7 @@ class Descent(SlopeSearch[DescentState]):
     - `hottest`, `coldest`: temperature of the smooth robustness at the start and at the end of a
       descent, in units of the spread of the predicates.
     - `patience`: consecutive gradients without a clearly lower point after which a descent ends.
-    **Raises:** `ValueError` for values out of range; `check` for a space without continuous
-    features.
+    **Raises:** `ValueError` for values out of range; in `check` also without continuous features.
     """
 
     descents: int = 64

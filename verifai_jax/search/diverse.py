@@ -359,8 +359,7 @@ def distinct(
     - `points`: `[n, d]`, in the unit cube.
     - `radius`: root mean square distance over the coordinates, as in `Diverse`.
     - `cube`: the unit cube of the space; when left out, all coordinates are continuous.
-    - `order`: indices of the points by preference, such as `np.argsort(rho)`; by default their
-      order.
+    - `order`: indices of the points by preference, such as `np.argsort(rho)`.
     **Returns:** indices `[k]` of the chosen points, in that order.
     """
     u = np.asarray(points, np.float32)

@@ -102,8 +102,7 @@ class Gradient(SlopeSearch[GradientState]):
       others are for the other descents in turn, in which they fall more slowly. A single one is for
       all.
     - `coldest`: minimum temperature.
-    **Raises:** `ValueError` for values out of range; `check` for a space without continuous
-    features.
+    **Raises:** `ValueError` for values out of range; in `check` also without continuous features.
     """
 
     descents: int = 16

@@ -49,7 +49,7 @@ class Grid(PointSequence[GridState]):
     """
 
     points: int | tuple[int, ...] = 21
-    sequence: ClassVar[tuple[str, str]] = "grid", "in a random order over the whole of it"
+    sequence: ClassVar[tuple[str, str]] = "grid", "in a random order over the whole grid"
 
     def __post_init__(self) -> None:
         if isinstance(self.points, tuple):
@@ -93,8 +93,7 @@ class Grid(PointSequence[GridState]):
     def points_at(self, rest: UInt32[Array, " n"], cube: Cube) -> Float[Array, "n d"]:
         """Return the points of the grid with these numbers, in the order of its rows.
 
-        Discrete coordinates change faster than continuous ones; among each kind the first is
-        fastest.
+        Discrete coordinates change faster than continuous ones; of each kind the first is fastest.
         """
         figures, batch = [], len(rest)
         for size in self._sizes(cube):

@@ -35,8 +35,7 @@ def improving(
 ) -> Float[Array, "batch d"]:
     """Return points with the largest expected improvement, each away from the earlier ones.
 
-    - `box`: its lowest corner and its side lengths; the process and the candidates use its
-      coordinates.
+    - `box`: its lowest corner and side lengths; process and candidates use its coordinates.
     - `doubt`: factor on the standard deviations, which increases exploration.
     """
     process, discrete = process_of(cube), np.array(cube.levels) > 0

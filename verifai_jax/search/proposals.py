@@ -108,8 +108,7 @@ class Proposals:
     def temperature(self) -> Float[Array, ""] | Float[np.ndarray, " m"] | float:
         """Temperature of the smooth robustness; only for searches with gradients.
 
-        It is one number for the next points, or one for each of the last points if the search wants
-        clauses.
+        It is one number, or one for each of the last points if the search wants clauses.
         """
         if self._plan is None:
             return self._program.temperature(self._state)
@@ -400,7 +399,7 @@ class Proposals:
 
     def _give_up(self) -> NoReturn:
         raise ConstraintError(
-            f"where refused all that search {self.search!r} has proposed for {MAX_REFUSED} "
-            f"rounds; it accepted {self.accepted} of {self.proposed} points in all. Make the space "
-            "narrower, so that more of it is allowed, or use another search"
+            f"where refused all proposals of search {self.search!r} for {MAX_REFUSED} rounds; it "
+            f"accepted {self.accepted} of {self.proposed} points in all. Make the space narrower, "
+            "so that more of it is allowed, or use another search"
         )

@@ -71,8 +71,8 @@ class Suggested(Wrapper[PyTree]):
             raise TypeError(f"Suggested needs a search like Portfolio(); got {self.search!r}")
         if not self.search.learns:
             raise ValueError(
-                f"search {self.search!r} does not learn, so that suggestions would change nothing "
-                "of it; give one that does, such as Portfolio(), or simulate them alone with "
+                f"search {self.search!r} does not learn, so suggestions would not influence it; "
+                "give one that does, such as Portfolio(), or only simulate them with "
                 "falsify(first=...)"
             )
         check_options(self, {"times": 1, "every": 1, "points": 1, "rows": 0, "worst": 0})
@@ -91,8 +91,8 @@ class Suggested(Wrapper[PyTree]):
         """Raise `ValueError`, since only the rounds of `falsify` can ask for suggestions."""
         raise ValueError(
             "suggestions are asked for between the rounds of vj.falsify and vj.resume, so "
-            f"Suggested must be their search itself, and no part of another one; got it with "
-            f"{self.search!r} inside"
+            "Suggested must be the search itself, not a part of another one; got one around "
+            f"{self.search!r}"
         )
 
     def __repr__(self) -> str:

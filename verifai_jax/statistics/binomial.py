@@ -22,12 +22,12 @@ class Rate:
     """A failure rate estimated from independent samples of the prior.
 
     - `failures`: samples that failed.
-    - `simulations`: samples in all, those without a verdict included.
+    - `simulations`: number of all samples, including those without a verdict.
     - `low`, `high`: bounds of the true rate.
-    - `confidence`: probability with which the bounds hold.
-    - `at_any_time`: whether they hold whatever decided when sampling ended.
-    - `undecided`: further samples whose outcome is unknown; the lower bound takes
-      them for safe and the upper one for failed.
+    - `confidence`: the probability that the bounds hold.
+    - `at_any_time`: whether they hold however the end of sampling was decided.
+    - `undecided`: further samples whose outcome is unknown; they count as safe in the lower bound
+      and as failures in the upper one.
     """
 
     failures: int
@@ -60,9 +60,9 @@ def clopper_pearson(
 
     **Arguments:**
     - `failures`: samples that failed.
-    - `simulations`: samples in all, a number fixed beforehand.
-    - `confidence`: probability with which the interval is to hold.
-    - `undecided`: further samples that may have failed: without a verdict, for instance.
+    - `simulations`: number of all samples, fixed beforehand.
+    - `confidence`: the probability that the interval holds.
+    - `undecided`: further samples that may have failed, for example without a verdict.
     **Returns:** the `Rate`.
     **Raises:** `ValueError` unless `0 <= failures <= failures + undecided <= simulations`,
     `simulations >= 1` and `0 < confidence < 1`.
@@ -82,10 +82,10 @@ def exact_interval(
     """Compute the ends of the interval of Clopper and Pearson; counts may be effective ones.
 
     **Arguments:**
-    - `low_count`, `high_count`: the smallest and the greatest possible number of failures, each
-      used for one end.
-    - `samples`: samples in all, or as many as weighted ones are worth.
-    - `confidence`: probability with which the interval is to hold.
+    - `low_count`, `high_count`: the smallest and the largest possible number of failures, used for
+      the lower and the upper end.
+    - `samples`: number of all samples, or effective number of weighted ones.
+    - `confidence`: the probability that the interval holds.
     """
     from scipy.special import betaincinv
 
@@ -99,7 +99,7 @@ def exact_interval(
 def upper_bound(failures: int, simulations: int, confidence: float = 0.95) -> float:
     """Compute the one-sided Clopper-Pearson bound: the largest rate that is not excluded.
 
-    **Arguments:** as `clopper_pearson`; no simulations, or nothing but failures, exclude nothing.
+    **Arguments:** those of `clopper_pearson`; without simulations, or if all fail, the bound is 1.
     **Returns:** the bound; without a failure about `3 / simulations` at a confidence of 95 %.
     """
     from scipy.special import betaincinv
@@ -110,11 +110,11 @@ def upper_bound(failures: int, simulations: int, confidence: float = 0.95) -> fl
 
 
 def simulations_without_failure(rate: float, confidence: float = 0.95) -> int:
-    """Count the simulations without a failure that show that the failure rate is below `rate`.
+    """Count the simulations without a failure that would show a failure rate below `rate`.
 
     **Arguments:**
     - `rate`: failure rate to exclude.
-    - `confidence`: probability with which the statement is to hold.
+    - `confidence`: the probability that the statement holds.
     **Returns:** the least `n` with `(1 - rate)^n <= 1 - confidence`: about `3 / rate` at 95 %.
     **Raises:** `ValueError` unless `0 < rate < 1` and `0 < confidence < 1`.
     """
@@ -126,12 +126,12 @@ def simulations_without_failure(rate: float, confidence: float = 0.95) -> int:
 def simulations_until(
     p0: float, failures: int = 0, simulations: int = 0, confidence: float = 0.95
 ) -> int:
-    """Count the further simulations, none failing, that show that the failure rate is below `p0`.
+    """Count the further simulations without a failure that would show a rate below `p0`.
 
     **Arguments:**
     - `p0`: failure rate to exclude.
     - `failures`, `simulations`: samples taken so far.
-    - `confidence`: probability with which the statement is to hold.
+    - `confidence`: the probability that the statement holds.
     **Returns:** the least `n` for which `upper_bound(failures, simulations + n)` is at most `p0`.
     **Raises:** `ValueError` unless `0 < p0 < 1`.
     """
@@ -153,8 +153,8 @@ def simulations_until(
 def check_counts(failures: int, simulations: int, undecided: int = 0) -> None:
     """Check the counts of a rate.
 
-    **Raises:** `ValueError` unless `0 <= failures <= simulations` and `simulations >= 1`, also
-    with those that are undecided counted as failures.
+    **Raises:** `ValueError` unless `0 <= failures <= simulations` and `simulations >= 1`, also if
+    undecided samples are counted as failures.
     """
     if undecided and not 0 <= undecided <= simulations - failures:
         raise ValueError(

@@ -48,13 +48,14 @@ Counts = Real[np.ndarray, "*#n"] | float
 def anytime_interval(
     failures: int, simulations: int, confidence: float = 0.95, undecided: int = 0
 ) -> Rate:
-    """Compute an interval that holds at all times, for samples stopped by their own outcomes.
+    """Compute an interval that is valid at any time, even if outcomes decide when sampling stops.
 
-    The rates at which a mixture of binomial likelihoods over a Beta(1/2, 1/2) prior has not grown
-    to `1 / (1 - confidence)` times that of the rate itself. Wider than `clopper_pearson`, by a
-    factor of 1.5 to 2.
+    It contains the rates whose likelihood is not exceeded `1 / (1 - confidence)` times by the
+    mixture of binomial likelihoods over a Beta(1/2, 1/2) prior. It is wider than `clopper_pearson`,
+    by a factor of 1.5 to 2.
 
-    **Arguments:** as `clopper_pearson`, but anything may have decided the number of simulations.
+    **Arguments:** those of `clopper_pearson`, but the number of simulations may depend on their
+    outcomes.
     **Returns:** the `Rate`.
     **Raises:** `ValueError` unless `0 <= failures <= simulations`, `simulations >= 1` and
     `0 < confidence < 1`.
@@ -74,17 +75,17 @@ def anytime_interval(
 def simultaneous_interval(
     failures: int, simulations: int, confidence: float = 0.95, among: int = 1
 ) -> Rate:
-    """Compute an interval that holds at all times, together with those of other rates.
+    """Compute an interval that is valid at any time, together with those of other rates.
 
-    Each side of each of N intervals has error `(1 - confidence) / (2 N)`, so that all of them hold
+    Each side of each of N intervals has error `(1 - confidence) / (2 N)`, so all of them hold
     together with probability `confidence` (Bonferroni), however the samples depend on each other:
     policies share their features.
 
     **Arguments:**
     - `failures`: samples that failed.
-    - `simulations`: samples in all; anything may have decided their number.
-    - `confidence`: probability with which all intervals are to hold.
-    - `among`: number of rates, this one included.
+    - `simulations`: number of all samples, which may depend on their outcomes.
+    - `confidence`: the probability that all intervals hold.
+    - `among`: number of rates, including this one.
     **Returns:** the `Rate`.
     **Raises:** `ValueError` unless `0 <= failures <= simulations`, `simulations >= 1`,
     `0 < confidence < 1` and `among >= 1`.
@@ -117,7 +118,7 @@ def evidence_below(failures: Counts, simulations: Counts, rate: Counts) -> Float
 
     **Arguments:**
     - `failures`, `simulations`: numbers of samples, which broadcast; `failures` may be fractions,
-      for what is expected of samples to come.
+      for expected numbers of future samples.
     - `rate`: rates to reject from above.
     """
     from scipy.special import betainc, betaln
@@ -139,7 +140,7 @@ def evidence_above(failures: Counts, simulations: Counts, rate: Counts) -> Float
 
     The mixture has a density proportional to `t^(-1/2) (1-t)^(-1/2)` there.
 
-    **Arguments:** as `evidence_below`, with rates to reject from below.
+    **Arguments:** those of `evidence_below`, with rates to reject from below.
     """
     from scipy.special import betaincc, betaln
 
@@ -154,10 +155,10 @@ def evidence_above(failures: Counts, simulations: Counts, rate: Counts) -> Float
 
 
 def verdict(rate: Rate | None, p: float) -> str:
-    """Return `"safe@p"`, `"unsafe"` or `"undecided"`: the interval below `p`, above it, or neither.
+    """Return `"safe@p"`, `"unsafe"` or `"undecided"`, for an interval below, above or around `p`.
 
-    So "unsafe" is a statement about the probability of failure. A counterexample alone is none: a
-    policy that fails once in a million is safe at 0.01.
+    So "unsafe" is a statement about the probability of failure. A single counterexample does not
+    make a policy unsafe: one that fails once in a million is safe at 0.01.
     """
     if rate is None:
         return UNDECIDED
@@ -167,12 +168,12 @@ def verdict(rate: Rate | None, p: float) -> str:
 
 
 def safe_at(p: float) -> str:
-    """Write the verdict of a policy whose failure rate is below `p`."""
+    """Write the verdict on a policy whose failure rate is below `p`."""
     return f"{SAFE}@{p:zg}"
 
 
 def verdict_kind(verdict: str) -> str:
-    """Return `"safe"`, `"unsafe"` or `"undecided"` of a verdict; empty for none."""
+    """Return the kind of a verdict, `"safe"`, `"unsafe"` or `"undecided"`; empty without one."""
     return SAFE if verdict.split("@")[0] == SAFE else verdict
 
 
@@ -187,7 +188,7 @@ def _border(within: float, outside: float, inside: Callable[[float], bool]) -> f
 
 
 def log_mixture(k: int, n: int) -> float:
-    """Compute the logarithm of the likelihood, mixed over a Beta(1/2, 1/2) prior."""
+    """Compute the logarithm of the likelihood averaged over a Beta(1/2, 1/2) prior."""
     half = math.lgamma(k + 0.5) + math.lgamma(n - k + 0.5) - math.lgamma(n + 1)
     return half - math.log(math.pi)
 

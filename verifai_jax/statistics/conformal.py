@@ -20,7 +20,7 @@ from verifai_jax.core.messages.checks import check_fraction
 
 
 def conformal_threshold(scores: ArrayLike, alpha: float) -> float:
-    """Return what a further score exceeds with probability `alpha` at most.
+    """Return a threshold that a further score exceeds with probability at most `alpha`.
 
     **Raises:** `ValueError` for too few scores.
     """
@@ -36,9 +36,9 @@ def conformal_threshold(scores: ArrayLike, alpha: float) -> float:
 
 
 def conformal_p_value(scores: ArrayLike, score: ArrayLike) -> np.ndarray:
-    """Return the share of scores, a further one included, that are no smaller than a further one.
+    """Return the share of all scores, a further one included, not below the further one.
 
-    It is `alpha` or below with probability `alpha` at most.
+    It is at most `alpha` with probability at most `alpha`.
     """
     ordered = np.sort(np.asarray(scores, float))
     below = np.searchsorted(ordered, np.asarray(score, float), "left")

@@ -34,18 +34,18 @@ def worst_probability(p: float, radius: float) -> float:
 
     **Arguments:**
     - `p`: its probability under the prior.
-    - `radius`: nats, at least 0.
+    - `radius`: the divergence in nats, at least 0.
     """
     _check(p, radius)
     return worst_mean((0.0, 1.0), (1 - p, p), radius)
 
 
 def radius_of(p: float, limit: float) -> float:
-    """Return the least divergence in nats at which a prior gives an event the probability `limit`.
+    """Return the smallest divergence in nats at which a prior gives an event probability `limit`.
 
     **Arguments:**
     - `p`: its probability under the prior.
-    - `limit`: a greater one; 0 is returned for one that is not greater.
+    - `limit`: a greater probability; the result is 0 if it is not greater.
     """
     _check(p, 0.0)
     return 0.0 if limit <= p else binary_divergence(limit, p)
@@ -55,9 +55,9 @@ def worst_mean(values: Sequence[float], weights: Sequence[float], radius: float)
     """Return the greatest mean of a number over all distributions within a divergence.
 
     **Arguments:**
-    - `values`: that the number takes.
-    - `weights`: their probabilities, whose sum is 1.
-    - `radius`: nats, at least 0.
+    - `values`: the possible values of the number.
+    - `weights`: their probabilities, which sum to 1.
+    - `radius`: the divergence in nats, at least 0.
     """
     _check(0.0, radius)
     low, high = 0.0, EXTREME
@@ -69,9 +69,10 @@ def worst_mean(values: Sequence[float], weights: Sequence[float], radius: float)
 
 
 def radius_of_mean(values: Sequence[float], weights: Sequence[float], limit: float) -> float:
-    """Return the least divergence in nats at which the mean of a number reaches `limit`.
+    """Return the smallest divergence in nats at which the mean of a number reaches `limit`.
 
-    **Arguments:** as `worst_mean`; `limit`, from which on 0 is returned where the mean is greater.
+    **Arguments:** those of `worst_mean`, and `limit`; the result is 0 if the mean already reaches
+    it.
     """
     if limit <= _tilted(values, weights, 0.0)[0]:
         return 0.0

@@ -18,15 +18,15 @@ def max_min_step(
     free: Bool[np.ndarray, " p"],
     bounded: bool,
 ) -> Float[np.ndarray, " p"]:
-    """Compute the step within `radius` a coordinate that raises `min(rho + gradients @ step)` most.
+    """Compute the step within `radius` a coordinate that maximises `min(rho + gradients @ step)`.
 
     **Arguments:**
-    - `theta`: present parameters, from which the step is taken.
+    - `theta`: the present parameters.
     - `rho`, `gradients`: robustness in each environment at `theta`, and its derivatives.
-    - `radius`: greatest change of a coordinate.
+    - `radius`: maximum change of a coordinate.
     - `free`: coordinates that may move.
     - `bounded`: whether they stay in the unit cube.
-    **Returns:** the step; zero where nothing can be gained, or the solver finds nothing.
+    **Returns:** the step; zero if there is no improvement, or the solver finds none.
     """
     step = np.zeros_like(theta)
     indices = np.flatnonzero(free & np.any(gradients != 0, axis=0))

@@ -19,13 +19,13 @@ from verifai_jax.core.messages.checks import check_fraction
 
 @dataclass(frozen=True)
 class PairedDifference:
-    """The mean of differences of pairs, with an interval.
+    """The mean difference of pairs, with an interval.
 
     - `mean`: the mean of the differences; NaN without a pair.
-    - `low`, `high`: bounds of the expected difference; NaN with fewer than two pairs, which say
-      nothing of how much a difference varies.
-    - `pairs`: differences in the mean.
-    - `confidence`: probability with which the bounds hold.
+    - `low`, `high`: bounds of the expected difference; NaN for fewer than two pairs, which do not
+      show how much differences vary.
+    - `pairs`: number of differences.
+    - `confidence`: the probability that the bounds hold.
     """
 
     mean: float
@@ -63,10 +63,8 @@ def paired_difference(
     """Compute the mean of `values - reference` and its Student's t interval.
 
     **Arguments:**
-    - `values`, `reference`: the two values of each pair; pairs in which one is not finite are left
-      out.
-    - `confidence`: probability with which the interval is to hold, if the differences are
-      independent and normal.
+    - `values`, `reference`: the two values of each pair; pairs without finite values are left out.
+    - `confidence`: probability that the interval holds, if differences are independent and normal.
     **Returns:** the `PairedDifference`.
     **Raises:** `ValueError` for lists of different lengths, or a confidence out of range.
 
@@ -76,8 +74,8 @@ def paired_difference(
     one, other = np.asarray(values, np.float64), np.asarray(reference, np.float64)
     if one.shape != other.shape or one.ndim != 1:
         raise ValueError(
-            "paired values are two lists of one length; "
-            f"got shapes {list(one.shape)} and {list(other.shape)}"
+            f"paired values must be two lists of the same length; got shapes {list(one.shape)} and "
+            f"{list(other.shape)}"
         )
     differences = one - other
     differences = differences[np.isfinite(differences)]

@@ -27,12 +27,12 @@ class PairedRates:
     """The difference of two failure rates, second minus first, from paired samples.
 
     - `only_first`, `only_second`: pairs in which only one of the two fails.
-    - `pairs`: in all.
+    - `pairs`: number of all pairs.
     - `low`, `high`: bounds of the difference.
-    - `at_any_time`: whether they hold whatever decided when sampling ended.
-    - `confidence`: probability with which they do.
-    - `undecided`: further pairs without both verdicts, among `pairs`; the lower bound takes them
-      for failures of the first alone, and the upper bound for failures of the second alone.
+    - `at_any_time`: whether they hold however the end of sampling was decided.
+    - `confidence`: the probability that they hold.
+    - `undecided`: pairs, included in `pairs`, without both verdicts; they count as failures of the
+      first only in the lower bound, of the second only in the upper bound.
     """
 
     only_first: int
@@ -46,7 +46,7 @@ class PairedRates:
 
     @property
     def estimate(self) -> float:
-        """Difference per pair, pairs without both verdicts left out."""
+        """Difference per pair, without pairs that lack a verdict."""
         known = self.pairs - self.undecided
         return (self.only_second - self.only_first) / known if known else math.nan
 
@@ -72,11 +72,10 @@ def paired_rates(
 
     **Arguments:**
     - `only_first`, `only_second`: pairs in which only the first, only the second fails.
-    - `pairs`: in all; anything may have decided their number.
-    - `confidence`: probability with which the interval is to hold at all times together.
-    - `undecided`: further pairs without both verdicts.
-    - `at_any_time`: False for a number of pairs that was fixed beforehand, of which the interval is
-      narrower.
+    - `pairs`: number of all pairs, which may depend on their outcomes.
+    - `confidence`: the probability that the interval holds at all times.
+    - `undecided`: further pairs that lack a verdict.
+    - `at_any_time`: False for a number of pairs fixed beforehand, which gives a narrower interval.
     **Returns:** the `PairedRates`.
     **Raises:** `ValueError` for counts below zero or above `pairs`, and unless `pairs >= 1` and
     `0 < confidence < 1`.
@@ -84,8 +83,8 @@ def paired_rates(
     counts = (only_first, only_second, undecided)
     if pairs < 1 or min(counts) < 0 or sum(counts) > pairs:
         raise ValueError(
-            "counts of pairs must be at least 0, and together at most the pairs, of which there is "
-            f"at least one; got {only_first}, {only_second} and {undecided} of {pairs}"
+            "counts of pairs must be at least 0 and add up to at most the number of pairs, which "
+            f"must be at least 1; got {only_first}, {only_second} and {undecided} of {pairs}"
         )
     check_fraction("confidence", confidence)
     interval = anytime_interval if at_any_time else clopper_pearson

@@ -16,13 +16,13 @@ _MAX_PAIRS = 2**24
 
 
 def fronts(points: ArrayLike) -> Int[np.ndarray, " n"]:
-    """Return each point's front: 0 where none dominates it, 1 once those are gone, and so on.
+    """Return each point's Pareto front: 0 if none dominates it, 1 if only front 0 does, ...
 
     **Arguments:**
-    - `points`: `[n, objectives]`, all objectives to be minimised. Infinite entries compare as
-      numbers do.
-    **Returns:** the numbers; -1 for a point with a NaN, which takes no part.
-    **Raises:** `ValueError` for points that are no matrix.
+    - `points`: `[n, objectives]`, all objectives, to be minimised. Infinite entries are compared
+      too.
+    **Returns:** the numbers of the fronts; -1 for a point with a NaN, which is ignored.
+    **Raises:** `ValueError` for points that are not a matrix.
     """
     points = np.asarray(points, np.float64)
     if points.ndim != 2:

@@ -16,8 +16,8 @@ def shortest(
     """Compute the shortest `z` with `matrix @ z >= bound`.
 
     **Arguments:**
-    - `matrix`: rows of length one, up to rounding, so that one tolerance fits them all.
-    - `bound`: least value of each row.
+    - `matrix`: rows of norm one, up to rounding, so that one tolerance fits all of them.
+    - `bound`: lower bound of each row.
     **Returns:** the vector; None if the inequalities contradict each other.
     """
     if np.all(bound <= 0):
@@ -43,7 +43,7 @@ def shortest_in_box(
     low: Float[np.ndarray, " k"],
     high: Float[np.ndarray, " k"],
 ) -> Float[np.ndarray, " k"] | None:
-    """Compute the shortest `z` with `rows @ z <= most` and `low <= z <= high`.
+    """Compute the shortest `z` with `rows @ z <= maximum` and `low <= z <= high`.
 
     **Arguments:**
     - `rows`, `maximum`: linear inequalities; rows of zeros are left out.
@@ -72,11 +72,11 @@ def smallest_change(
 ) -> Float[np.ndarray, " p"] | None:
     """Compute the step to the point nearest to `nominal` with `rho + gradients @ step >= target`.
 
-    Exact for this linear model; the caller checks the step by simulation.
+    It is exact for this linear model; the caller checks the step by simulation.
 
     **Arguments:**
-    - `theta`: present parameters, from which the step is taken.
-    - `nominal`: parameters to stay near to.
+    - `theta`: the present parameters.
+    - `nominal`: parameters to stay close to.
     - `rho`, `gradients`: robustness in each environment at `theta`, and its derivatives.
     - `target`: robustness to reach in every environment.
     - `free`: coordinates that may move.

@@ -23,18 +23,18 @@ class StoppingRule(Protocol):
 
         **Arguments:**
         - `failures`: samples that failed so far, as simulated.
-        - `simulations`: samples so far.
-        - `without_verdict`: those among them that have no verdict.
+        - `simulations`: number of samples so far.
+        - `without_verdict`: number of those without a verdict.
         """
         ...
 
 
 @dataclass(frozen=True)
 class Within:
-    """Stop when the failure rate is known to within `half_width`, such as 0.005 for half a percent.
+    """A rule that stops when the failure rate is known to within `half_width`, such as 0.005.
 
-    - `half_width`: half of the length of the interval that is wanted.
-    - `confidence`: probability with which the interval is to hold.
+    - `half_width`: half of the required length of the interval.
+    - `confidence`: the probability that the interval holds.
 
     **Raises:** `ValueError` unless `0 < half_width < 0.5` and `0 < confidence < 1`.
     """
@@ -57,10 +57,10 @@ class Within:
 
 @dataclass(frozen=True)
 class Decided:
-    """Stop when it is clear whether the failure rate is above or below `rate`.
+    """A rule that stops when it is clear whether the failure rate is above or below `rate`.
 
     - `rate`: failure rate to compare with.
-    - `confidence`: probability with which the answer is to be right.
+    - `confidence`: the probability that the answer is right.
 
     **Raises:** `ValueError` unless `0 < rate < 1` and `0 < confidence < 1`.
     """

@@ -51,10 +51,10 @@ class StratifiedRate:
     """A failure rate from two strata.
 
     - `estimate`: the estimate of the rate; `low`, `high`: bounds of it.
-    - `confidence`: probability with which the bounds hold.
-    - `trials`: in both strata together.
-    - `pooled`: the interval of Clopper and Pearson of the same trials, without strata.
-    - `at_any_time`: whether the bounds hold whatever decided which trials there are.
+    - `confidence`: the probability that the bounds hold.
+    - `trials`: number of trials in both strata.
+    - `pooled`: the Clopper-Pearson interval of the same trials, without strata.
+    - `at_any_time`: whether the bounds hold however the trials were chosen.
     """
 
     estimate: float
@@ -67,7 +67,7 @@ class StratifiedRate:
 
     @property
     def worth(self) -> float:
-        """Number of trials without strata that would give an interval as short, about."""
+        """Approximate number of trials without strata that give an interval of the same length."""
         return self.trials * ((self.pooled[1] - self.pooled[0]) / (self.high - self.low)) ** 2
 
     def __str__(self) -> str:
@@ -93,16 +93,16 @@ def stratified_rate(
 
     **Arguments:**
     - `first`, `second`: failures and trials of each stratum.
-    - `share`: probability of the second stratum: a number, or how many of how many independent
-      samples lie in it.
-    - `confidence`: probability with which the interval is to hold.
+    - `share`: probability of the second stratum: a number, or counts of independent samples, in it
+      and in all.
+    - `confidence`: the probability that the interval holds.
     - `undecided`: further trials of each stratum that may have failed.
-    - `allocated`: whether somebody chose the number of trials of each stratum beforehand; without
-      that they are samples of the whole.
-    - `at_any_time`: whether verdicts decided which trials were made, or when to stop.
+    - `allocated`: whether the number of trials in each stratum was chosen beforehand; otherwise
+      trials are samples of the whole.
+    - `at_any_time`: whether verdicts influenced which trials were made, or when to stop.
     **Returns:** the `StratifiedRate`.
-    **Raises:** `ValueError` for counts below zero or failures above trials, no trial, and for a
-    share or a confidence out of range.
+    **Raises:** `ValueError` for counts below zero or failures above trials, if there are no trials,
+    and for a share or a confidence out of range.
     """
     check_fraction("confidence", confidence)
     counts = [first, second]

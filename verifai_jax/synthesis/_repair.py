@@ -68,31 +68,33 @@ def repair(
     backend: str | None = None,
     progress: bool | None = None,
 ) -> Repair:
-    """Change parameters as little as makes the formula hold in all counterexamples.
+    """Change parameters as little as possible so that the formula holds in all counterexamples.
 
     **Arguments:**
-    - `problem`: what fails, or a run of it, whose counterexamples come first.
+    - `problem`: the problem that fails, or a run of it, whose counterexamples are used first.
     - `parameters`: names of features; or, with `system_of`, a pytree of arrays.
-    - `budget`: simulations at most, the check not counted.
+    - `budget`: maximum number of simulations, without those of the final check.
     - `nominal`: values of the parameters to start from; the problem's own when left out.
-    - `system_of(parameters) -> system`: pure, and traced by JAX. All features are the environment.
-    - `aim`: the formula in all that an attack finds, or the least failure probability, counted in
-      samples of the prior, where no parameters keep the formula everywhere. No attack is made then.
-    - `attack`: the search over the environment that attacks the parameters.
-    - `margin`: robustness that is wanted.
-    - `rounds`: turns of attack and repair at most.
-    - `held_out`: fresh environments for the failure rates before and after; 0 for no check.
-    - `mass`: probability of the part of the prior in which the environment is attacked, nearest to
-      its medians: what lies farther out in the tails is no reason for other parameters. With 1 the
-      attack goes to the ends of all tails at once.
-    - `gradient`: whether to follow gradients; by default where the system has them without
-      changing the backend.
+    - `system_of(parameters) -> system`: a pure function, traced by JAX. All features then belong to
+      the environment.
+    - `aim`: `"robustness"`: the formula must hold in all environments that an attack finds.
+      `"probability"`: the lowest failure probability, counted in samples of the prior without
+      attacks, for problems in which no parameters always keep the formula.
+    - `attack`: the search over the environment that looks for failures of the parameters.
+    - `margin`: the required robustness.
+    - `rounds`: maximum number of rounds, each an attack and a repair.
+    - `held_out`: number of fresh environments for the rates before and after; 0 for no check.
+    - `mass`: probability of the central part of the prior, around its medians, in which the
+      environment is attacked; environments farther out in the tails are ignored. With 1 the attack
+      reaches the ends of all tails at once.
+    - `gradient`: whether to follow gradients; by default if the present backend has them.
     - `max_seconds`: wall-clock seconds; a fifth is reserved for the check.
     - `progress`: whether to show one line of progress; see `core.display.progress` for the default.
     - all other arguments: as in `falsify`.
-    **Returns:** a `Repair`; after Ctrl-C what is finished, without the check.
+    **Returns:** a `Repair`; after Ctrl-C the finished part, without the check.
     **Raises:** `ValueError` before anything compiles for unknown features, parameters without a
-    nominal value, no environment, options out of range, or arrays of a system without gradients.
+    nominal value, a problem without an environment, options out of range, or arrays of a system
+    without gradients.
     """
     started = time.perf_counter()
     run = problem if isinstance(problem, Run) else None
@@ -340,7 +342,9 @@ class _Repair:
             return False
         self.stopped = "no parameters"
         if not self.loop.bounded:
-            self.notes.append("gradients led no further; nothing else is tried on arrays")
+            self.notes.append(
+                "gradients found no further improvement; nothing else is tried for arrays"
+            )
         return False
 
     @property

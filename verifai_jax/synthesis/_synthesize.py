@@ -69,31 +69,31 @@ def synthesize(
     backend: str | None = None,
     progress: bool | None = None,
 ) -> Synthesis:
-    """Find features for which the formula holds robustly, whatever the other features are.
+    """Find values of some features for which the formula holds robustly for all others.
 
     **Arguments:**
     - `problem`: the system, its features and formulas.
     - `parameters`: names of the features to choose; all when left out. The others are the
       environment, which varies.
-    - `budget`: simulations at most, the check not counted.
-    - `aim`: the greatest robustness, which an attack measures, or the least failure probability,
-      counted in samples of the prior, where no parameters keep the formula everywhere.
-    - `attack`: the search over the environment that attacks the parameters.
-    - `margin`: robustness that is wanted.
-    - `environments`: in the set at first.
-    - `held_out`: fresh environments in which the result is checked; 0 for no check.
-    - `mass`: probability of the part of the prior in which the environment is attacked, nearest to
-      its medians; 1 for all of it, to the ends of all tails at once.
-    - `prove`: seconds, about, in which a box of parameters around the best is proved, as by
-      `verify`: with none of these, and no environment of that part of the prior, the formula
-      breaks. No proof when left out.
-    - `gradient`: whether to follow gradients; by default where the system has them without
-      changing the backend.
+    - `budget`: maximum number of simulations, without those of the final check.
+    - `aim`: `"robustness"`: the greatest worst-case robustness, found by attacks. `"probability"`:
+      the lowest failure probability, counted in samples of the prior without attacks, for problems
+      in which no parameters always keep the formula.
+    - `attack`: the search over the environment that looks for failures of the parameters.
+    - `margin`: the required robustness.
+    - `environments`: number of environments in the initial set.
+    - `held_out`: number of fresh environments in which the result is checked; 0 for no check.
+    - `mass`: probability of the central part of the prior, around its medians, in which the
+      environment is attacked; with 1 the attack reaches the ends of all tails at once.
+    - `prove`: approximate seconds to prove a box of parameters around the best ones, with the
+      method of `verify`: for all parameters in it, and all environments of that part of the prior,
+      the formula holds. No proof when left out.
+    - `gradient`: whether to follow gradients; by default if the present backend has them.
     - `batch`: simulations at once.
     - `max_seconds`: wall-clock seconds; a fifth is reserved for the check.
     - `progress`: whether to show one line of progress; see `core.display.progress` for the default.
     - all other arguments: as in `falsify`.
-    **Returns:** a `Synthesis`; after Ctrl-C what is finished, without the check.
+    **Returns:** a `Synthesis`; after Ctrl-C the finished part, without the check.
     **Raises:** `ValueError` before anything compiles for unknown features and options out of range.
     """
     started = time.perf_counter()

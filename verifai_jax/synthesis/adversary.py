@@ -33,8 +33,8 @@ STEPS = (1.0, 0.3, 0.1, 0.03)
 class Attack(NamedTuple):
     """Environments that were tried against one choice of parameters, and their verdicts.
 
-    **Fields:** `environments` `[m, d]`; `rho` `[m]`, NaN without a verdict; `violating`
-    `[m]`: fails, or keeps the formula with less than the margin.
+    **Fields:** `environments` `[m, d]`; `rho` `[m]`, NaN without a verdict; `violating` `[m]`:
+    whether the formula fails, or holds by less than the margin.
     """
 
     environments: Float[np.ndarray, "m d"]
@@ -43,11 +43,11 @@ class Attack(NamedTuple):
 
     @property
     def worst(self) -> float:
-        """Least robustness with a verdict; infinite without a verdict."""
+        """The least robustness of all verdicts; infinite if there is none."""
         return float(np.nanmin(self.rho, initial=np.inf))
 
     def select(self, maximum: int) -> Float[np.ndarray, "k d"]:
-        """Select the worst violating environment, and those of the worst half farthest apart."""
+        """Select the worst violating environment, and distant ones from the worse half."""
         indices = np.flatnonzero(self.violating)
         indices = indices[np.argsort(self.rho[indices], kind="stable")]
         indices = indices[: max(maximum, (len(indices) + 1) // 2)]
@@ -74,19 +74,19 @@ def attack(
     enough: int = 64,
     scale: float = 1.0,
 ) -> Attack:
-    """Search environments whose robustness lies below `level`.
+    """Search for environments whose robustness is below `level`.
 
     **Arguments:**
     - `loop`: the system with its parameters.
     - `theta` `[p]`: the parameters to attack.
     - `level`: robustness below which an environment counts.
-    - `limits`: simulations at most.
-    - `search`: over the environment.
-    - `batch`: environments that the search proposes at once.
+    - `limits`: the budget of simulations.
+    - `search`: the search over the environment.
+    - `batch`: number of environments that the search proposes at once.
     - `seed`: the seed of the search.
-    - `region`: where the environment is attacked.
-    - `enough`: environments after which the search stops.
-    - `scale`: size of ordinary robustnesses, to which temperatures are relative.
+    - `region`: the region in which the environment is attacked.
+    - `enough`: number of environments after which the search stops.
+    - `scale`: typical size of the robustness, to which temperatures are relative.
     """
     assert loop.environment is not None
     free = np.sum(np.array(loop.environment.levels) == 0)

@@ -41,9 +41,9 @@ def feature_parameters(
     backend: str | None,
     seed: int,
 ) -> FeatureParameters:
-    """Return the problem, checked and on its backend, with these features as parameters.
+    """Return the checked problem on its backend, with these features as parameters.
 
-    **Raises:** `ValueError` for what does not fit, before anything compiles.
+    **Raises:** `ValueError` for invalid arguments, before anything compiles.
     """
     if not isinstance(problem, Problem):
         raise TypeError(f"a Problem is needed; got {type(problem).__name__}")
@@ -76,9 +76,9 @@ def feature_parameters(
 
 
 def attack_search(problem: Problem, search: str | Search, loop: Parametric) -> Search:
-    """Return the search over the environment, if it can work there.
+    """Return the search over the environment, if it can work on this problem.
 
-    **Raises:** `ValueError` for a search that needs gradients of a system without them, or clauses.
+    **Raises:** `ValueError` for a search that needs clauses, or gradients that the system lacks.
     """
     if isinstance(search, str):
         search = searches.named(search)
@@ -109,7 +109,7 @@ def repaired_arrays(
 ) -> ArrayParameters:
     """Return the problem with these arrays as parameters of a repair.
 
-    **Raises:** `TypeError` or `ValueError` for what does not fit.
+    **Raises:** `TypeError` or `ValueError` for invalid arguments.
     """
     if not isinstance(problem, Problem):
         raise TypeError(f"a Problem is needed; got {type(problem).__name__}")
@@ -139,21 +139,21 @@ def repaired_features(
 ) -> tuple[Any, Float[np.ndarray, " p"]]:
     """Return the problem with these features as parameters of a repair, and their nominal values.
 
-    **Raises:** `ValueError` for what does not fit, before anything compiles.
+    **Raises:** `ValueError` for invalid arguments, before anything compiles.
     """
     named = isinstance(names, str) or (
         isinstance(names, Sequence) and all(isinstance(name, str) for name in names)
     )
     if not named or not len(names):
         raise ValueError(
-            "parameters must be names of features, at least one; arrays need "
-            f"system_of=function that makes the system of them; got {names!r}"
+            "parameters must be names of features, at least one; arrays need system_of=, a "
+            f"function that makes the system from them; got {names!r}"
         )
     loop = feature_parameters(problem, names, gradient, batch, budget, precision, backend, seed)
     if loop.environment is None:
         raise ValueError(
-            "all features are parameters, so that nothing can vary to find counterexamples in; "
-            "use synthesize"
+            "all features are parameters, so no environment is left in which to find "
+            "counterexamples; use synthesize"
         )
     check_names("parameter of nominal", nominal or {}, loop.names)
     given = {**(problem.nominal or {}), **(nominal or {})}

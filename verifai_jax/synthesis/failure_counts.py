@@ -32,16 +32,16 @@ STD = 0.01, 0.3
 
 
 class FailureCounts:
-    """The search, whose best candidate can be read at any time.
+    """A search for the lowest failure count, whose best candidate is available at any time.
 
     **Arguments:**
-    - `loop`: the system with its parameters, some features being its environment.
-    - `margin`: robustness below which a sample fails.
+    - `loop`: the system with its parameters; the other features are its environment.
+    - `margin`: robustness below which a sample counts as failing.
     - `limits`: its budget.
-    - `seed`: alone decides samples and candidates.
-    - `start` `[p]`: nominal parameters, which are candidates; of others that fail as seldom the
-      nearest to these is best. None without any.
-    **Raises:** `ValueError` where nothing varies but the parameters.
+    - `seed`: the seed, which alone determines samples and candidates.
+    - `start` `[p]`: nominal parameters. They are candidates, and among parameters that fail equally
+      often the nearest to them are best. None without any.
+    **Raises:** `ValueError` if nothing varies except the parameters.
     """
 
     def __init__(

@@ -25,11 +25,11 @@ class HeldOut:
     """Verdicts of parameters in fresh environments.
 
     **Fields:**
-    - `simulations` made.
+    - `simulations`: number of simulations made.
     - `failures`: simulations that broke a formula.
-    - `short`: simulations that kept it, but by less than the wanted margin.
+    - `short`: simulations that kept it by less than the required margin.
     - `without_verdict`: simulations that did not end properly; the upper end of the rate's interval
-      takes them for failures.
+      counts them as failures.
     - `lowest` robustness, None without a verdict.
     - `rate`: the rate of failures, with its 95 % interval; None without any verdict.
     """
@@ -43,12 +43,12 @@ class HeldOut:
 
     @property
     def passed(self) -> bool:
-        """True where all were simulated and none fails or falls short of the margin."""
+        """True if all were simulated, and none fails or is below the margin."""
         return self.simulations > 0 and not (self.failures or self.short or self.without_verdict)
 
     @property
     def bound(self) -> float | None:
-        """A number that the failure probability is below, with 95 % confidence."""
+        """An upper bound of the failure probability with 95 % confidence."""
         if self.rate is None:
             return None
         rate = self.rate
@@ -85,9 +85,9 @@ def held_out(
     **Arguments:**
     - `loop`: the system with its parameters.
     - `theta` `[p]`: the parameters.
-    - `count`: environments; fewer where the constraint of the space refuses nearly all.
-    - `margin`: robustness that is wanted.
-    - `seed`: alone decides the environments.
+    - `count`: number of environments; fewer if the constraint of the space refuses nearly all.
+    - `margin`: the required robustness.
+    - `seed`: the seed, which alone determines the environments.
     - `limits`: time at which to stop early.
     **Returns:** a `HeldOut`.
     """

@@ -35,7 +35,7 @@ Propose = Callable[[np.ndarray, np.ndarray, np.ndarray, float], list[np.ndarray]
 
 
 class Choice(NamedTuple):
-    """Parameters, and their least robustness over so many environments."""
+    """Parameters, with their least robustness and the number of environments for it."""
 
     theta: Float[np.ndarray, " p"]
     value: float
@@ -54,7 +54,7 @@ class Archive:
             self.choices.append(Choice(theta, float(value), environments))
 
     def best(self, count: int, merit: Merit, apart: float = 0.0) -> list[Choice]:
-        """Return the best choices, no two the same, or nearer than `apart` in each coordinate."""
+        """Return the best distinct choices, at least `apart` from each other in some coordinate."""
         taken: list[Choice] = []
         names: set[bytes] = set()
         for choice in sorted(self.choices, key=lambda c: merit(c.theta, c.value), reverse=True):
@@ -69,15 +69,15 @@ class Archive:
 
 
 def value_merit(theta: np.ndarray, value: float) -> tuple[float, ...]:
-    """Return the merit of a synthesis: the value."""
+    """Return the merit of parameters in a synthesis: their value."""
     return (value,)
 
 
 def worst_case(pairs: Pairs) -> Float[np.ndarray, " k"]:
-    """Return the value of each choice of parameters: negative where one fails somewhere.
+    """Return the value of each choice of parameters; negative if it fails in an environment.
 
-    Minus infinity where a simulation has no verdict in an environment in which others have one, or
-    where none of the environments can happen.
+    It is minus infinity if a simulation has no verdict in an environment in which others have one,
+    or if none of the environments is possible.
     """
     known = np.any(pairs.proper, axis=0)
     rho = np.where(pairs.proper, pairs.rho, -np.inf)[:, known]
@@ -88,7 +88,7 @@ def worst_case(pairs: Pairs) -> Float[np.ndarray, " k"]:
 
 
 def typical_size(rho: Sequence[float]) -> float:
-    """Return the size of ordinary robustnesses, positive."""
+    """Return a typical size of the robustness, which is positive."""
     sizes = np.abs(np.asarray(rho, float))
     sizes = sizes[np.isfinite(sizes) & (sizes > 0)]
     return float(np.median(sizes)) if len(sizes) else 1.0
@@ -114,7 +114,7 @@ def explore(
     batch: int,
     rng: np.random.Generator,
 ) -> None:
-    """Evaluate parameters over their whole space, then around the best."""
+    """Evaluate parameters over their whole space, then around the best ones."""
     size, half = max(1, len(environments)), limits.slice(limits.left // 2)
     refused = 0
     while half.left >= size and refused < MAX_REFUSED:
@@ -150,12 +150,12 @@ def climb(
     radius: float,
     steps: int = 40,
 ) -> list[Choice]:
-    """Follow the gradients of the least robust environments from each start, all in step.
+    """Follow the gradients of the least robust environments from all starts in parallel.
 
     **Arguments:**
-    - `propose(theta, rho, gradients, radius)`: candidates for a step, the boldest first.
+    - `propose(theta, rho, gradients, radius)`: returns candidates for a step, the largest first.
 
-    A step is taken where simulations show that it is better; the radius follows its success.
+    A step is taken if simulations show an improvement; the radius adapts to its success.
     """
     thetas = np.array(thetas, np.float64)[: limits.left // max(1, len(environments))]
     if not len(thetas):
@@ -207,7 +207,7 @@ def climb(
 
 
 def has_gradients(loop: Parametric) -> bool:
-    """Return whether there are gradients, or few enough parameters for differences."""
+    """Return whether there are gradients, or few enough parameters for finite differences."""
     return loop.differentiable or (loop.bounded and 0 < int(loop.free.sum()) <= MAX_DIFFERENCES)
 
 
@@ -243,7 +243,7 @@ def cross_entropy(
     rng: np.random.Generator,
     rounds: int = 8,
 ) -> None:
-    """Search around good parameters without gradients: sample, keep an elite, narrow.
+    """Search around good parameters without gradients by sampling, elites and narrowing.
 
     De Boer, Kroese, Mannor, Rubinstein, A tutorial on the cross-entropy method (2005), algorithm
     3.3, with the elite kept over the rounds. Discrete coordinates are inherited or drawn anew.

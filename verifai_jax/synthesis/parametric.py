@@ -42,12 +42,12 @@ MAX_DIFFERENTIATED = 64
 class Pairs(NamedTuple):
     """Verdicts of `k` parameters in `n` environments each.
 
-    - `rho`: least robustness of the formulas; NaN without a verdict, infinite where the constraint
+    - `rho`: least robustness of the formulas; NaN without a verdict, infinite if the constraint
       refuses the pair.
-    - `failing`: breaks a formula.
-    - `proper`: has a verdict, or cannot happen.
-    - `by_parameters`, `by_environment`: gradients of the smooth robustness by the coordinates, zero
-      where they are not finite; None unless asked for.
+    - `failing`: whether a formula is broken.
+    - `proper`: whether there is a verdict, or the pair is impossible.
+    - `by_parameters`, `by_environment`: gradients of the smooth robustness with respect to the
+      coordinates, zero where they are not finite; None unless requested.
     """
 
     rho: Float[np.ndarray, "k n"]
@@ -57,7 +57,7 @@ class Pairs(NamedTuple):
     by_environment: Float[np.ndarray, "k n d"] | None = None
 
     def violates(self, margin: float) -> Bool[np.ndarray, "k n"]:
-        """Return the pairs that break a formula, or keep it with less than this margin."""
+        """Return which pairs break a formula, or keep it by less than this margin."""
         return self.proper & (self.failing | (self.rho < margin))
 
 
@@ -65,10 +65,10 @@ class FeatureParameters:
     """Some features of a problem as parameters, the others as the environment.
 
     **Arguments:**
-    - `problem`: on the backend that it is to run on.
-    - `names`: the names of the features that are parameters; all that vary when left out.
+    - `problem`: the problem, on the backend on which it should run.
+    - `names`: the names of the features that are parameters; by default all that vary.
     - `batch`: simulations at once.
-    - `gradient`: whether gradients may be asked for.
+    - `gradient`: whether gradients may be requested.
     **Raises:** `ValueError` for unknown features, none, or one that does not vary.
     """
 
@@ -126,11 +126,11 @@ class FeatureParameters:
 
     @property
     def simulations(self) -> int:
-        """Simulations so far; one with its gradient counts once."""
+        """Number of simulations so far; one with its gradient counts as one."""
         return self._values.simulations + (self._slopes.simulations if self._slopes else 0)
 
     def evaluate(self, thetas: Any, environments: Any, temperature: float | None = None) -> Pairs:
-        """Simulate every pair; a `temperature` also asks for gradients of the smooth robustness."""
+        """Simulate every pair; with a `temperature` also differentiate the smooth robustness."""
         k, n, d = len(thetas), len(environments), self.problem.space.dim
         rows = self._rows(thetas, environments)
         happens = accepted(self.problem.space, rows)
@@ -151,7 +151,7 @@ class FeatureParameters:
         return Pairs(*(x.reshape(k, n) for x in (rho, failing, proper)), *slopes)
 
     def values(self, theta: Float[np.ndarray, " p"]) -> dict[str, Any]:
-        """Return the values of the parameters by name, as a person writes them."""
+        """Return the values of the parameters by name, as a user writes them."""
         columns = {c: entries[0] for c, entries in columns_of(self.space, theta[None]).items()}
         values = {name: _plain(self.space[name], name, columns) for name in self.names}
         if self.start is None:
@@ -164,7 +164,7 @@ class FeatureParameters:
         return values
 
     def begin(self, nominal: dict[str, Any]) -> Float[np.ndarray, " p"]:
-        """Return the coordinates of values by name, which `values` gives back unrounded."""
+        """Return coordinates of named values from which `values` recovers them without rounding."""
         ordered = {name: nominal[name] for name in self.names}
         fields = [(self.space[name], value) for name, value in ordered.items()]
         parts = [np.ravel(np.asarray(d.to_unit(d.coerce(value)), float)) for d, value in fields]
@@ -176,7 +176,7 @@ class FeatureParameters:
         return held(self.problem, self.values(theta))
 
     def happens(self, theta: Any, environments: Any) -> Bool[np.ndarray, " n"]:
-        """Return the environments that the constraint accepts with these parameters."""
+        """Return which environments the constraint accepts with these parameters."""
         return accepted(self.problem.space, self._rows(np.asarray(theta)[None], environments))
 
     def _rows(self, thetas: Any, environments: Any) -> Float[np.ndarray, "kn d"]:
@@ -190,11 +190,12 @@ class ArrayParameters:
     """Arrays as parameters, such as the weights of a network; all features are the environment.
 
     **Arguments:**
-    - `problem`: its space, formulas and `end` are used; the system is what `system_of` makes.
+    - `problem`: the problem, whose space, formulas and `end` are used with the system of
+      `system_of`.
     - `parameters`: a pytree of arrays of real numbers.
-    - `system_of(parameters) -> system`: pure, and traced by JAX.
+    - `system_of(parameters) -> system`: a pure function, traced by JAX.
     - `batch`: simulations at once.
-    **Raises:** `TypeError` for leaves that are no real numbers; `ValueError` for a system that JAX
+    **Raises:** `TypeError` for leaves that are not real numbers; `ValueError` for a system that JAX
     cannot trace in the parameters.
     """
 
@@ -223,7 +224,7 @@ class ArrayParameters:
                 )
         flat, self._restore = ravel_pytree(parameters)
         if not flat.size:
-            raise ValueError("parameters hold no number to change")
+            raise ValueError("parameters contain no number to change")
         self.problem, self.environment = problem, problem.space
         self.start, self.dim = np.asarray(flat, np.float64), int(flat.size)
         self.free = np.ones(self.dim, bool)
@@ -256,7 +257,7 @@ class ArrayParameters:
             ) from error
 
     def evaluate(self, thetas: Any, environments: Any, temperature: float | None = None) -> Pairs:
-        """Simulate every pair; with a `temperature` the smooth robustness is differentiated."""
+        """Simulate every pair; with a `temperature` also differentiate the smooth robustness."""
         with in_precision(self.precision):
             parts = [
                 self._one(np.asarray(theta, np.float32), environments, temperature)
@@ -267,7 +268,7 @@ class ArrayParameters:
         return Pairs(*stacked)
 
     def happens(self, theta: Any, environments: Any) -> Bool[np.ndarray, " n"]:
-        """Return the environments that the constraint accepts."""
+        """Return which environments the constraint accepts."""
         return accepted(self.problem.space, np.asarray(environments, np.float32))
 
     def _one(self, theta: np.ndarray, environments: Any, temperature: float | None) -> Pairs:
@@ -299,7 +300,7 @@ class ArrayParameters:
         return self._restore(jnp.asarray(theta, jnp.float32))
 
     def with_parameters(self, theta: Float[np.ndarray, " p"]) -> Problem:
-        """Return the problem with the system of these parameters."""
+        """Return the problem with the system for these parameters."""
         return replace(self.problem, system=self.system_of(self.values(theta)))
 
     @cached_property
@@ -322,20 +323,20 @@ Parametric = FeatureParameters | ArrayParameters
 
 
 def held(problem: Problem, values: dict[str, Any]) -> Problem:
-    """Return the problem with these features fixed, and nominal if it has nominal features."""
+    """Return the problem with these features fixed, also in its nominal features if it has any."""
     nominal = None if problem.nominal is None else {**problem.nominal, **values}
     return replace(problem, space=problem.space.fixed(**values), nominal=nominal)
 
 
 def accepted(space: FeatureSpace, rows: Float[np.ndarray, "n d"]) -> Bool[np.ndarray, " n"]:
-    """Return the points that the constraint of the space accepts."""
+    """Return which points the constraint of the space accepts."""
     if space.where is None or not len(rows):
         return np.ones(len(rows), bool)
     return np.asarray(space.accepts_points(pad_rows(rows)))[: len(rows)]
 
 
 def columns_of(space: FeatureSpace, points: Any) -> dict[str, np.ndarray]:
-    """Return the columns of a table for the features at points of the space's cube."""
+    """Return table columns with the features at points of the space's cube."""
     u = np.asarray(points, np.float32).reshape(len(points), space.dim)
     padded = np.pad(u, ((0, -len(u) % ROWS), (0, 0)), constant_values=0.5)
     parts = [

@@ -32,11 +32,11 @@ Corner: TypeAlias = Float[np.ndarray, " dim"]
 
 @dataclass(frozen=True)
 class ProvedParameters:
-    """A box of parameters with which no features of an environment fail.
+    """A box of parameters for which no environment fails.
 
-    - `ends`: the least and the greatest value of each parameter, by its column in a table.
+    - `ends`: the minimum and maximum of each parameter, by its column in a table.
     - `mass`: the share of the parameters' prior in the box.
-    - `looked_at`: boxes that were looked at for it; `seconds`.
+    - `looked_at`: number of boxes examined for it; `seconds`.
     """
 
     ends: dict[str, tuple[Any, Any]]
@@ -65,12 +65,12 @@ def prove_around(
     """Prove a box of parameters around a point; None if no box was proved in time.
 
     **Arguments:**
-    - `problem`: one that `enclosable` gave.
-    - `point`: of the unit cube; its `chosen` coordinates are the parameters.
-    - `low`, `high`: corners of the part of the cube in which the other features lie.
-    - `seconds`: how long, about.
-    - `precision`, `seed`: as of `verify`.
-    **Raises:** `MissingRule` for an operation of the system that sets cannot go through.
+    - `problem`: a problem returned by `enclosable`.
+    - `point`: a point of the unit cube; its `chosen` coordinates are the parameters.
+    - `low`, `high`: corners of the part of the cube that contains the other features.
+    - `seconds`: approximate time in seconds.
+    - `precision`, `seed`: as in `verify`.
+    **Raises:** `MissingRule` for an operation of the system that has no rule for sets.
     """
     started, end = time.perf_counter(), time.perf_counter() + seconds
     enclosure = Enclosure(problem, precision)

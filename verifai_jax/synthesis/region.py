@@ -30,8 +30,8 @@ MAX_NAMES = 6
 class Region:
     """A part of the cube of an environment; see the module's docstring.
 
-    - `parameters`, `features`: names of what is chosen, and of what the environment varies.
-    - `tailed`: of each coordinate, whether its feature has tails.
+    - `parameters`, `features`: names of the parameters, and of the features of the environment.
+    - `tailed`: for each coordinate, whether its feature has tails.
     - `names`: the names of the features with tails.
     - `mass`: probability of the region, 1 for the whole cube.
     """
@@ -44,7 +44,7 @@ class Region:
 
     @property
     def radius(self) -> float:
-        """Distance from the medians in normal scores, of all coordinates with tails together."""
+        """Distance from the medians in normal scores, over all coordinates with tails."""
         count = int(self.tailed.sum())
         if self.mass >= 1 or not count:
             return math.inf
@@ -52,16 +52,16 @@ class Region:
 
     @property
     def ends(self) -> tuple[Float[np.ndarray, " d"], Float[np.ndarray, " d"]]:
-        """The corners of the box around the region, in the environment's cube."""
+        """The corners of the bounding box of the region, in the environment's cube."""
         low = np.where(self.tailed, scipy_special().ndtr(-self.radius), 0.0)
         return low, 1 - low
 
     def contains(self, points: Float[np.ndarray, "n d"]) -> Bool[np.ndarray, " n"]:
-        """Return the points that lie in the region."""
+        """Return which points lie in the region."""
         return self._distance(points) <= self.radius * (1 + 1e-6)
 
     def project(self, points: Float[np.ndarray, "n d"]) -> Float[np.ndarray, "n d"]:
-        """Return points, those outside moved towards the medians to the edge of the region."""
+        """Return points; those outside are moved towards the medians to the edge of the region."""
         outside = ~self.contains(points)
         if not outside.any():
             return points
@@ -72,7 +72,7 @@ class Region:
         return moved
 
     def describe(self) -> str:
-        """Say what was chosen, what the environment varies, and how far it goes."""
+        """Describe the parameters, the environment, and the extent of the region."""
         text = f"varied {_listed(self.features)}"
         if self.parameters:
             text = f"chose {_listed(self.parameters)}, {text}"
@@ -95,7 +95,7 @@ class Region:
 
 
 def region_of(loop: Parametric, mass: float) -> Region | None:
-    """Return the region in which the environment of a loop is attacked; None without one.
+    """Return the region in which a loop's environment is attacked; None without an environment.
 
     **Raises:** `ValueError` for a mass that is not a probability above 0.
     """

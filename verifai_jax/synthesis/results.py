@@ -24,19 +24,19 @@ if TYPE_CHECKING:
 class Synthesis(InNotebook):
     """Result of `synthesize`: parameters for which a formula holds.
 
-    **Fields:** `parameters`: the best found, by name; `robustness`: the least with
+    **Fields:** `parameters`: the best ones found, by name; `robustness`: the least robustness with
     them, over all `environments` of the set and all attacks (minus infinity without a verdict);
-    `margin` that was wanted; `candidates`: a table of the best parameters with their `rho` over
-    that many `environments`, all over the same set; `environments`: a table of the set, with the
-    `rho` of the best parameters; `held_out`: how they did in fresh samples, None without a check;
-    `attacks`: environments that were tried against the best parameters; `converged`: whether the
-    last attack found no environment worse than those of the set; `simulations` (without
-    those of the check), `without_verdict` and `seconds`; `stopped`: `"converged"`, `"budget"`,
-    `"max_seconds"`, `"no verdict"` or `"interrupted"`; `problem`: the one given; `seed`;
-    `varied`: what was chosen, what the environment varied, and how far; `counted`: with
-    `aim="probability"`, failures and samples by which the parameters were chosen; `sources`: what
-    the model was made of, as a run records it; `proved`: the box of parameters that was proved,
-    None without one; `proof_seconds`: how long a proof was to take, None for none.
+    `margin`: the required robustness; `candidates`: a table of the best parameters with their `rho`
+    and the number of `environments`, all from the same set; `environments`: a table of the set,
+    with the `rho` of the best parameters; `held_out`: the result in fresh samples, None without a
+    check; `attacks`: environments tried against the best parameters; `converged`: whether the last
+    attack found no environment worse than those of the set; `simulations` (without those of the
+    check), `without_verdict` and `seconds`; `stopped`: `"converged"`, `"budget"`, `"max_seconds"`,
+    `"no verdict"` or `"interrupted"`; `problem`: the given one; `seed`; `varied`: the parameters,
+    the environment, and its extent; `counted`: with `aim="probability"`, the failures and samples
+    by which the parameters were chosen; `sources`: the files of the model, as a run records them;
+    `proved`: the proved box of parameters, None without one; `proof_seconds`: the seconds allowed
+    for a proof, None for none.
     """
 
     problem: Problem = field(repr=False)
@@ -61,13 +61,13 @@ class Synthesis(InNotebook):
 
     @property
     def holds(self) -> bool:
-        """True where the formula kept its margin in every simulation with the best parameters."""
+        """True if the formula kept its margin in every simulation with the best parameters."""
         kept = bool(self.robustness >= self.margin)
         return kept and (self.held_out is None or self.held_out.passed)
 
     @cached_property
     def chosen(self) -> Problem:
-        """The problem with the parameters held at their values: ready to `falsify`."""
+        """The problem with the parameters fixed at their values, for example for `falsify`."""
         return held(self.problem, self.parameters)
 
     @property
@@ -116,7 +116,7 @@ class Synthesis(InNotebook):
             over = f"over {len(self.environments)} environments"
             lines.append(f"  {found} of the best {of} candidates keep it {over} (.candidates)")
         else:
-            lines.append(f"  {found} of the points simulated keep it (.robust)")
+            lines.append(f"  {found} of the simulated points keep the margin (.robust)")
         lines.append(f"  {self._costs()}")
         return "\n".join(lines)
 
@@ -139,7 +139,7 @@ def _counted(counts: tuple[int, int]) -> str:
 
 
 def format_value(value: object) -> str:
-    """Write the value of a parameter."""
+    """Format the value of a parameter."""
     if isinstance(value, float):
         return f"{value:z.6g}"
     if isinstance(value, int | str | bool):
@@ -152,12 +152,12 @@ def format_value(value: object) -> str:
 
 
 class Round(NamedTuple):
-    """One round of a repair: the attack on the present parameters.
+    """One round of a repair, starting with the attack on its parameters.
 
     **Fields:**
-    - `attacked`: environments simulated; `counterexamples` among them; `worst` robustness.
-    - `change`: of the parameters from the nominal ones, Euclidean in unit coordinates (or in the
-      arrays' own).
+    - `attacked`: number of simulated environments; their `counterexamples`; `worst` robustness.
+    - `change`: distance of the parameters from the nominal ones, Euclidean in unit coordinates (or
+      in the arrays' own).
     """
 
     attacked: int
@@ -171,7 +171,7 @@ class RepairEstimates(NamedTuple):
 
     **Fields:**
     - `name`: the name of the problem.
-    - `before`, `after`: an `Estimate` each.
+    - `before`, `after`: an `Estimate` of each.
     """
 
     name: str
@@ -180,7 +180,7 @@ class RepairEstimates(NamedTuple):
 
     @property
     def lowered(self) -> bool:
-        """True where the whole interval after the repair is below the one before."""
+        """True if the whole interval after the repair is below the one before."""
         known = self.before.probability is not None
         return bool(known and self.after.high < self.before.low)
 
@@ -206,20 +206,19 @@ class RepairEstimates(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Repair(Drawn, InNotebook):
-    """Result of `repair`: parameters changed as little as removes the failures.
+    """The result of `repair`: parameters changed as little as possible to remove the failures.
 
     **Fields:** `before` and `parameters`: the nominal and the repaired ones, features by name or a
-    pytree; `rounds`: a `Round` each; `held_out_before`, `held_out_after`: how both did in the same
-    number of fresh samples, None without a check; `robustness`: the least with the repaired
-    parameters; `environments`: how many are in the set of counterexamples; `margin` that was
-    wanted; `change`: distance of the parameters, as in `Round`; `found`: whether the last attack
-    found nothing; `simulations` (without those of the check), `without_verdict`, `seconds`;
-    `stopped`: `"repaired"`, `"no parameters"` (none found for the set), `"budget"`,
-    `"max_seconds"`, `"rounds"`, `"fewest failures"`, `"no verdict"` or `"interrupted"`;
-    `arrays`: whether the parameters are a pytree; `notes`; `seed`; `counted`: with
-    `aim="probability"`, failures and samples by which the parameters were chosen; `sources`: what
-    the model was made of, as a run records it; `changed`: says that the model of the run from which
-    it began has changed since.
+    pytree; `rounds`: a `Round` for each; `held_out_before`, `held_out_after`: the results of both
+    in the same number of fresh samples, None without a check; `robustness`: the least robustness
+    with the repaired parameters; `environments`: size of the set of counterexamples; `margin`: the
+    required robustness; `change`: distance of the parameters, as in `Round`; `found`: whether the
+    last attack found nothing; `simulations` (without those of the check), `without_verdict`,
+    `seconds`; `stopped`: `"repaired"`, `"no parameters"` (none found for the set), `"budget"`,
+    `"max_seconds"`, `"rounds"`, `"fewest failures"`, `"no verdict"` or `"interrupted"`; `arrays`:
+    whether the parameters are a pytree; `notes`; `seed`; `counted`: with `aim="probability"`, the
+    failures and samples by which the parameters were chosen; `sources`: the files of the model, as
+    a run records them; `changed`: a sentence if the model has changed since the given run was made.
     """
 
     _picture = "repair", "plot_repair"
@@ -250,12 +249,12 @@ class Repair(Drawn, InNotebook):
 
     @property
     def repaired(self) -> bool:
-        """True where neither the last attack nor the check, which was made, found a failure."""
+        """True if there was a check, and neither it nor the last attack found a failure."""
         return self.found and self.held_out_after is not None and self.held_out_after.passed
 
     @cached_property
     def problem(self) -> Problem:
-        """The problem with the repaired parameters: ready to `falsify`."""
+        """The problem with the repaired parameters, for example for `falsify`."""
         assert self.make is not None
         return self.make()
 
@@ -268,15 +267,15 @@ class Repair(Drawn, InNotebook):
     def estimate(
         self, method: str | None = None, budget: int = 50_000, **options: Any
     ) -> RepairEstimates:
-        """Estimate the failure probabilities before and after, where failures are rare.
+        """Estimate the failure probabilities before and after, even if failures are rare.
 
-        The check counts failures in samples of the prior, among which rare ones are none. This
-        looks for them, as `vj.estimate` does.
+        The check counts failures in samples of the prior, which hardly ever contain rare ones. This
+        method searches for them, as `vj.estimate` does.
 
         **Arguments:**
-        - `method`, `options`: of `vj.estimate`.
-        - `budget`: simulations at most for each of the two.
-        **Raises:** as `vj.estimate`.
+        - `method`, `options`: as in `vj.estimate`.
+        - `budget`: maximum number of simulations for each of the two.
+        **Raises:** the errors of `vj.estimate`.
         """
         estimate = lazy_import("verifai_jax.estimation", "estimate")
         problems = (self.nominal_problem, self.problem)
@@ -314,7 +313,8 @@ class Repair(Drawn, InNotebook):
             lines.append("  not checked in held-out environments")
         if self.found and self.held_out_after is not None and not self.held_out_after.passed:
             lines.append(
-                "  the check found what the attacks did not: try a larger budget, margin or mass"
+                "  the check found failures that the attacks missed: try a larger budget, "
+                "margin or mass"
             )
         checks = (self.held_out_before, self.held_out_after)
         if all(check is not None and check.simulations and not check.failures for check in checks):

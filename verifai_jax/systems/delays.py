@@ -120,8 +120,8 @@ def as_delay(option: DelayOption, name: str) -> Delay:
         or not isinstance(delay.feature, str | None)
     ):
         raise ValueError(
-            f"{name} must be a number of steps, or one feature with the greatest number of steps "
-            f"that it may say, {{'latency': 5}}; got {option!r}"
+            f"{name} must be a number of steps, or a feature with its maximum number of steps, "
+            f"{{'latency': 5}}; got {option!r}"
         )
     return delay
 

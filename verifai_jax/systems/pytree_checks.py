@@ -14,8 +14,8 @@ from jaxtyping import Array, PyTree
 def as_floating(tree: PyTree, origin: str) -> Any:
     """Return the same pytree with all leaves as arrays of one floating-point dtype.
 
-    **Raises:** `ValueError`, naming `origin`, for a tree without leaves or a leaf that is not a
-    real number.
+    **Raises:** `ValueError`, naming `origin`, for a tree without leaves, or with one that is not
+    real.
     """
     leaves = jax.tree.leaves(tree)
     if not leaves:
@@ -74,7 +74,7 @@ def check_like(
     **Arguments:**
     - `same_precision`: whether real numbers must have the same number of bits; if not, the caller
       converts them (`as_precise_as`).
-    **Raises:** `ValueError` that says what `origin` must return as `role`, and the first
+    **Raises:** `ValueError` with the form that `origin` must return as `role`, and the first
     difference.
     """
     must = f"{origin} must return {role}"
@@ -144,7 +144,7 @@ def check_signals(signals: object) -> None:
         if not hasattr(value, "shape") or len(value.shape) > 1:
             raise ValueError(
                 f"signal {name!r} must be a scalar or a vector at each sample; got "
-                f"{outline(value)}; the option signals= says what the trace has"
+                f"{outline(value)}; choose the signals of the trace with signals="
             )
 
 

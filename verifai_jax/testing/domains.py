@@ -16,7 +16,7 @@ def check_domain(domain: Domain, *, samples: int = 64, seed: int = 0) -> None:
     """Check the laws of a domain on random points and on the corners of its cube.
 
     **Arguments:**
-    - `domain`: to check.
+    - `domain`: the domain to check.
     - `samples`: number of random points.
     - `seed`: the seed of the points.
     **Raises:** `AssertionError` naming the broken law.

@@ -21,9 +21,9 @@ def check_search(
     """Check the contract of a search on one cube, on a quadratic robustness with failures.
 
     **Arguments:**
-    - `search`: to check.
-    - `cube`: that it searches.
-    - `batch`: points in a round.
+    - `search`: the search to check.
+    - `cube`: the cube that it searches.
+    - `batch`: number of points in a round.
     - `rounds`: number of rounds.
     - `seed`: the seed of its random key.
     **Raises:** `AssertionError` naming the broken law.
@@ -99,8 +99,8 @@ def check_batch_independence(search: Search, cube: Cube, *, points: int = 48) ->
     """Check that a passive search gives the same points whatever the batch size is.
 
     **Arguments:**
-    - `search`: to check.
-    - `cube`: that it searches.
+    - `search`: the search to check.
+    - `cube`: the cube that it searches.
     - `points`: number of points to compare.
     **Raises:** `AssertionError` if it does not.
     """

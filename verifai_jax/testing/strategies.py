@@ -10,12 +10,11 @@ from verifai_jax.features import FeatureSpace
 
 
 def strategy(space: FeatureSpace, nominal: Mapping[str, Any] | None = None) -> Any:
-    """Return a strategy of Hypothesis for the features of a space, as a system sees them.
+    """Return a Hypothesis strategy for the features of a space, in the form for a system.
 
-    Each unit coordinate is a number from 0 to 1 that Hypothesis draws, and the features are at that
-    point, by the inverse of the cumulative distribution. Examples shrink towards `nominal`, and to
-    few items of arrays of variable length, such as events; a constraint of the space holds in all
-    of them.
+    Hypothesis draws each unit coordinate as a number from 0 to 1, from which the features follow by
+    inverse cumulative distributions. Examples shrink towards `nominal`, and to few items of arrays
+    of variable length, such as events; all satisfy the constraint of the space.
 
         space = FeatureSpace({"x": Box(-1, 1), "n": DiscreteBox(0, 5)})
 
@@ -25,11 +24,10 @@ def strategy(space: FeatureSpace, nominal: Mapping[str, Any] | None = None) -> A
 
     **Arguments:**
     - `space`: a feature space.
-    - `nominal`: ordinary features, towards which examples shrink; the middles of the domains, and
-      the least lengths, when left out.
+    - `nominal`: nominal features, towards which examples shrink; by default the middles of the
+      domains, and the minimum lengths.
     **Returns:** a `hypothesis.strategies.SearchStrategy` of dictionaries of features.
-    **Raises:** `ImportError` without Hypothesis; `ValueError` for nominal features outside the
-    space.
+    **Raises:** `ImportError` without Hypothesis; `ValueError` for nominal features outside it.
     """
     try:
         from hypothesis import strategies

@@ -16,14 +16,14 @@ from verifai_jax.systems.blackbox._blackbox import plain_leaves
 def check_system(
     system: Any, space: FeatureSpace, *, samples: int = 4, seed: int = 0, tolerance: float = 1e-5
 ) -> None:
-    """Check the contract of a system on random features: pure, one clock, all its ways agree.
+    """Check the contract of a system on random features: pure, one clock, all methods agree.
 
     **Arguments:**
-    - `system`: to check, as `Problem` takes it.
-    - `space`: the space of the features that it takes.
+    - `system`: the system to check, in any form that `Problem` accepts.
+    - `space`: the feature space of the system.
     - `samples`: number of random features.
     - `seed`: the seed of features and keys.
-    - `tolerance`: difference of signals between the ways to simulate, relative to their largest
+    - `tolerance`: maximum difference of signals between simulations, relative to their largest
       value.
     **Raises:** `AssertionError` naming the broken law.
     """

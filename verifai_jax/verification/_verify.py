@@ -42,29 +42,30 @@ def verify(
 
     Each box is simulated with sets of numbers. It is *proved* if the robustness is at least zero
     for all of them, in real arithmetic and with the rounding of the simulation; *broken* if it
-    contains a point whose robustness is negative for certain. Boxes that are neither are split
-    where the robustness changes most, the largest first. What is verified is the system in discrete
-    time as it is simulated, with its steps; or, if `continuous`, the differential equation itself.
+    contains a point whose robustness is certainly negative. Other boxes are split where the
+    robustness changes most, the largest first. The subject of the proof is the discrete-time system
+    as it is simulated, with its steps; or, if `continuous`, the differential equation itself.
 
     **Arguments:**
-    - `problem`: whose system JAX traces, without randomness of its own.
-    - `budget`: seconds, about; 60 if `boxes` is left out too. One may stop at any time with Ctrl-C.
-    - `boxes`: number of boxes to look at, at most.
-    - `samples`: simulations from the prior of what stays undecided, which bound how often it fails.
+    - `problem`: a problem whose system JAX traces, without random numbers of its own.
+    - `budget`: approximate seconds; 60 if `boxes` is left out too. Ctrl-C stops it at any time.
+    - `boxes`: maximum number of boxes to examine.
+    - `samples`: simulations from the prior of the undecided part, to bound how often it fails.
     - `confidence`: the confidence of that bound, which holds whenever one stops.
     - `seed`: the seed of the samples.
     - `precision`: the precision of the simulations that are verified, `"float32"` or `"float64"`.
-    - `continuous`: verify the differential equation of a system that `vj.ode` made, in real
+    - `continuous`: verify the differential equation of a system made by `vj.ode`, in real
       arithmetic and at all times, with the controller's output held between its samples. Its
-      dynamics must be smooth, without switches or an end, its formulas without until, since and
-      next. Nothing is sampled; searches and estimates simulate steps, and do not take the result.
-    - `resume`: an earlier result of the same problem, or its file, to go on with.
+      dynamics must be smooth, without switches or an early end, its formulas without until, since
+      and next. Nothing is sampled, and searches and estimates, which simulate steps, cannot use the
+      result.
+    - `resume`: an earlier result for the same problem, or its file, to continue.
     - `progress`: as in `falsify`.
     **Returns:** the result: the three volumes, the three probabilities, the boxes.
-    **Raises:** `ProblemError` for a black box, for a system that draws random numbers, and for what
-    `continuous` cannot be about;
-    `MissingRule` for an operation that sets cannot go through, with its name and line; `ValueError`
-    for options out of range, and for the result of another problem.
+    **Raises:** `ProblemError` for a black box, for a system that draws random numbers, and for
+    systems and formulas that `continuous` does not support; `MissingRule` for an operation without
+    a rule for sets, with its name and line; `ValueError` for options out of range, and for the
+    result of another problem.
     """
     started = time.perf_counter()
     if not isinstance(problem, Problem):

@@ -24,15 +24,15 @@ CHOICES = 4096
 
 @dataclass
 class Boxes:
-    """A partition of the unit cube, one row a box.
+    """A partition of the unit cube, with one row for each box.
 
-    - `low`, `high`: `[n, dim]`, corners.
+    - `low`, `high`: `[n, dim]`, the corners.
     - `state`: `[n]`, `OPEN`, `PROVED`, `BROKEN` or `OUTSIDE`.
-    - `lowest`, `highest`: `[n]`, bounds of the robustness; infinite where nothing is known, and
-      `highest` until sets were evaluated for the box itself.
-    - `witness`: `[n, dim]`, a point that fails as simulated; NaN without one.
-    - `confirmed`: `[n]`, whether the witness fails for certain.
-    - `failures`, `samples`: `[n]`, of independent samples of the box.
+    - `lowest`, `highest`: `[n]`, bounds of the robustness; infinite if unknown, and `highest` until
+      the box itself was evaluated with sets.
+    - `witness`: `[n, dim]`, a point that fails when simulated; NaN without one.
+    - `confirmed`: `[n]`, whether the witness certainly fails.
+    - `failures`, `samples`: `[n]`, counts of independent samples of the box.
     """
 
     low: Float[np.ndarray, "n dim"]
@@ -68,8 +68,8 @@ class Boxes:
         count = math.prod(map(len, sides))
         if count > CHOICES:
             raise ValueError(
-                f"the choices of this feature space have {count:,} combinations, and verify looks "
-                f"at {CHOICES:,} one by one at most; hold some with problem.only(...)"
+                f"the choices of this feature space have {count:,} combinations, and verify "
+                f"examines at most {CHOICES:,}; fix some with problem.only(...)"
             )
         ends = np.array(list(itertools.product(*sides))).reshape(count, space.dim, 2)
         return cls.between(ends[..., 0].copy(), ends[..., 1].copy())
@@ -81,17 +81,17 @@ class Boxes:
         return Boxes(*(getattr(self, field.name)[rows] for field in fields(self)))
 
     def copy(self) -> "Boxes":
-        """Return boxes that change without these."""
+        """Return a copy of the boxes that can be changed independently."""
         return self[np.arange(len(self))]
 
     def within(self, low: Float[np.ndarray, " dim"], high: Float[np.ndarray, " dim"]) -> "Boxes":
-        """Return open boxes, the parts of these between two corners."""
+        """Return the intersections of the boxes with the box between two corners, as open boxes."""
         lower, upper = np.maximum(self.low, low), np.minimum(self.high, high)
         some = (lower < upper).all(axis=1)
         return Boxes.between(lower[some], upper[some])
 
     def with_more(self, others: "Boxes") -> "Boxes":
-        """Return these boxes, and others after them."""
+        """Return these boxes followed by others."""
         return Boxes(
             *(np.concatenate([getattr(self, f.name), getattr(others, f.name)])
               for f in fields(self))
@@ -104,7 +104,7 @@ class Boxes:
 
     @property
     def has_witness(self) -> Bool[np.ndarray, " n"]:
-        """True if a point of the box fails as simulated."""
+        """True if a point of the box fails when simulated."""
         return np.asarray(~np.isnan(self.witness).any(axis=1))
 
     def splittable(self, enclosure: Enclosure) -> Bool[np.ndarray, "n dim"]:
@@ -120,9 +120,9 @@ class Boxes:
         return wide
 
     def halves(self, coordinate: Int[np.ndarray, " n"], enclosure: Enclosure) -> "Boxes":
-        """Return both halves of each box along a coordinate, open, with the witness in its half.
+        """Return the halves of each box along a coordinate, open; its witness stays in its half.
 
-        What bounds the robustness from below does so for both.
+        Lower bounds of the robustness are inherited by both halves.
         """
         rows = np.arange(len(self))
         low, high = self.low[rows, coordinate], self.high[rows, coordinate]

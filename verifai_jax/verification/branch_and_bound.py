@@ -30,9 +30,9 @@ CANDIDATES = 4096
 
 
 class BranchAndBound:
-    """The boxes, and what looks at them.
+    """A branch-and-bound process: the boxes, and the programs that examine them.
 
-    `wanted` says which boxes are worth a look; all are, unless somebody sets it.
+    `wanted` selects the boxes worth examining; by default all.
     """
 
     def __init__(self, problem: Problem, enclosure: Enclosure, boxes: Boxes, seed: int) -> None:
@@ -42,7 +42,7 @@ class BranchAndBound:
         self.evaluator = Evaluator(problem, 4096, precision=enclosure.precision, seed=seed)
 
     def go_on(self, end: float | None, limit: int | None) -> str:
-        """Look at boxes, the most probable first; return why it stopped."""
+        """Examine boxes, the most probable first; return the reason for stopping."""
         top, count, rate = TOGETHER * available_cores(), 32, 1e6
         try:
             while True:
@@ -117,10 +117,10 @@ class BranchAndBound:
             self.boxes = self.boxes.with_more(parts)
 
     def star(self, some: Boxes) -> tuple[Float[np.ndarray, "n k"], Float[np.ndarray, "n k"]]:
-        """Simulate the middle of boxes, and both sides of it along each coordinate.
+        """Simulate the middle of boxes, and points on both sides of it along each coordinate.
 
-        **Returns:** the robustness, NaN without a verdict, and which of them fail. A point that
-        fails becomes the witness of its box.
+        **Returns:** the robustness, NaN without a verdict, and which points fail. A failing point
+        becomes the witness of its box.
         """
         dim = some.low.shape[1]
         offsets = np.concatenate([np.zeros((1, dim)), *(
@@ -144,11 +144,11 @@ class BranchAndBound:
     def influence(
         self, some: Boxes, robustness: np.ndarray, moves: np.ndarray, can: np.ndarray
     ) -> tuple[Int[np.ndarray, "n dim"], Bool[np.ndarray, "n dim"]]:
-        """Return the coordinates of each box, the best to split first, and which are half as good.
+        """Return the best coordinate of each box to split, and those at least half as good.
 
-        It is the one that changes the robustness most. As far as bounds are wider than what
-        simulations see, it is the widest one that changes it at all, or one that moves the signals,
-        and with them what is not linear, if it is at least half as wide.
+        The best one changes the robustness most. If bounds are wider than the differences between
+        simulations, it is the widest coordinate that changes the robustness at all, or, if at least
+        half as wide, one that moves the signals and thereby the nonlinear terms.
         """
         # What counts most is that a point has a verdict, or is accepted, and its neighbour is not.
         values = np.where(np.isnan(robustness), 1e30, np.clip(robustness, -1e29, 1e29))
@@ -167,7 +167,7 @@ class BranchAndBound:
         return order, (score >= score[:, :1] / 2) & (score >= 0)
 
     def confirm(self) -> None:
-        """Find out which failing points of open boxes fail for certain."""
+        """Find out which failing points of open boxes certainly fail."""
         open_ones = (self.boxes.state == OPEN) & self.boxes.has_witness & ~self.boxes.confirmed
         rows = np.flatnonzero(open_ones)
         rows = rows[np.argsort(-self.boxes.mass[rows], kind="stable")[:CANDIDATES]]
@@ -176,7 +176,7 @@ class BranchAndBound:
             self.boxes.confirmed[rows] = (bounds.high < 0) & bounds.inside
 
     def sample(self, count: int) -> None:
-        """Simulate points of what is open, drawn from the prior."""
+        """Simulate points of the undecided part, drawn from the prior."""
         self.boxes.failures[:] = self.boxes.samples[:] = 0
         rows = np.flatnonzero((self.boxes.state == OPEN) & ~self.boxes.confirmed)
         mass = self.boxes.mass[rows]

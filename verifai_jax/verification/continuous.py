@@ -22,10 +22,10 @@ from verifai_jax.verification.sets import flow
 
 
 def between_samples(problem: Problem) -> Problem:
-    """Return the problem about the differential equation; its system is one for sets alone.
+    """Return the problem with the differential equation, whose system only sets can evaluate.
 
-    **Raises:** `ProblemError` for a system that `vj.ode` did not make, or that ends or jumps at
-    instants of its own, and for a formula about single samples.
+    **Raises:** `ProblemError` for a system that was not made by `vj.ode`, or that ends or jumps at
+    its own instants, and for a formula about single samples.
     """
     loop = problem.system
     if not isinstance(loop, Ode):
@@ -39,13 +39,13 @@ def between_samples(problem: Problem) -> Problem:
     ):  # fmt: skip
         if given:
             raise ProblemError(
-                f"continuous=True needs a plant that moves continuously for the whole duration; "
-                f"the system of problem {problem.name!r} has {name}=. Leave one of both out"
+                "continuous=True needs a plant that moves continuously for the whole duration; "
+                f"the system of problem {problem.name!r} has {name}=. Leave one of the two out"
             )
     for part in about_single_samples(*problem.formulas.values()):
         raise ProblemError(
-            f"continuous=True knows formulas of comparisons, not, and, or, always, eventually, "
-            f"historically and once; {part} is about single samples"
+            "continuous=True supports formulas with comparisons, not, and, or, always, "
+            f"eventually, historically and once; {part} is about single samples"
         )
 
     def during(time: Any, state: PyTree, control: Any, features: Any) -> Any:

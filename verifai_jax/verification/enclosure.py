@@ -38,10 +38,10 @@ Corners = Float[np.ndarray, "n dim"]
 class Bounds(NamedTuple):
     """Bounds over boxes.
 
-    - `low`, `high`: of the least robustness over the formulas; infinite where nothing is known.
+    - `low`, `high`: bounds of the least robustness over the formulas; infinite if unknown.
     - `holds`: whether no point of the box breaks a formula.
     - `inside`, `outside`: whether the constraint accepts all points, or none.
-    - `moves`: how far each coordinate moves the signals of the formulas, added up.
+    - `moves`: the total change of the formulas' signals along each coordinate.
     """
 
     low: Float[np.ndarray, " n"]
@@ -53,10 +53,10 @@ class Bounds(NamedTuple):
 
 
 class Enclosure:
-    """The program of one simulation of a problem, for sets of features.
+    """The program of one simulation of a problem, evaluated with sets of features.
 
     **Arguments:**
-    - `problem`: a checked one.
+    - `problem`: a checked problem.
     - `precision`: the precision of simulations, `"float32"` or `"float64"`.
     """
 
@@ -159,22 +159,22 @@ class Enclosure:
 
 
 def enclosable(problem: Problem, precision: str) -> Problem:
-    """Return a problem on the backend on which sets go through it.
+    """Return a problem on the backend that can be evaluated with sets.
 
-    **Raises:** `ProblemError` for a black box, and for a system that draws random numbers; what
-    `Problem.check` raises.
+    **Raises:** `ProblemError` for a black box, and for a system that draws random numbers; the
+    errors of `Problem.check`.
     """
     problem = resolved(problem, batch=512, budget=512, precision=precision).problem
     problem.check()
     if problem.black_box:
         raise ProblemError(
-            f"problem {problem.name!r} has a system that JAX does not trace, and verify evaluates "
-            "the traced program with sets; vj.estimate bounds how probable its failures are"
+            f"problem {problem.name!r} has a system that JAX does not trace, but verify evaluates "
+            "the traced program with sets; vj.estimate bounds the probability of its failures"
         )
     if problem.draws():
         raise ProblemError(
-            f"the system of problem {problem.name!r} draws random numbers, and verify needs one "
-            "that depends on its features alone; make what it draws a feature"
+            f"the system of problem {problem.name!r} draws random numbers, but verify needs a "
+            "system that depends only on its features; make these numbers features"
         )
     return problem
 

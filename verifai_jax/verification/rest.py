@@ -27,13 +27,13 @@ where there is no cut any more."""
 
 
 class Rest:
-    """The part of the unit cube that is neither decided nor refused by the constraint.
+    """The part of the unit cube that is not decided, and that the constraint accepts.
 
     **Arguments:**
     - `boxes`: the partition of the cube.
-    - `states`: those that count as decided.
+    - `states`: the states that count as decided.
 
-    `mass` is its probability; `decided` that of the boxes that are decided, and `failing` of those
+    `mass` is its probability; `decided` that of the decided boxes, and `failing` that of those
     among them in which every point fails.
     """
 
@@ -51,7 +51,7 @@ class Rest:
         self._nodes = [np.array(column) for column in zip(*nodes, strict=True)]
 
     def draw(self, random: np.random.Generator, count: int) -> Float[np.ndarray, "count dim"]:
-        """Draw points from the prior, given that they lie in the rest."""
+        """Draw points from the prior, given that they lie in this part."""
         low, high, mass = self._boxes.low, self._boxes.high, self._boxes.mass
         rows = random.choice(len(mass), count, p=mass / mass.sum())
         return low[rows] + random.random((count, low.shape[1])) * (high - low)[rows]
@@ -59,12 +59,12 @@ class Rest:
     def is_decided(
         self, points: Float[Any, "*n dim"], margin: float = 0.0, xp: Any = np
     ) -> Bool[Any, "*n"]:
-        """Return whether points lie in boxes that are decided, and not near faces within the cube.
+        """Return whether points lie in decided boxes, and not near their faces inside the cube.
 
         **Arguments:**
-        - `points`: of the unit cube.
-        - `margin`: distance from the faces.
-        - `xp`: NumPy, or JAX's, which may trace the points.
+        - `points`: points of the unit cube.
+        - `margin`: required distance from the faces.
+        - `xp`: NumPy, or `jax.numpy`, which may trace the points.
         """
         axis, cut, after, low, high = map(xp.asarray, self._nodes)
         node = xp.zeros(points.shape[:-1], int)
@@ -111,7 +111,7 @@ def _even_cut(low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, int, float
 
 
 class Undecided:
-    """The constraint of a space, and that a point lies in no box that is decided."""
+    """The constraint of a space combined with the condition that a point lies in no decided box."""
 
     def __init__(self, space: FeatureSpace, rest: Rest) -> None:
         self.space, self.rest = space, rest
@@ -122,9 +122,9 @@ class Undecided:
 
 
 class RestSpace(FeatureSpace):
-    """A feature space whose constraint refuses the boxes that are decided, too.
+    """A feature space whose constraint also refuses decided boxes.
 
-    Points are asked for themselves: features may have lost coordinates, as those of absent items.
+    The constraint uses points, since features may lack coordinates, as of absent items.
     """
 
     def __init__(self, space: FeatureSpace, rest: Rest) -> None:

@@ -39,7 +39,7 @@ CONTINUOUS = (
 
 
 class Part(NamedTuple):
-    """A part of a feature space: its share of the prior, and of the volume of the features."""
+    """A part of a feature space: its share of the prior, and of the volume."""
 
     mass: float
     volume: float
@@ -51,13 +51,13 @@ class Verification(Drawn, Reported, InNotebook):
 
     - `name`: the name of the problem; `columns`: its unit coordinates.
     - `boxes`: the partition of the unit cube; `shares`, `upper_shares`: the corners of the boxes as
-      shares of the range of the features.
-    - `features`, `formulas`, `model`, `precision`: what was verified, the system by a
-      hash.
-    - `confidence`: the confidence of bounds by samples.
+      shares of the features' ranges.
+    - `features`, `formulas`, `model`, `precision`: the subject of the verification; the system is
+      given by a hash.
+    - `confidence`: the confidence of bounds from samples.
     - `continuous`: whether it is about the differential equation.
-    - `looked_at`: boxes that were looked at; `simulations`; `seconds`; `stopped`: why it ended.
-    - `notes` for people; `version`; `sources`: what the model was made of, as a run records it.
+    - `looked_at`: number of examined boxes; `simulations`; `seconds`; `stopped`: why it ended.
+    - `notes`: notes for the user; `version`; `sources`: the model's files, as a run records them.
     """
 
     _picture = "verification", "plot_verification"
@@ -83,7 +83,7 @@ class Verification(Drawn, Reported, InNotebook):
 
     @cached_property
     def verdicts(self) -> np.ndarray:
-        """`"proved"`, `"broken"`, `"undecided"` or `"outside"` (of the constraint), box by box."""
+        """For each box `"proved"`, `"broken"`, `"undecided"` or `"outside"` (the constraint)."""
         words = np.array(["undecided", "proved", "broken", "outside"])[self.boxes.state]
         return np.where(self.boxes.confirmed, "broken", words)
 
@@ -107,7 +107,7 @@ class Verification(Drawn, Reported, InNotebook):
 
     @property
     def broken(self) -> Part:
-        """The boxes that contain a point which fails for certain."""
+        """The boxes that contain a certainly failing point."""
         return self._part(self.verdicts == "broken")
 
     @property
@@ -117,12 +117,12 @@ class Verification(Drawn, Reported, InNotebook):
 
     @property
     def undecided(self) -> Part:
-        """The rest."""
+        """The part that is neither proved nor broken."""
         return self._part(self.verdicts == "undecided")
 
     @property
     def failure_bound(self) -> float:
-        """An upper bound of the failure probability within the undecided part, by samples."""
+        """An upper bound of the failure probability within the undecided part, from samples."""
         rows = self.verdicts == "undecided"
         count = int(self.boxes.samples[rows].sum())
         if not rows.any():
@@ -134,17 +134,18 @@ class Verification(Drawn, Reported, InNotebook):
 
     @property
     def probability(self) -> tuple[float, float]:
-        """Bounds of the failure probability: certain below; above certain for what is decided."""
+        """Bounds of the failure probability; the upper one uses samples for the undecided part."""
         high = self.broken.mass + self.undecided.mass * self.failure_bound
         return self.throughout.mass, min(1.0, high)
 
     @cached_property
     def table(self) -> pd.DataFrame:
-        """A row for each box, the largest first.
+        """One row for each box, the largest first.
 
-        `verdict`, `throughout` (every point fails), `mass`, `volume`, bounds of the robustness,
-        `failure_bound` (of its failure probability by its own samples, at the confidence for each
-        box by itself), and the ends of each coordinate, as shares of the range of its feature.
+        Columns are `verdict`, `throughout` (every point fails), `mass`, `volume`, bounds of the
+        robustness, `failure_bound` (an upper bound of its failure probability from its own samples,
+        at the confidence for each single box), and the ends of each coordinate, as shares of its
+        feature's range.
         """
         boxes = self.boxes
         bound = np.where(boxes.state == PROVED, 0.0, 1.0)
@@ -178,12 +179,15 @@ class Verification(Drawn, Reported, InNotebook):
             "undecided",
             line("proved", proved, "no point of it fails"),
             line(
-                "broken", broken, "boxes with a point that fails for certain; in "
+                "broken",
+                broken,
+                "boxes with a point that fails for certain; in "
                 f"{format_percent(self.throughout.mass)} of the prior every point does",
             ),
             line(
-                "undecided", undecided, f"at most {format_percent(self.failure_bound)} of it "
-                f"fails, at {sure} by {count}",
+                "undecided",
+                undecided,
+                f"at most {format_percent(self.failure_bound)} of it fails, at {sure} by {count}",
             ),
             f"  failing      {format_percent(low)} of the prior at least, "
             f"{format_percent(high)} at most{f' at {sure}' if undecided.mass > 0 else ''}",
@@ -199,9 +203,9 @@ class Verification(Drawn, Reported, InNotebook):
         return [picture_html(self.plot()), frame_html(self.table)]
 
     def check_same(self, problem: Problem, precision: str, continuous: bool = False) -> None:
-        """Refuse another problem than the one that was verified.
+        """Refuse a problem other than the one that was verified.
 
-        **Raises:** `ValueError` that says what differs.
+        **Raises:** `ValueError` that names the difference.
         """
         if continuous != self.continuous:
             raise ValueError(
@@ -216,29 +220,29 @@ class Verification(Drawn, Reported, InNotebook):
                 )
 
     def left(self, problem: Problem, precision: str) -> Rest:
-        """Return what is left of the feature space where neither all points fail nor none does.
+        """Return the part of the feature space where neither all points fail nor none does.
 
-        **Raises:** as `check_same`.
+        **Raises:** the errors of `check_same`.
         """
         self.check_same(problem, precision)
         return Rest(self.boxes, (PROVED, BROKEN))
 
     @property
     def note(self) -> str:
-        """A sentence on simulations of the rest."""
+        """A sentence on simulations of the remaining part."""
         share = format_percent(self.proved.mass)
         return f"{share} of the prior is proved and not simulated; all rates are of the rest"
 
     def loosest(self, problem: Problem, budget: int) -> pd.DataFrame | None:
-        """Return rows of what is not proved for a search to begin with, where bounds are loosest.
+        """Return rows from the unproved part with the loosest bounds, for a search to start with.
 
-        They are points that fail as simulated, and then middles of boxes: those first of which the
-        robustness has the lowest bound.
+        First come points that fail when simulated, then middles of boxes by increasing lower bound
+        of the robustness.
 
         **Arguments:**
-        - `problem`: that of `rest`.
-        - `budget`: simulations of the search, of which these take an eighth at most.
-        **Returns:** the rows; None if nothing is left.
+        - `problem`: the problem returned by `rest`.
+        - `budget`: number of simulations of the search; these rows take at most an eighth of it.
+        **Returns:** the rows; None if everything is proved.
         """
         boxes = self.boxes[~np.isin(self.boxes.state, (PROVED, OUTSIDE))]
         boxes = boxes[np.lexsort((-boxes.mass, boxes.lowest, ~boxes.has_witness))]
@@ -249,14 +253,14 @@ class Verification(Drawn, Reported, InNotebook):
         return rows if len(rows) else None
 
     def rest(self, problem: Problem, precision: str = "float32") -> Problem:
-        """Return the problem without what is proved, for searches that spend nothing there.
+        """Return the problem without its proved part, so that searches spend nothing there.
 
-        Its constraint refuses the boxes that are proved, so that rates are those of the rest.
+        Its constraint refuses the proved boxes, so rates refer to the remaining part.
 
         **Arguments:**
         - `problem`: the problem that was verified.
-        - `precision`: the precision of the simulations of the rest, in which it was verified.
-        **Raises:** `ValueError` for another problem or precision, and where nothing is left.
+        - `precision`: the precision of later simulations, which must be the verified one.
+        **Raises:** `ValueError` for another problem or precision, and if nothing is left.
         """
         self.check_same(problem, precision)
         left = Rest(self.boxes, (PROVED,))
@@ -265,12 +269,12 @@ class Verification(Drawn, Reported, InNotebook):
         return replace(problem, space=RestSpace(problem.space, left))
 
     def save(self, path: str | Path) -> Path:
-        """Write the result as JSON; `load_verification` reads it.
+        """Write the result as JSON, for `load_verification`.
 
         **Arguments:**
-        - `path`: the path of the file, whose folder is made.
+        - `path`: the path of the file; its folder is made if needed.
         **Returns:** the path.
-        **Raises:** `OSError` that names the file, for whatever the file system refuses.
+        **Raises:** `OSError` that names the file, if the file system refuses.
         """
         plain = {name: value for name, value in vars(self).items()
                  if name in self.__dataclass_fields__}  # fmt: skip
@@ -282,15 +286,15 @@ class Verification(Drawn, Reported, InNotebook):
 
 
 def as_verification(result: "Verification | str | Path") -> Verification:
-    """Return a result, read from its file where that is given.
+    """Return a result; a path is read.
 
-    **Raises:** as `load_verification`.
+    **Raises:** the errors of `load_verification`.
     """
     return load_verification(result) if isinstance(result, str | Path) else result
 
 
 def described(problem: Problem) -> dict[str, Any]:
-    """Return what a result records of its problem."""
+    """Return the record of a problem in a result."""
     return {
         "name": problem.name,
         "features": {name: repr(domain) for name, domain in problem.space.domains.items()},
@@ -300,14 +304,13 @@ def described(problem: Problem) -> dict[str, Any]:
 
 
 def load_verification(path: str | Path) -> Verification:
-    """Read a result that `Verification.save` has written.
+    """Read a result written by `Verification.save`.
 
-    **Raises:** `FileNotFoundError`; `DamagedError` for a file that is not as it was written, or is
-    no such result.
+    **Raises:** `FileNotFoundError`; `DamagedError` for a changed file, or one that is not a result.
     """
     record = read_record(Path(path))
     if record.pop("kind", None) != KIND:
-        raise DamagedError(f"{path} is no result of verify")
+        raise DamagedError(f"{path} is not a result of verify")
     dim = len(record["columns"])
     types = {"state": int, "failures": int, "samples": int, "confirmed": bool}
     arrays = {

@@ -142,7 +142,7 @@ def test_a_system_with_chance_and_without_a_step():
     assert not found["precision"].measured
     assert not found["solver"].measured
     assert "Not measured, and not in it: step, precision, solver." in found.total
-    assert "of the verdicts turn" in found["randomness"].text
+    assert "of the verdicts change" in found["randomness"].text
     assert found.prior.radius == 0
     assert "is not shown under this prior" in str(found.prior)
 

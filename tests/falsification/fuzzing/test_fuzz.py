@@ -176,7 +176,7 @@ def test_without_a_formula_a_jax_system_is_checked_too():
         ({"problem": LEVEL, "ranges": {"x": (1, 0)}}, "needs low < high"),
         ({"problem": LEVEL, "ranges": {"x": 3}}, r"must be \(low, high\)"),
         ({"problem": LEVEL, "cells": {"x": (0, 1)}}, "must be .low, high, how many."),
-        ({"problem": LEVEL, "cells": {"x": (0, 1, 600)}}, "have 600 cells together"),
+        ({"problem": LEVEL, "cells": {"x": (0, 1, 600)}}, "give 600 combinations of cells"),
         ({"problem": LEVEL, "cell": {}}, "did you mean 'cells'"),
     ],
 )

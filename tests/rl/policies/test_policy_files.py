@@ -56,5 +56,5 @@ def test_a_recurrent_graph_remembers(name):
 
         _, got = jax.lax.scan(step, loaded.initial_memory, jnp.asarray(episode))
         np.testing.assert_allclose(got, wanted, rtol=1e-5, atol=2e-6)
-    with pytest.raises(TypeError, match="remembers: act\\(observation, memory\\)"):
+    with pytest.raises(TypeError, match="has a memory: act\\(observation, memory\\)"):
         loaded.act(observations[0, 0])

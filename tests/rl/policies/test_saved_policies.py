@@ -131,7 +131,7 @@ def test_what_cannot_be_saved_or_was_damaged(tmp_path):
         loaded.save(tmp_path / "p.pkl")
     with pytest.raises(PolicyError, match="computes sort, which cannot be saved"):
         policy(jnp.sort).save(tmp_path / "p.npz", np.zeros(3))
-    with pytest.raises(PolicyError, match="that draws cannot be saved"):
+    with pytest.raises(PolicyError, match="a random policy cannot be saved"):
         policy(lambda observation, key: observation).save(tmp_path / "p.npz", np.zeros(3))
     with pytest.raises(PolicyError, match="computes pure_callback"):
         policy(lambda x: np.float32([float(x[0])])).save(tmp_path / "p.npz", np.zeros(3))

@@ -264,7 +264,10 @@ def test_wrappers_that_reset_are_refused():
         ),
         ({"initial": {"x": "p[0]"}}, r"unknown part of Slide's initial state 'p\[0\]'; did you me"),
         ({"initial": {"x": "q[1]"}}, r"q of Slide has 1 entries; got the number 1"),
-        ({"backend": "mjx"}, r"backend and options are for an environment by its name; got Slide"),
+        (
+            {"backend": "mjx"},
+            r"backend and options need the name of an environment; got the object Slide",
+        ),
         ({"duration": 0.25}, r"either duration or steps"),
         ({"steps": None}, r"give steps or duration; got neither"),
         ({"policy": 3}, r"policy must be a function of \(observation\) or \(observation, key\)"),

@@ -289,7 +289,9 @@ def test_a_model_that_mjx_cannot_do_is_left_to_native():
     assert "CYLINDER" in system.why_not("mjx")
     assert system.black_box
     assert system({})["j"].shape == (6,)
-    with pytest.raises(ValueError, match="backend 'mjx' is not possible: MJX cannot do this model"):
+    with pytest.raises(
+        ValueError, match="backend 'mjx' is not possible: MJX does not support this model"
+    ):
         mjx(text, duration=0.1, control_period=0.02)
 
 

@@ -238,7 +238,10 @@ RAW = {"$array": "<f8", "shape": [2], "at": 0}
         ({"signals": {"x": [1], "y": [1, 2]}}, "signals must have one length; got x: 1, y: 2"),
         ({"signals": {"x": {**RAW, "$array": "O"}}}, r"have a \$array of <f8.*; got 'O'"),
         ({"signals": {"x": {**RAW, "shape": [-1]}}}, "the shape of signal 'x' must be a list of"),
-        ({"signals": {"x": {**RAW, "at": 1}}}, "signal 'x' needs 16 bytes from 1; 16 came"),
+        (
+            {"signals": {"x": {**RAW, "at": 1}}},
+            "signal 'x' needs 16 bytes from 1; 16 were received",
+        ),
         ({"signals": {"x": {**RAW, "shape": [10**30]}}}, "needs 8000000000000000000000000000000"),
         ({"signals": {"x": {**RAW, "shape": [10**4000] * 2}}}, "needs a huge number bytes from 0"),
         ({"dt": None}, "either a sampling period dt or sample times"),
@@ -982,7 +985,7 @@ HOSTILE = {
             + b",".join([b'{"id":1,"seed":1,"features":{}}'] * 40)
             + b"]}"
         ),
-        "hands out more than 32 points",
+        "sends more than 32 points",
     ),
     "later": (HELLO + struct.pack(">I", 1 << 30), "announces 1073741824 bytes"),
 }

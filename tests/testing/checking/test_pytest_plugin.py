@@ -218,7 +218,7 @@ def test_tests_of_one_problem_share_what_they_compile(tmp_path, monkeypatch):
 def test_what_is_refused():
     with unchecked(), pytest.raises(TypeError, match="needs a Problem or the name of one"):
         vj.test(3)
-    message = "500 simulations cannot show a failure probability of at most 0.1 %: if none"
+    message = "500 simulations cannot show a failure probability of at most 0.1 %: it needs"
     with pytest.raises(ValueError, match=message):
         Check(budget=500, max_failure_probability=0.001)
     with pytest.raises(ValueError, match="did you mean 'budget'"):

@@ -29,7 +29,7 @@ def test_finished_work_of_another_study_is_not_gone_on_with(tmp_path, monkeypatc
     assert "--even-if-changed" in str(error.value)
     again = sweep(study, **options, even_if_changed=True)
     assert len(again.record.sources) == 2
-    assert "OF SEVERAL MODELS" in again.summary()
+    assert "SEVERAL MODELS" in again.summary()
     again.save(tmp_path / "saved")
     assert load_sweep(tmp_path / "saved").record.sources == again.record.sources
     (policy, *_) = (tmp_path / "saved" / "policies").glob("*.npz")

@@ -360,7 +360,7 @@ def test_folders_that_hold_no_such_sweep(small, tmp_path):
     policy.unlink()
     assert load_sweep(folder).record.policies[0] is None
     (folder / "curves.npz").unlink()
-    with pytest.raises(SweepFileError, match="is not whole"):
+    with pytest.raises(SweepFileError, match="is incomplete"):
         load_sweep(folder)
 
 

@@ -27,7 +27,7 @@ def check_same_tables(one, other):
 
 
 def test_what_is_wrong_is_said_before_anything_trains():
-    with pytest.raises(StudyError, match=r"train trains by itself: give example="):
+    with pytest.raises(StudyError, match=r"train is a training function: give example="):
         vj.Trainer(train, steps=8)
     with pytest.raises(StudyError, match=r"must be train\(key, hyperparameters, steps=\.\.\."):
         vj.Trainer(lambda key, values: None, steps=8, example=lambda o: o)

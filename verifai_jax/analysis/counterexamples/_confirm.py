@@ -68,8 +68,8 @@ def confirm(
       If there are more counterexamples, the worst and those nearest to zero are replayed, until the
       rest is far from zero (see `evaluation.confirmer.Confirmer`).
     - `progress`: whether to show one line of progress; see `core.display.progress` for the default.
-    **Returns:** a `Confirmation` for a row, `Confirmations` for all; after Ctrl-C those that are
-    finished.
+    **Returns:** a `Confirmation` for a row, `Confirmations` for all; after Ctrl-C the finished
+    ones.
     **Raises:** `ValueError` for a run without its problem, a row that is not a counterexample, or
     an engine that does not fit; `IndexError` for a row that is not in the table.
     """

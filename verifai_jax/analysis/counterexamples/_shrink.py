@@ -89,9 +89,8 @@ def shrink(
     box. It is 0.2 % farther away than the nearest failing point, as a margin for rounding. Ctrl-C
     ends the search and returns the best result so far.
 
-    **Raises:** `ValueError` for a run without its problem or without a counterexample, a row that
-    is not a counterexample or does not fail when simulated again, and a feature without a nominal
-    value.
+    **Raises:** `ValueError` for a run without a problem or a counterexample, a row that is not a
+    counterexample or does not fail when simulated again, and a feature without a nominal value.
     """
     problem = selection.problem_of(run)
     if by not in ORDERS:
@@ -132,7 +131,7 @@ def shrink(
         search.search(points)
     except KeyboardInterrupt:
         stopped = "interrupted"
-        notes.append("interrupted: the least so far")
+        notes.append("interrupted: the smallest departure so far")
     verified = _verified(problem, search, key, number, run.precision)
     u = start[0] if verified is None else verified[0]
     replayed = original if verified is None else verified[1]
@@ -169,7 +168,9 @@ def _origin(problem: Problem, by: str, nominal: Mapping[str, Any] | None) -> Nom
     if by != "likelihood":
         return Nominal.of(problem, nominal)
     if nominal is not None:
-        raise ValueError("by='likelihood' departs from the likeliest features; leave out nominal=")
+        raise ValueError(
+            "by='likelihood' measures departures from the likeliest features; leave out nominal="
+        )
     return Likeliest.in_space(problem.space)
 
 

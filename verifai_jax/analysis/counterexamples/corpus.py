@@ -47,8 +47,7 @@ class SavedCounterexample:
     - `formulas`: their texts by name.
     - `features`: the columns of the feature space.
     - `robustness`: the robustness of each formula, as simulated.
-    - `seed`, `row`: the run's seed and the row in its table, which determine the random key of the
-      simulation.
+    - `seed`, `row`: the run's seed and the row in its table, which determine the random key.
     - `precision`, `backend`: those of the simulation.
     - `verdict`: the verdict of closer replays of its row; empty if there were none.
     - `changed`: the departures from nominal, `[nominal, value]` by coordinate, if it was shrunk.
@@ -178,8 +177,7 @@ def save_counterexamples(
     """Write counterexamples of a run into a folder, one small file each.
 
     Only claimed rows are written: if the run confirms, those that closer replays confirmed. The
-    worst comes first, then each time the one farthest from those before, so that a few of them
-    represent all.
+    worst comes first, then each time the one farthest from those before, so a few represent all.
 
     **Arguments:**
     - `run`: a run with its problem.

@@ -96,8 +96,7 @@ def note_on_key(problem: Problem, row: int) -> list[str]:
 def fix_key(problem: Problem, run: Run, row: int | None) -> Problem:
     """Return the problem in which every simulation uses the random key of one row.
 
-    It is the same problem if the system draws no random numbers, so that compiled programs are
-    reused.
+    It is the same problem if the system draws no random numbers, and compiled programs are reused.
     """
     if not problem.black_box and not problem.draws():
         return problem

@@ -153,7 +153,7 @@ def boundary_steps(
     """Return departures at the nearest points of the linearised boundary, and on the way there.
 
     - `costs`: the cost of a minimal departure of a coordinate, over its whole range; 0 for none.
-      Without it a linear model extends to an end of the range.
+      Without such a cost a linear model would lead to an end of the range.
     """
     nominal = candidates.nominal
     ends = np.zeros((2, len(track.u)))

@@ -10,8 +10,7 @@ from verifai_jax.evaluation.confirmations import NOT_CLAIMED
 def verdicts(table: pd.DataFrame) -> tuple[Bool[np.ndarray, " n"], Bool[np.ndarray, " n"]]:
     """Return the counterexamples and the rows that keep the property.
 
-    A row that violates the property but that closer replays did not confirm (column `verdict`) is
-    in neither.
+    A violating row that closer replays did not confirm (column `verdict`) is in neither.
     """
     ended = np.ones(len(table), bool)
     if "status" in table:

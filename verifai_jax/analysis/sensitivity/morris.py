@@ -38,7 +38,7 @@ def morris(
     deviation, which is large if the effect is nonlinear or depends on the other features. `mu` is
     the mean with its sign (NaN for choices without an order).
 
-    - `trajectories`: number of paths that change every coordinate once; each takes `d + 1`
+    - `trajectories`: number of paths that change each coordinate once; each has `d + 1`
       simulations.
     - `levels`: even number of values that a continuous coordinate takes: the middles of equally
       probable cells, so that long-tailed features stay finite. A discrete one takes all of its

@@ -149,7 +149,7 @@ def variance_of(rho: Float[np.ndarray, " n"], problem: Problem) -> float:
     if not len(proper):
         raise ValueError(
             f"none of {len(rho)} simulations of problem {problem.name!r} has a verdict; "
-            "falsify(problem, 'uniform', 10).summary() says what happens to them"
+            "falsify(problem, 'uniform', 10).summary() shows why"
         )
     if np.ptp(proper) == 0:
         raise ValueError(

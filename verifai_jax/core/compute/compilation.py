@@ -43,15 +43,15 @@ class Slot(Generic[K, V]):
 
 
 class ProgramCache:
-    """Values by slot and key, which are kept with the object that has the cache."""
+    """Cached values by slot and key, which live as long as the object that owns the cache."""
 
     def __init__(self) -> None:
         self._slots: dict[str, dict[Hashable, object]] = {}
 
     def get(self, slot: Slot[K, V], key: K, make: Callable[[], V]) -> V:
-        """Return the value of this key, which `make` makes the first time.
+        """Return the value of this key; `make` computes it the first time.
 
-        What `make` raises is raised, and nothing is kept.
+        If `make` raises, the error is passed on and nothing is stored.
         """
         values = self._slots.setdefault(slot.name, {})
         if key not in values:
@@ -59,11 +59,11 @@ class ProgramCache:
         return cast(V, values[key])
 
     def peek(self, slot: Slot[K, V], key: K) -> V | None:
-        """Return the value of this key, or None before it is made."""
+        """Return the value of this key; None if it has not been made."""
         return cast("V | None", self._slots.get(slot.name, {}).get(key))
 
     def clear(self) -> None:
-        """Forget everything, so that its memory can be freed."""
+        """Remove all values, so that their memory can be freed."""
         self._slots.clear()
 
 
@@ -76,8 +76,8 @@ def pad_rows(rows: Any, count: int | None = None) -> np.ndarray:
     """Return rows followed by copies of the last one.
 
     **Arguments:**
-    - `rows`: an array `[n, ...]`; an empty one stays as it is.
-    - `count`: rows of the result, at least `n`; the next power of two when left out.
+    - `rows`: an array `[n, ...]`; an empty one is returned unchanged.
+    - `count`: number of rows of the result, at least `n`; the next power of two when left out.
     """
     rows = np.asarray(rows)
     missing = (power_of_two(len(rows)) if count is None else count) - len(rows)
@@ -114,9 +114,9 @@ _meanwhile: dict[Callable[[], object], float] = {}
 
 
 class Compilation:
-    """A program that is being compiled, or is already; calling it waits until it is.
+    """A program that is compiled or being compiled; calling it waits for the compilation.
 
-    - `name`: the name of the program, for people.
+    - `name`: the name of the program in messages.
     """
 
     def __init__(
@@ -136,9 +136,9 @@ class Compilation:
         self._program: jax.stages.Compiled | None = None
 
     def result(self) -> jax.stages.Compiled:
-        """Return the compiled program, once it is compiled.
+        """Wait for the compilation, and return the compiled program.
 
-        **Raises:** what the compiler raised.
+        **Raises:** the error of the compiler.
         """
         if self._program is None:
             began = time.perf_counter()
@@ -169,7 +169,7 @@ class Compilation:
 
 
 def seconds_waited() -> float:
-    """Return the seconds that this process has waited for programs, all of its threads together."""
+    """Return how many seconds all threads of this process have waited for programs."""
     return _waited
 
 
@@ -189,38 +189,36 @@ def compile_soon(
     """Compile a program in the background.
 
     **Arguments:**
-    - `name`: the name of the program, for people: "the search".
+    - `name`: the name of the program in messages, such as "the search".
     - `lowered`: the program, lowered by JAX.
-    - `effort`: how much XLA does to make it fast; accelerators always do the most.
-    - `splits`: whether its loops may be split over cores; not of a program that runs on all of
-      them.
-    - `wide`: whether it may have the widest vectors of the processor; only a program without
-      functions of XLA's own, of which one is wrong with these.
+    - `effort`: how strongly XLA optimises it; accelerators always use the maximum.
+    - `splits`: whether its loops may be split over cores; False if it already uses all of them.
+    - `wide`: whether it may use the processor's widest vectors; only for a program without XLA's
+      own math functions, one of which is wrong with these.
     """
     enable_compile_cache()
     return Compilation(name, lowered, effort, splits, wide)
 
 
 def while_compiling(work: Callable[[], object], after: float = LONG) -> None:
-    """Have work done once where this process next waits for a program; never where it does not.
+    """Run some work once while this process next waits for a program; if it never waits, never.
 
     **Arguments:**
-    - `work`: what will be needed anyway, such as an import; nothing that results depend on.
-    - `after`: seconds of the wait before; 0 for what a first result needs.
+    - `work`: work that will be needed anyway, such as an import; no result may depend on it.
+    - `after`: minimum seconds of waiting before it; 0 for work that a first result needs.
     """
     _meanwhile[work] = after
 
 
 @contextmanager
 def tracing(name: str = "") -> Iterator[None]:
-    """Return a context, or a decorator, for tracing programs: the garbage collector waits.
+    """Return a context, or a decorator, for tracing, in which garbage collection is suspended.
 
-    What is traced is millions of small objects that live until all is compiled. The collector
-    would look at all of them again and again, for a fifth of the time.
+    Tracing makes millions of small objects that live until everything is compiled. The collector
+    would scan all of them repeatedly, which takes a fifth of the time.
 
     **Arguments:**
-    - `name`: the name of the program, which `describe_compilation` then says already; none by
-      default.
+    - `name`: the name of the program for `describe_compilation` during tracing; none by default.
     """
     with _said(name) if name else nullcontext():
         if not gc.isenabled():
@@ -251,7 +249,7 @@ def _said(name: str) -> Iterator[None]:
 
 
 def describe_compilation() -> str:
-    """Say what is being compiled and for how long so far; empty if nothing is."""
+    """Say what is being compiled and for how long; empty if nothing is."""
     with _lock:
         running = list(_running.values())
     if not running:
@@ -294,15 +292,15 @@ def _wanted_options(
 
 @cache
 def options_of(effort: XlaOptimization) -> dict[str, Any] | None:
-    """Return the options for this effort that XLA knows; None without any."""
+    """Return the options of XLA for this effort; None if it knows none."""
     return known_options(_wanted_options(effort)) or None
 
 
 def known_options(options: Mapping[str, Any]) -> dict[str, Any]:
-    """Return those of XLA's compile options that the XLA of this process knows.
+    """Return the compile options that the XLA of this process supports.
 
-    XLA adds options and drops them from one version to the next, refuses a program with one that
-    it does not know, and ends a process that gets it in `XLA_FLAGS`.
+    XLA's options change between versions. XLA refuses a program with an unknown option, and an
+    unknown one in `XLA_FLAGS` ends the process.
 
     **Arguments:**
     - `options`: values by their names.

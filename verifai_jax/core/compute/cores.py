@@ -23,7 +23,7 @@ def available_cores() -> int:
 
 
 def claim_cores() -> None:
-    """Give JAX one host device per core, unless its backend runs or the user chose a number.
+    """Give JAX one host device per core, unless its backend is running or the user set a number.
 
     **Raises:** `ValueError` for a `VERIFAI_JAX_CORES` that is not a positive integer.
     """

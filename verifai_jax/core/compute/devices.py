@@ -29,12 +29,12 @@ def spread_over_devices(
     """Split the leading axis of some arguments, and of all results, over devices.
 
     **Arguments:**
-    - `function`: the function of arrays whose leading axes are a device's share.
-    - `split`: for each argument whether its leading axis is split; the others are given whole.
-    - `devices`: JAX devices; all of this process when left out. Leading axes must be multiples of
+    - `function`: a function of arrays whose leading axes are one device's share.
+    - `split`: for each argument, whether its leading axis is split; the others are passed whole.
+    - `devices`: JAX devices; by default all of this process. Leading axes must be multiples of
       their number.
-    **Returns:** a function of the whole arrays, to be traced by `jax.jit`; `function` itself where
-    there is one device.
+    **Returns:** a function of the whole arrays, to be traced by `jax.jit`; `function` itself if
+    there is only one device.
     """
     devices = jax.local_devices() if devices is None else devices
     if len(devices) == 1:
@@ -52,7 +52,7 @@ def spread_over_devices(
 
 @cache
 def describe_processor() -> str:
-    """Describe what decides the last digits of results: processor, device and version of JAX."""
+    """Describe what determines the last digits of results: processor, device and JAX version."""
     device = jax.local_devices()[0]
     kind = device.device_kind
     if device.platform == "cpu":
@@ -67,9 +67,9 @@ def describe_processor() -> str:
 
 
 def split_sharding(devices: Sequence[Device]) -> NamedSharding:
-    """Return where arrays lie whose leading axis is split as `spread_over_devices` does.
+    """Return the sharding of arrays whose leading axis is split by `spread_over_devices`.
 
-    An array that lies elsewhere would have a compiled program compiled again.
+    Arrays with another sharding would make JAX compile a program again.
     """
     return NamedSharding(_mesh(devices), PartitionSpec("row"))
 
@@ -83,7 +83,7 @@ def _setting(name: str) -> Any:
 
 
 def cache_folder() -> Path | None:
-    """Folder of the persistent compile cache; None when it is switched off."""
+    """Folder of the persistent compile cache; None if it is switched off."""
     setting = os.environ.get("VERIFAI_JAX_CACHE", "").strip()
     if setting.lower() in ("off", "0", "no", "false"):
         return None
@@ -99,7 +99,7 @@ which it warns of in each later process and never replaces; a run's programs are
 
 
 def enable_compile_cache() -> None:
-    """Keep compiled programs on disk, unless the user has configured JAX's cache already."""
+    """Store compiled programs on disk, unless the user has configured JAX's cache."""
     folder = cache_folder()
     if folder is None or _setting("jax_compilation_cache_dir") is not None:
         return

@@ -39,14 +39,14 @@ _NO_MODULE = re.compile(r"No module named '([\w.]+)'")
 
 
 class WorkerError(RuntimeError):
-    """An error of a worker that died and was not replaced, or that lacks what it needs."""
+    """An error of a worker that died and was not replaced, or that lacks something it needs."""
 
 
 class Future(Protocol):
-    """The part of `concurrent.futures.Future` that all executors have."""
+    """The part of the interface of `concurrent.futures.Future` that all executors have."""
 
     def result(self) -> Any:
-        """Wait for the result and return it, or raise what the call raised."""
+        """Wait for the result and return it, or raise the error of the call."""
         ...
 
     def done(self) -> bool:
@@ -54,13 +54,13 @@ class Future(Protocol):
         ...
 
     def cancel(self) -> Any:
-        """Take the call out of the queue, if it has not begun."""
+        """Remove the call from the queue if it has not started."""
         ...
 
 
 @runtime_checkable
 class Executor(Protocol):
-    """Anything with `concurrent.futures`' `submit`."""
+    """Any object with the `submit` of `concurrent.futures`."""
 
     def submit(self, function: Callable[..., Any], /, *arguments: Any) -> Any:
         """Call `function(*arguments)` on a worker, and return its future."""
@@ -81,13 +81,13 @@ def check_executor(executor: object) -> None:
     method = getattr(context, "get_start_method", lambda: "")()
     if isinstance(executor, concurrent.futures.ProcessPoolExecutor) and method == "fork":
         raise ValueError(
-            "the process pool forks this process, and JAX does not work in a copy of it; make it "
-            "with ProcessPoolExecutor(mp_context=multiprocessing.get_context('spawn'))"
+            "the process pool forks this process, and JAX does not work in a forked process; make "
+            "it with ProcessPoolExecutor(mp_context=multiprocessing.get_context('spawn'))"
         )
 
 
 def count_workers(executor: Executor) -> int:
-    """Return how many calls the executor works on at a time, as far as it says so."""
+    """Return how many calls the executor runs at a time, if it can tell."""
     client = getattr(executor, "_client", None)
     if client is not None and hasattr(client, "nthreads"):
         return max(1, sum(client.nthreads().values()))
@@ -96,7 +96,7 @@ def count_workers(executor: Executor) -> int:
 
 
 def seconds_per_block(executor: Executor) -> float:
-    """Return the seconds of work that a call is to take, about: more where a call is a job."""
+    """Return the approximate seconds of a call's work; longer if each call is a cluster job."""
     return float(getattr(executor, "seconds_per_block", SECONDS))
 
 
@@ -105,15 +105,14 @@ def gather(
     ended: Callable[[int, Any], None],
     further: Callable[[], Sequence[Future]] = tuple,
 ) -> None:
-    """Wait until all futures have ended, and call `ended(index, result)` as each ends.
+    """Wait for all futures, and call `ended(index, result)` when each has ended.
 
-    `further()` is asked for more futures whenever some have ended; their places go on.
+    `further()` returns more futures whenever some have ended; indices continue.
 
-    When one fails, or somebody interrupts, what is queued is cancelled; what has ended by then is
+    If one fails, or the user interrupts, queued calls are cancelled; results that exist by then are
     still reported.
 
-    **Raises:** `WorkerError` where a worker died and was not replaced; what the call raised
-    otherwise.
+    **Raises:** `WorkerError` if a worker died and was not replaced; the error of the call.
     """
     waiting = dict(enumerate(futures))
     count = len(waiting)
@@ -167,22 +166,21 @@ def _explained(error: Exception) -> Exception:
     names = {kind.__name__ for kind in type(error).__mro__}
     if names & {"KilledWorker", "WorkerCrashedError", "NodeDiedError"}:
         return WorkerError(
-            "workers died again and again on the same block, so that the cluster gave it up: "
+            "workers died repeatedly on the same block, so the cluster gave up on it: "
             f"{one_line(format_error(error))}"
         )
     return error
 
 
 class Shipment(Generic[T]):
-    """An object that is sent to workers; each worker keeps it with the programs compiled for it.
+    """An object sent to workers, which keep it together with the programs compiled for it.
 
     **Arguments:**
-    - `thing`: the object.
-    - `target`: its name `FILE.py:NAME`; given, the workers load it by that name, and it is not sent
-      itself.
-    - `same`: tells whether an object loaded by its name is this one; its texts by what they are.
+    - `thing`: the object to send.
+    - `target`: its name `FILE.py:NAME`; if given, workers load it by this name instead.
+    - `same`: a check whether an object loaded by name is this one: texts by what they describe.
 
-    `made` is what a worker has made for it, and keeps.
+    `made` holds the objects that a worker has made for it.
     """
 
     def __init__(
@@ -252,10 +250,10 @@ def ship(
 ) -> Shipment[T]:
     """Prepare an object to be sent through an executor.
 
-    An executor that sends code gets the object itself, with the functions of files that were loaded
-    as targets; another one must be able to pickle it, or its workers load it by its name.
+    If the executor sends code, the object is pickled together with functions of files loaded as
+    targets. Otherwise it must be picklable, or workers load it by its name.
 
-    **Raises:** `ValueError` where the executor can do neither.
+    **Raises:** `ValueError` if neither is possible.
     """
     shipment = Shipment(thing)
     if isinstance(executor, concurrent.futures.ThreadPoolExecutor):
@@ -272,7 +270,7 @@ def ship(
             f"{type(executor).__name__} cannot send the {type(thing).__name__.lower()} to its "
             f"workers ({one_line(format_error(error))[:200]}); name it, "
             "target='specs/FILE.py:NAME', so that they load it themselves, or use Dask or Ray, "
-            "which send functions that are in no module"
+            "which can send functions that are not in a module"
         ) from error
     return shipment
 

@@ -61,9 +61,9 @@ _FACTORIZATIONS = {
 
 
 def avoid_deadlock() -> None:
-    """Let this process lower large batches of factorizations block by block, for affected versions.
+    """Make this process lower large batches of factorizations in blocks, for affected versions.
 
-    It holds for all programs of the process, which compute what they did before.
+    It applies to all programs of the process, whose results do not change.
     """
     if not _BEGINS <= jaxlib.version.__version_info__[:3] < _ENDS:
         return

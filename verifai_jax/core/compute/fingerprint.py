@@ -48,11 +48,11 @@ def fingerprint(program: Any, derivatives: bool = True) -> str | None:
     """Return a hash of all that a traced function computes, with its constants.
 
     **Arguments:**
-    - `program`: what JAX traced, with its constants.
-    - `derivatives`: whether rules of derivatives are read too. They are traced for that, and only
-      programs that differentiate this one depend on them.
-    **Returns:** the hash in hexadecimal digits; None if a part of the function is opaque, such
-    as a call of Python from the device.
+    - `program`: a program traced by JAX, with its constants.
+    - `derivatives`: whether to include derivative rules. Only programs that differentiate this one
+      depend on them; they are traced for it.
+    **Returns:** the hash in hexadecimal digits; None if a part of the function is opaque, such as a
+    Python callback.
     """
     reader = _Reader(derivatives)
     try:
@@ -66,7 +66,7 @@ def fingerprint(program: Any, derivatives: bool = True) -> str | None:
 def identity(*values: object) -> str | None:
     """Return a hash of plain values: numbers, texts, arrays, tuples, and dataclasses of them.
 
-    **Returns:** the hash in hexadecimal digits; None if one of them is something else.
+    **Returns:** the hash in hexadecimal digits; None if there is a value of another type.
     """
     reader = _Reader()
     try:
@@ -230,9 +230,9 @@ PROGRAM: Any = getattr(jax.extend.core, "ClosedJaxpr", jax.extend.core.Jaxpr)
 
 
 def as_traced(traced: jax.stages.Traced) -> Callable[..., Any]:
-    """Return what was traced as a function of pytrees: no code of a user's runs again.
+    """Return a traced program as a function of pytrees, which runs no user code again.
 
-    What none of its results is computed from is left out, so that it is not differentiated either.
+    Equations that no result depends on are left out, so that they are not differentiated either.
     """
     closed = traced.jaxpr
     used = without_unused(closed.jaxpr, [True] * len(closed.jaxpr.outvars))
@@ -242,7 +242,7 @@ def as_traced(traced: jax.stages.Traced) -> Callable[..., Any]:
 
 
 def used_inputs(program: Any) -> list[bool]:
-    """Return which inputs of a program any of its results depends on."""
+    """Return which inputs of a program its results depend on."""
     results = [True] * len(program.jaxpr.outvars)
     return partial_eval.dce_jaxpr(program.jaxpr, results)[1]
 
@@ -252,19 +252,19 @@ def without_unused(program: Any, wanted: Sequence[bool]) -> Any:
 
     **Arguments:**
     - `program`: a `Jaxpr`.
-    - `wanted`: which of its results.
+    - `wanted`: which results to compute.
     """
     return partial_eval.dce_jaxpr(program, list(wanted), instantiate=True)[0]
 
 
 def as_function(program: Any, step: Any) -> tuple[Callable[..., list[Any]], list[Any]]:
-    """Return a function that takes one step of a program, and the variables that are its arguments.
+    """Return a function that performs one equation of a program, and its argument variables.
 
     **Arguments:**
     - `program`: a `Jaxpr`.
     - `step`: one of its equations.
-    **Returns:** the function, of one array for each variable, which returns the step's results; and
-    the variables, each once.
+    **Returns:** the function, with one array for each variable, which returns the equation's
+    results; and the variables, each once.
     """
     inputs = [each for each in step.invars if not isinstance(each, jax.extend.core.Literal)]
     inputs = list(dict.fromkeys(inputs))
@@ -278,13 +278,13 @@ def as_function(program: Any, step: Any) -> tuple[Callable[..., list[Any]], list
 def of_some(
     call: Callable[..., list[Any]], values: Sequence[Any], indices: Sequence[int]
 ) -> Callable[..., list[Any]]:
-    """Return a function of some arguments of another, to be differentiated.
+    """Fix all other arguments of a function, to differentiate it by these.
 
     **Arguments:**
-    - `call`: the other function, of arrays.
-    - `values`: all of its arguments.
-    - `indices`: numbers of those that the function takes; the others keep their values.
-    **Returns:** the function, which returns those results that can have a derivative.
+    - `call`: the other function of arrays.
+    - `values`: all its arguments.
+    - `indices`: indices of the arguments that stay; the others are fixed.
+    **Returns:** the function, which returns only results that can have a derivative.
     """
 
     def function(*some: Any) -> list[Any]:
@@ -297,7 +297,7 @@ def of_some(
 
 
 def describe_step(step: Any) -> str:
-    """Write a step for people: its operation, the function that it calls, and the user's line."""
+    """Describe an equation: its operation, the function that it calls, and the user's line."""
     called = step.params.get("callback")
     name = getattr(getattr(called, "callback_func", called), "__name__", "")
     named = f" of {name}" if name and not name.startswith("<") else ""
@@ -306,7 +306,7 @@ def describe_step(step: Any) -> str:
 
 
 def programs_in(step: Any) -> list[Any]:
-    """Return the programs among the parameters of a step, such as the body of a loop."""
+    """Return the programs among the parameters of an equation, such as the body of a loop."""
     kinds = (jax.extend.core.Jaxpr, PROGRAM)
     leaves = jax.tree.leaves(
         list(step.params.values()), is_leaf=lambda each: isinstance(each, kinds)
@@ -315,9 +315,9 @@ def programs_in(step: Any) -> list[Any]:
 
 
 def alone_only(program: Any) -> Iterator[tuple[Any, Exception]]:
-    """Yield the steps of a `Jaxpr` that `jax.vmap` refuses, each with what it says.
+    """Yield the equations of a `Jaxpr` that `jax.vmap` refuses, each with the error.
 
-    Only calls of Python, and operations without a rule for batches, are tried.
+    Only Python callbacks, and operations without a batching rule, are tried.
     """
     for step in program.eqns:
         inside = programs_in(step)
@@ -344,7 +344,7 @@ def _has_rule(primitive: Any) -> bool:
 
 
 def operands_of_scan(options: Mapping[str, Any]) -> tuple[int, int]:
-    """Return how many operands of a scan are constants and how many are carried."""
+    """Return how many operands of a scan are constants, and how many are carried."""
     if "ft_in" in options:  # JAX 0.12 groups the operands, versions before it count them.
         constants, carried, _ = options["ft_in"].unpack()
         return len(constants), len(carried)
@@ -358,7 +358,7 @@ _CALLBACKS = frozenset({"pure_callback", "io_callback"})
 
 
 def stable_text(value: object) -> str:
-    """Return the `repr` of a value without addresses in memory; of an array all of its numbers."""
+    """Return the `repr` of a value without memory addresses; for an array, with all its numbers."""
     if isinstance(value, np.ndarray | jax.Array):
         return repr(np.asarray(value).tolist())
     return _ADDRESS.sub("", repr(value))

@@ -17,7 +17,7 @@ _PARAMETERS = ("jaxpr", "call_jaxpr", "fun_jaxpr", "call")
 
 
 def called(step: Any) -> Any | None:
-    """Return the program that a step runs once on its operands; None for a step that calls none."""
+    """Return the program that an equation calls once on its operands; None if it calls none."""
     if step.primitive.name not in CALLS | CUSTOM_CALLS:
         return None
     return next(step.params[name] for name in _PARAMETERS if name in step.params)
@@ -30,12 +30,12 @@ def run_through(
     literal: Callable[[Any], V],
     step: Callable[[Any, list[V]], Sequence[V]],
 ) -> list[V]:
-    """Go through the steps of a `Jaxpr` in their order, and return its results.
+    """Interpret the equations of a `Jaxpr` in order, and return its results.
 
     **Arguments:**
-    - `constants`, `inputs`: the values of its constants and of its arguments.
-    - `literal`: makes a value of a number in the program, given as JAX's `Literal`.
-    - `step`: makes the results of one step from its operands.
+    - `constants`, `inputs`: the values of its constants and arguments.
+    - `literal`: a function that converts a number in the program, JAX's `Literal`, to a value.
+    - `step`: a function that computes the results of an equation from its operands.
     """
     values: dict[object, V] = dict(zip(program.constvars, constants, strict=True))
     values.update(zip(program.invars, inputs, strict=True))

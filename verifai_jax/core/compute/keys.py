@@ -13,8 +13,8 @@ ROTATIONS = ((13, 15, 26, 6), (17, 29, 16, 24))
 def run_keys(seed: int) -> tuple[Key[Array, ""], Key[Array, ""]]:
     """Split a seed into the key of the search and the key of the simulations.
 
-    They are those of `jax.random.split(jax.random.key(seed))`, whose programs JAX would compile in
-    every process: NumPy needs none.
+    They equal `jax.random.split(jax.random.key(seed))`, whose programs JAX would compile in every
+    process; NumPy needs no compilation.
     """
     key = np.array([0, int(seed) & 0xFFFFFFFF], np.uint32)
     first, second = _threefry(key, np.zeros(2, np.uint32), np.arange(2, dtype=np.uint32))

@@ -24,7 +24,7 @@ T = TypeVar("T")
 
 
 class LiftedNumbers:
-    """The numbers of one program, and their indices in its argument."""
+    """The lifted numbers of a program, and their indices in its argument vector."""
 
     def __init__(self) -> None:
         self._indices: dict[tuple[int, str], int] = {}
@@ -32,7 +32,7 @@ class LiftedNumbers:
         self._values: list[float] = []
 
     def read_from(self, vector: Float[Array, " numbers"], function: Callable[[], T]) -> T:
-        """Call a function, while what it asks to be lifted is read from the vector."""
+        """Call a function in which lifted numbers are read from the vector."""
         token = _current.set((self, vector))
         try:
             return function()
@@ -40,13 +40,13 @@ class LiftedNumbers:
             _current.reset(token)
 
     def vector(self, precision: str) -> Float[np.ndarray, " numbers"]:
-        """Return the argument: the numbers in this precision, then zeros."""
+        """Return the argument vector: the numbers in this precision, padded with zeros."""
         vector = np.zeros(CAPACITY, precision)
         vector[: len(self._values)] = self._values
         return vector
 
     def index_of(self, name: str, owner: object, values: np.ndarray) -> int | None:
-        """Return where these numbers begin in the vector; None if there is no room for them."""
+        """Return the index of these numbers in the vector; None if there is no room for them."""
         key = (id(owner), name)
         if key not in self._indices:
             if len(self._values) + values.size > CAPACITY:
@@ -63,9 +63,9 @@ _wanted: ContextVar[bool] = ContextVar("numbers are to be lifted", default=False
 
 @contextmanager
 def lifting() -> Iterator[None]:
-    """Return a context in which numbers are lifted, where the program being traced can take them.
+    """Return a context in which numbers are lifted, if the program being traced supports it.
 
-    Nothing that JAX traces once and keeps may be called in it: it would keep the argument.
+    No function that JAX traces once and caches may be called inside: it would store the argument.
     """
     token = _wanted.set(True)
     try:
@@ -75,16 +75,16 @@ def lifting() -> Iterator[None]:
 
 
 def is_lifting() -> bool:
-    """Return whether numbers are lifted here."""
+    """Return whether numbers are being lifted."""
     return _wanted.get() and _current.get() is not None
 
 
 def lifted(owner: object, **values: np.ndarray) -> tuple[Any, ...]:
-    """Return these numbers: as an argument of the program that is traced, or as they are.
+    """Return these numbers as arguments of the traced program, or unchanged outside of `lifting`.
 
     **Arguments:**
-    - `owner`: the owner of the numbers, which they are known by, with their names.
-    - `values`: arrays of the precision of the program.
+    - `owner`: the object that owns the numbers; with their names it identifies them.
+    - `values`: arrays in the precision of the program.
     """
     current = _current.get()
     if current is None or not _wanted.get():

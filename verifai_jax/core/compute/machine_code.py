@@ -24,13 +24,13 @@ MAX_SECONDS = 60.0
 
 
 class Unavailable(Exception):
-    """Raised when a library cannot be made, with the reason."""
+    """An error for a library that cannot be made, with the reason."""
 
 
 def compiler() -> Path:
-    """Return the compiler of this machine, for a library that is kept.
+    """Return the C compiler of this machine, for a library that is stored.
 
-    **Raises:** `Unavailable` without a compiler, or without a folder for the library.
+    **Raises:** `Unavailable` without a compiler, or without a folder for libraries.
     """
     if cache_folder() is None:
         raise Unavailable("the cache of compiled programs is switched off")
@@ -49,12 +49,12 @@ Program = tuple[str, tuple[str, ...]]
 
 
 def library_file(name: str, program: Callable[[], Program]) -> Path:
-    """Return the file of the library of this name, compiled where there is none.
+    """Return the file of the library with this name, compiling it if there is none.
 
     **Arguments:**
-    - `name`: which depends on all that the library depends on.
-    - `program`: makes the source and the compiler's flags, if they are needed.
-    **Raises:** `Unavailable` where it cannot be compiled or kept.
+    - `name`: a name that identifies everything the library depends on.
+    - `program`: a function that returns the source and the compiler's flags, called if needed.
+    **Raises:** `Unavailable` if it cannot be compiled or stored.
     """
     try:
         folder = library_folder()
@@ -65,7 +65,7 @@ def library_file(name: str, program: Callable[[], Program]) -> Path:
 
 
 def library_folder() -> Path:
-    """Return the folder of libraries, which only this user may write to.
+    """Return the folder of libraries, to which only this user can write.
 
     **Raises:** `Unavailable` if others can write to it, or if the cache is switched off.
     """
@@ -93,9 +93,9 @@ def _checksum(data: bytes) -> str:
 
 
 def compile_library(folder: Path, name: str, source: str, flags: tuple[str, ...]) -> Path:
-    """Compile a library into a folder, and return its file, whose name ends in a checksum.
+    """Compile a library into a folder, and return its file, whose name ends with a checksum.
 
-    **Raises:** `Unavailable` where there is no compiler, or where it fails.
+    **Raises:** `Unavailable` if there is no compiler, or if it fails.
     """
     tool = _compiler()
     with tempfile.TemporaryDirectory(dir=folder) as cell:

@@ -21,8 +21,8 @@ _TRUNCATION = re.compile("Explicitly requested dtype .* is not available")
 def in_precision(precision: str) -> AbstractContextManager[None]:
     """Return a context in which JAX computes in `"float32"` or `"float64"`.
 
-    NumPy arrays that a traced function closes over become constants of that precision, whatever
-    the function was traced in before.
+    NumPy arrays in the closure of a traced function become constants of that precision, even if the
+    function was traced in another one before.
 
     **Raises:** `ValueError` for another precision.
     """
@@ -42,11 +42,11 @@ def _computing_in(precision: str) -> Iterator[None]:
 
 
 def whole_products() -> AbstractContextManager[Any]:
-    """Return a context in which accelerators multiply matrices in the precision of their elements.
+    """Return a context in which accelerators multiply matrices in the elements' precision.
 
-    By default a GPU rounds the factors of a product of float32 to 10 bits (TF32), and a TPU to 7.
-    On an H200 the actions of small networks were off by up to 5e-3, which changes verdicts.
-    A processor computes products as they are, so that nothing is set there.
+    By default a GPU rounds the factors of a float32 product to 10 bits (TF32), and a TPU to 7. On
+    an H200 the actions of small networks were off by up to 5e-3, which changes verdicts. CPUs do
+    not round, so nothing is changed there.
     """
     if jax.default_backend() == "cpu":
         return nullcontext()
@@ -55,10 +55,10 @@ def whole_products() -> AbstractContextManager[Any]:
 
 @contextmanager
 def reproducible_settings() -> Iterator[None]:
-    """Return a context, or a decorator, in which a person's own JAX settings change no result.
+    """Return a context, or a decorator, in which a user's JAX settings do not affect results.
 
-    Random numbers depend on the generator and on how it splits, the types of everything on x64: a
-    run computes with those that its seed means, whatever the configuration says outside.
+    Random numbers depend on the generator and its settings, all types on x64. A run uses the
+    settings that its seed refers to, whatever the user's configuration.
     """
     with jax.enable_x64(False), reproducible_random():
         yield
@@ -66,19 +66,19 @@ def reproducible_settings() -> Iterator[None]:
 
 @contextmanager
 def reproducible_random() -> Iterator[None]:
-    """Return a context, or a decorator, in which random numbers are those that a seed means."""
+    """Return a context, or a decorator, with the random generator that seeds refer to."""
     with jax.threefry_partitionable(True), jax.default_prng_impl(IMPLEMENTATION):
         yield
 
 
 @contextmanager
 def truncate_silently() -> Iterator[None]:
-    """Keep JAX from warning that a system's float64 is truncated: a run asks for its precision.
+    """Suppress JAX's warning that a system's float64 is truncated, since a run sets the precision.
 
-    A system that says `jnp.asarray(x, float)` serves both precisions, and the advice to enable x64
-    for all of JAX is none for its author. All other warnings go on as they are. The filter is put
-    into the list itself: `warnings.catch_warnings` would make Python forget which warnings of the
-    user's own code it has shown.
+    A system that calls `jnp.asarray(x, float)` works in both precisions, so the advice to enable
+    x64 for all of JAX does not help its author. All other warnings are unaffected. The filter is
+    inserted into the list itself, because `warnings.catch_warnings` would make Python forget which
+    warnings of the user's code it has shown.
     """
     filters: list[object] = warnings.filters  # pyright: ignore[reportAssignmentType]
     filters.insert(0, entry := ("ignore", _TRUNCATION, UserWarning, None, 0))

@@ -45,13 +45,12 @@ _SETTINGS = (
 
 
 def remembered_as(kind: str, *values: object) -> str | None:
-    """Return the name under which a program is kept, a hash of all that it depends on.
+    """Return the name under which a program is stored, a hash of all that it depends on.
 
     **Arguments:**
-    - `kind`: of the program, for people who look into the folder.
-    - `values`: everything that determines the program, besides this package and JAX; see
-      `identity`.
-    **Returns:** the name; None if a value has no identity, or nothing is kept on disk.
+    - `kind`: the kind of program, readable in the folder.
+    - `values`: all values that determine the program, except this package and JAX; see `identity`.
+    **Returns:** the name; None if a value has no identity, or if nothing is stored on disk.
     """
     if cache_folder() is None or None in values:
         return None
@@ -62,24 +61,23 @@ def remembered_as(kind: str, *values: object) -> str | None:
 
 
 def is_kept(name: str | None) -> bool:
-    """Return whether there is a file of this name, as `remembered_as` gives it."""
+    """Return whether there is a file with this name, as returned by `remembered_as`."""
     return name is not None and (_folder() / name).is_file()
 
 
 def lower_or_recall(
     name: str | None, function: Callable[..., Any], arguments: tuple[Any, ...], form: Any = None
 ) -> jax.stages.Lowered:
-    """Return a function as a program that can be compiled, from its file where there is one.
+    """Return a function as a lowered program, read from its file if there is one.
 
-    It is the same program, to the last bit, whether it was traced here or by an earlier process.
+    The program is identical whether it was traced here or by an earlier process.
 
     **Arguments:**
-    - `name`: the name of `remembered_as`; None for a program that is not kept.
-    - `function`: the function of pytrees; is traced where there is no file.
-    - `arguments`: their shapes and types.
-    - `form`: the structure of what it returns; left out for tuples, lists and dictionaries of
-      arrays.
-    **Raises:** what tracing raises.
+    - `name`: the name from `remembered_as`; None for a program that is not stored.
+    - `function`: a function of pytrees; it is traced if there is no file.
+    - `arguments`: the shapes and types of its arguments.
+    - `form`: the structure of its result; left out for tuples, lists and dictionaries of arrays.
+    **Raises:** the errors of tracing.
     """
     if name is None:
         return jax.jit(function).trace(*arguments).lower()

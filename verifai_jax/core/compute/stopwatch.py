@@ -18,12 +18,12 @@ from verifai_jax.core.compute.compilation import seconds_waited
 
 
 class Stopwatch:
-    """Seconds by the name of what they were spent on.
+    """Seconds spent, by activity.
 
     **Arguments:**
-    - `name`: what they are spent on until `on` says otherwise.
-    - `began`: when it began, as `time.perf_counter` had it; now by default.
-    - `earlier`: seconds by name that are spent already, as by an earlier part of a run.
+    - `name`: the activity until the first `on`.
+    - `began`: the start on the clock `time.perf_counter`; now by default.
+    - `earlier`: seconds already spent by activity, for example in an earlier part of a run.
     """
 
     def __init__(
@@ -35,13 +35,13 @@ class Stopwatch:
 
     @property
     def seconds(self) -> Mapping[str, float]:
-        """Seconds by name, up to now; 0 for a name that nothing was spent on."""
+        """Seconds by activity so far; 0 for an activity without any."""
         self._count()
         return self._seconds
 
     @contextmanager
     def on(self, name: str) -> Iterator[None]:
-        """Count what happens inside for `name`, and for nothing around it."""
+        """Count the time inside for activity `name` only."""
         self._count()
         self._names.append(name)
         try:
@@ -52,7 +52,7 @@ class Stopwatch:
 
     @contextmanager
     def waiting_for_programs_is(self, name: str) -> Iterator[None]:
-        """Count for `name` what is spent inside on waiting for programs that are compiled."""
+        """Count for `name` the time inside that is spent waiting for programs to compile."""
         before = seconds_waited()
         try:
             yield
@@ -60,7 +60,7 @@ class Stopwatch:
             self.move(seconds_waited() - before, name)
 
     def move(self, seconds: float, to: str) -> None:
-        """Count seconds that were measured inside the present part for `to` instead.
+        """Count seconds measured inside the present part for activity `to` instead.
 
         At most the seconds of the present part are moved.
         """

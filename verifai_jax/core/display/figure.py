@@ -21,7 +21,7 @@ else:
 class Drawn:
     """A result that has a picture.
 
-    - `_picture`: a module of `verifai_jax.reports.plotting`, and its function that draws it.
+    - `_picture`: a module of `verifai_jax.reports.plotting`, and its drawing function.
     """
 
     _picture: ClassVar[tuple[str, str]]
@@ -30,7 +30,7 @@ class Drawn:
         """Draw the result.
 
         **Arguments:**
-        - `path`: file that the picture is written to, if given.
+        - `path`: file to which the picture is written, if given.
         **Returns:** the Matplotlib figure.
         """
         module, function = self._picture
@@ -45,35 +45,35 @@ class Reported:
 
         **Arguments:**
         - `path`: the path of the HTML file.
-        - `options`: the options of `reports.write_report` for a result of this kind: of a run
-          `units` and `reasons` of features, `traces`, `studies`, `modes`, `odd`, `assessment`; of a
-          sweep `units` and `reasons` of hyper-parameters; of a transfer `units` and `reasons` of
-          features, and of any other result its `problem`, too; of an estimate and a comparison also
-          `errors`.
+        - `options`: the options of `reports.write_report` for this kind of result. For a run:
+          `units` and `reasons` of features, `traces`, `studies`, `modes`, `odd`, `assessment`. For
+          a sweep: `units` and `reasons` of hyper-parameters. For a transfer: `units` and `reasons`
+          of features. For any other result these and its `problem`; for an estimate and a
+          comparison also `errors`.
         **Returns:** the path of the HTML file.
         """
         return lazy_import("verifai_jax.reports", "write_report")(self, path, **options)
 
 
 def new_figure(**options: Any) -> Figure:
-    """Return an empty figure: nothing pops up, and nothing has to be closed.
+    """Return an empty figure that opens no window and needs no closing.
 
-    As the last value of a notebook cell it is drawn, with or without `%matplotlib inline`.
+    As the last value of a notebook cell it is displayed, with or without `%matplotlib inline`.
 
     **Arguments:**
-    - `options`: those of `matplotlib.figure.Figure`.
+    - `options`: the options of `matplotlib.figure.Figure`.
     """
     return _figure_class()(**options)
 
 
 def load() -> None:
-    """Import what figures are drawn with, which takes half a second."""
+    """Import the libraries for figures, which takes half a second."""
     _figure_class()
 
 
 @contextlib.contextmanager
 def missing_glyphs() -> Iterator[None]:
-    """Draw characters that the font lacks as boxes, without a warning for each."""
+    """Draw characters missing from the font as boxes, without a warning for each."""
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", "Glyph .* missing from", UserWarning)
         yield

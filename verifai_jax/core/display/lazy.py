@@ -16,21 +16,21 @@ from typing import Any
 
 
 def lazy_import(module: str, name: str) -> Any:
-    """Import `module` now and return what it calls `name`, which may be a module within it."""
+    """Import `module` now and return its object `name`, which may be a submodule."""
     return getattr(__import__(module, fromlist=[name]), name)
 
 
 def attach(
     package: str, *others: str
 ) -> tuple[Callable[[str], Any], Callable[[], list[str]], list[str]]:
-    """Return `__getattr__`, `__dir__` and `__all__` of a package whose names are imported late.
+    """Return `__getattr__`, `__dir__` and `__all__` of a package whose names are imported lazily.
 
-    The names are those that the package imports for type checkers, as `from a.b import c as c`:
-    they are read from its source, so that each stands there once.
+    The names are those that the package imports for type checkers, as `from a.b import c as c`.
+    They are read from its source, so that each is written only once.
 
     **Arguments:**
-    - `package`: the name of the package, which is being imported.
-    - `others`: names that it has already.
+    - `package`: the name of the package that is being imported.
+    - `others`: further names that it already has.
     """
     source = sys.modules[package].__loader__.get_source(package)  # pyright: ignore
     begin = source.index("if TYPE_CHECKING:")

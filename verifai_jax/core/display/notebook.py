@@ -25,9 +25,9 @@ MAX_ROWS = 10
 
 
 class ForUsers:
-    """A value whose tab completion leaves out what only this package uses.
+    """A value whose tab completion leaves out attributes that are for internal use.
 
-    A class names those attributes in `_internal`; those of its bases are left out too.
+    A class lists those attributes in `_internal`; those of its bases are left out too.
     """
 
     _internal: ClassVar[frozenset[str]] = frozenset()
@@ -38,9 +38,9 @@ class ForUsers:
 
 
 class InNotebook(ForUsers):
-    """A result that a notebook shows as its text, and with tables and pictures where it has any.
+    """A result that a notebook shows as text, with its tables and pictures.
 
-    Its texts steer no terminal, whatever is in the names of systems and files that they quote.
+    Control characters in names of systems and files are escaped.
     """
 
     def __init_subclass__(cls, **options: object) -> None:
@@ -83,12 +83,12 @@ def _in_printable_characters(write: Callable[[T], str]) -> Callable[[T], str]:
 
 
 def text_html(text: str) -> str:
-    """Write a text of several lines as HTML, as a terminal would show it."""
+    """Convert a text of several lines to HTML, as a terminal would show it."""
     return f'<pre style="white-space: pre-wrap">{html.escape(printable(text))}</pre>'
 
 
 def rows_html(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """Write rows of text as a table of HTML."""
+    """Convert rows of text to an HTML table."""
     head = "".join(f"<th>{html.escape(cell)}</th>" for cell in header)
     body = "".join(
         "<tr>" + "".join(f"<td>{html.escape(cell)}</td>" for cell in row) + "</tr>" for row in rows
@@ -97,12 +97,12 @@ def rows_html(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
 
 
 def frame_html(frame: "pd.DataFrame") -> str:
-    """Write the first rows of a table of pandas as HTML, numbers with four digits."""
+    """Convert the first rows of a pandas table to HTML, numbers with four digits."""
     return frame.head(MAX_ROWS).to_html(float_format=lambda x: f"{x:z.4g}", border=0)
 
 
 def picture_html(figure: Figure) -> str:
-    """Write a figure as an image within HTML."""
+    """Convert a figure to an image in HTML."""
     file = io.BytesIO()
     figure.savefig(file, format="png", dpi=72)
     return f'<img src="data:image/png;base64,{base64.b64encode(file.getvalue()).decode()}"/>'

@@ -89,10 +89,10 @@ class _Stage:
 
 
 class ProgressBar:
-    """One line, for one stage of a computation at a time; a context manager around all of them.
+    """A one-line progress bar for the stages of a computation; a context manager around them.
 
     **Arguments:**
-    - `show`: whether to show it; None decides by where the error stream goes, False shows nothing.
+    - `show`: whether to show it; None shows it if the error stream is a terminal or notebook.
     """
 
     def __init__(self, show: bool | None = None) -> None:
@@ -166,7 +166,7 @@ class ProgressBar:
                 stream.flush()
 
     def begin(self, name: str, total: float | None, unit: str) -> None:
-        """Begin a stage of `total` units of work, None if unknown; a stage may lie in another."""
+        """Begin a stage of `total` units of work, None if unknown; stages may be nested."""
         self._own += 1
         bar = self._shared or self
         stage = _Stage(name, total, unit, time.perf_counter())
@@ -179,7 +179,7 @@ class ProgressBar:
         bar._stages.append(stage)
 
     def end(self) -> None:
-        """End the present stage; the one that it lies in goes on."""
+        """End the present stage; the enclosing one continues."""
         if not self._own:
             return
         self._own -= 1
@@ -197,12 +197,12 @@ class ProgressBar:
             self.update(stage.done + amount, figures=figures)
 
     def update(self, done: float, total: float | None = None, figures: str = "") -> None:
-        """Set the units that are done, and their total where it has changed."""
+        """Set the number of finished units, and their total if it has changed."""
         if self._own:
             self._set((self._shared or self)._stages[-1], done, total, figures)
 
     def count(self, amount: float) -> None:
-        """Count units as done of the outermost stage, whatever goes on within it."""
+        """Count finished units of the outermost stage, even inside another stage."""
         if self._stages:
             stage = self._stages[0]
             # A total is what somebody allowed; more than that is done by what is not counted in it.
@@ -220,14 +220,14 @@ class ProgressBar:
             )
 
     def note(self, text: str) -> None:
-        """Write a line above the bar, which stays."""
+        """Write a line above the bar, which remains visible."""
         display = (self._shared or self)._display
         if display is not None:
             display.console.print(f"note: {printable(text)}", markup=False, highlight=False)
 
     @property
     def speed(self) -> float:
-        """Units per second of the present stage."""
+        """Units per second in the present stage."""
         bar = self._shared or self
         if not self._own:
             return 0.0
@@ -246,16 +246,15 @@ def _compiling() -> str:
 def shows_progress(
     doing: str, unit: str = "simulations", *, of_budget: bool = True
 ) -> Callable[[Callable[P, R]], Callable[P, R]]:
-    """Let a verb say what it is doing while it runs, in one line.
+    """Make a verb show in one line what it is doing.
 
-    Its option `progress` decides as in `ProgressBar`; one that is a function of the caller's shows
-    nothing by itself. The total is its option `budget`, where it has one. What `count_done` counts
-    is done.
+    Its option `progress` works as in `ProgressBar`; if that is a function, nothing is shown. The
+    total is its option `budget`, if it has one. `count_done` counts finished units.
 
     **Arguments:**
-    - `doing`: a word for the verb, before the name of its first argument: "comparing".
-    - `unit`: name of what is counted.
-    - `of_budget`: whether its option `budget` is the total, and not that of a part.
+    - `doing`: the word before the name of the first argument: "comparing".
+    - `unit`: the name of the units.
+    - `of_budget`: whether its option `budget` is the total, not that of a part.
     """
 
     def decorate(function: Callable[P, R]) -> Callable[P, R]:
@@ -291,13 +290,13 @@ def shows_progress(
 
 
 def count_done(amount: float) -> None:
-    """Count so many units as done by the verb that was called."""
+    """Count this many units as done by the verb that was called."""
     if (bar := _ongoing.get()) is not None:
         bar.count(amount)
 
 
 def say_done(done: float, total: float | None = None, figures: str = "") -> None:
-    """Set how much the verb that was called has done, of how much, with figures next to it."""
+    """Set how much the verb that was called has done, out of how much, with figures next to it."""
     if (bar := _ongoing.get()) is not None:
         bar.update(done, total, figures)
 
@@ -308,7 +307,7 @@ class SimulationProgress:
     **Arguments:**
     - `name`: text in front of the bar.
     - `budget`: simulations in all.
-    - `show`: whether to draw; None decides by where the error stream goes.
+    - `show`: whether to draw it; None draws if the error stream is a terminal or notebook.
     """
 
     def __init__(self, name: str, budget: int, show: bool | None = None) -> None:
@@ -324,24 +323,24 @@ class SimulationProgress:
         self.bar.__exit__(*reason)
 
     def note(self, text: str) -> None:
-        """Write a line above the bar, which stays."""
+        """Write a line above the bar, which remains visible."""
         self.bar.note(text)
 
     def update(self, simulations: int, counterexamples: int, best: float) -> None:
-        """Show the simulations made, the counterexamples among them and the least robustness."""
+        """Show the number of simulations and counterexamples, and the least robustness."""
         figures = f"{self.bar.speed:z,.0f}/s  best {best:z.3g}  {counterexamples} counterexamples"
         self.bar.update(simulations, figures=figures)
 
 
 def write_line(text: str) -> None:
-    """Write a line to the error stream, above any bar, on what takes long where there is no bar."""
+    """Write a line about slow work to the error stream, above the bar if there is one."""
     stream = _Stream()
     stream.write(f"{printable(text)}\n")
     stream.flush()
 
 
 def has_viewer() -> bool:
-    """Return whether the error stream is a terminal or a notebook that can draw a bar."""
+    """Return whether the error stream is a terminal or a notebook that can show a bar."""
     if sys.stderr is not None and not sys.stderr.closed and sys.stderr.isatty():
         return True
     # In a notebook rich draws through ipywidgets, and without it warns instead.
@@ -350,10 +349,10 @@ def has_viewer() -> bool:
 
 @contextlib.contextmanager
 def goes_on_with(command: str, kept: Callable[[], bool]) -> Iterator[None]:
-    """Say after a moment which command resumes the work, since a killed process cannot say it.
+    """Show after a moment the command that resumes the work, since a killed process cannot.
 
     **Arguments:**
-    - `kept`: whether there is anything to go on with by now.
+    - `kept`: a function that returns whether there is anything to resume.
     """
     over = threading.Event()
 

@@ -15,20 +15,20 @@ from verifai_jax.core.messages.text import is_control
 
 
 def is_number(value: object) -> TypeGuard[float]:
-    """Return whether this is a real number of Python or NumPy, and no truth value."""
+    """Return whether this is a real number of Python or NumPy, but not a truth value."""
     return isinstance(value, int | float | np.integer | np.floating) and not isinstance(value, bool)
 
 
 def check_name(
     what: str, name: object, *, lines: bool = False, error: type[ValueError] = ValueError
 ) -> str:
-    """Check a name that tables and files can hold.
+    """Check a name for use in tables and files.
 
     **Arguments:**
-    - `what`: what it names, for the message: `the name of a signal`.
+    - `what`: a description of the named object, for the message: `the name of a signal`.
     - `lines`: whether it may have line breaks and other control characters.
     - `error`: type of the error to raise.
-    **Raises:** `error` for anything but a text that is not empty and that UTF-8 can hold.
+    **Raises:** `error` for anything but a non-empty text that UTF-8 can encode.
     """
     if not isinstance(name, str) or not name:
         raise error(f"{what} must be a text that is not empty; got {name!r}")
@@ -55,14 +55,14 @@ def check_fraction(
     one: bool = False,
     error: type[ValueError] = ValueError,
 ) -> float:
-    """Check a probability or another share of one.
+    """Check a probability or another share.
 
     **Arguments:**
     - `name`: name of the argument in the error message.
     - `zero`: whether 0 itself is allowed.
     - `one`: whether 1 itself is allowed.
     - `error`: type of the error to raise.
-    **Raises:** `error` unless `0 < value < 1`, or the value is an end that is allowed.
+    **Raises:** `error` unless `0 < value < 1`, or the value is an allowed end.
     """
     if is_number(value) and (0 < value < 1 or (zero and value == 0) or (one and value == 1)):
         return value
@@ -91,11 +91,11 @@ def check_positive(
 def check_count(
     name: str, value: object, minimum: int = 1, *, error: type[ValueError] = ValueError
 ) -> int:
-    """Check an integer that counts something.
+    """Check a whole number.
 
     **Arguments:**
     - `name`: name of the argument in the error message.
-    - `value`: value to check; NumPy's integers are welcome, truth values and floats are not.
+    - `value`: value to check; NumPy integers are allowed, truth values and floats are not.
     - `minimum`: smallest value allowed.
     - `error`: type of the error to raise.
     **Returns:** the value as a Python integer.

@@ -21,7 +21,7 @@ class UnknownNameError(ValueError):
 
 
 def nearest_names(name: object, known: Iterable[str]) -> str:
-    """Write the known names nearest to `name` as a question; empty if none is near."""
+    """Return the known names nearest to `name` as a question; empty if none is near."""
     near = difflib.get_close_matches(str(name), list(known), n=2, cutoff=0.5)
     return f"; did you mean {' or '.join(map(repr, near))}?" if near else ""
 
@@ -35,7 +35,7 @@ def unknown_name(kind: str, name: object, known: Iterable[str]) -> UnknownNameEr
 
 
 def missing_name(owner: str, kind: str, name: object, known: Iterable[str]) -> UnknownNameError:
-    """Make the error for `name`, which `owner` (`the trace`) should have and has not."""
+    """Make the error for a `name` that `owner` (`the trace`) should have but does not."""
     known = [str(k) for k in known]
     hint = nearest_names(name, known) or "."
     listing = f"It has: {', '.join(known)}." if known else f"It has no {kind} at all."
@@ -51,10 +51,9 @@ def check_names(kind: str, names: Iterable[str], known: Iterable[str]) -> None:
 
 
 def suggests_options(function: Callable[P, R]) -> Callable[P, R]:
-    """Let a misspelt keyword of `function` raise `UnknownNameError` with the nearest keywords.
+    """Make a misspelt keyword of `function` raise `UnknownNameError` with the nearest keywords.
 
-    Numbers of NumPy reach the function as Python's: arithmetic, JSON and JAX treat the two
-    differently.
+    NumPy numbers are converted to Python's, since arithmetic, JSON and JAX treat them differently.
     """
     known = list(inspect.signature(function).parameters)
 
@@ -100,4 +99,4 @@ def require(module: str, extra: str) -> Any:
             f"{module} {lacks} not installed: pip install 'verifai_jax[{extra}]'"
         ) from error
     except ImportError as error:
-        raise MissingExtra(f"{module} is installed and cannot be imported: {error}") from error
+        raise MissingExtra(f"{module} is installed but cannot be imported: {error}") from error

@@ -19,9 +19,9 @@ def counted(count: int, noun: str) -> str:
 
 
 def format_percent(share: float) -> str:
-    """Write a share as a percentage of three digits: `3.8 %`, `0.00171 %`, `>99.9 %`.
+    """Format a share as a percentage with three digits: `3.8 %`, `0.00171 %`, `>99.9 %`.
 
-    Only a share of exactly 1 is written `100 %`; one that is not finite is `unknown`.
+    Only a share of exactly 1 becomes `100 %`; one that is not finite becomes `unknown`.
     """
     if not math.isfinite(share):
         return "unknown"
@@ -33,7 +33,7 @@ def format_percent(share: float) -> str:
 
 
 def format_probability(probability: float) -> str:
-    """Write a probability with three digits, or with as many as tell it from 1: `0.99993`."""
+    """Format a probability with three digits, or more if needed to differ from 1: `0.99993`."""
     if 0.999 < probability < 1:
         digits = -math.floor(math.log10(1 - probability))
         return f"{probability:z.{digits}f}".rstrip("0")
@@ -41,9 +41,9 @@ def format_probability(probability: float) -> str:
 
 
 def format_time(seconds: float, digits: int = 6) -> str:
-    """Write an instant in seconds so that it can be told from its neighbours: `1700000003.5`.
+    """Format an instant in seconds with enough digits to distinguish samples: `1700000003.5`.
 
-    A few digits suffice up to 1000 s; of later instants the microseconds are kept.
+    Up to 1000 s a few digits suffice; later instants keep their microseconds.
     """
     if abs(seconds) < 1000 or not math.isfinite(seconds):
         return f"{seconds:z.{digits}g}"
@@ -59,14 +59,14 @@ STAMPS = 1e8
 
 
 def format_seconds(seconds: float, digits: int = 6) -> str:
-    """Write a time with its unit, from ten minutes on in those of a person: `11 h 3 min 0.5 s`.
+    """Format a time with its unit, in hours and minutes from ten minutes on: `11 h 3 min 0.5 s`.
 
-    Nothing is rounded away that `format_time` would write. Stamps, such as 1700000003.5 s since
-    1970, stay in seconds.
+    No digit that `format_time` would write is lost. Time stamps, such as 1700000003.5 s since 1970,
+    stay in seconds.
 
     **Arguments:**
     - `seconds`: instant or duration.
-    - `digits`: the digits of a duration below ten minutes.
+    - `digits`: number of digits of a duration below ten minutes.
     """
     if not LONG <= abs(seconds) < STAMPS:
         return f"{format_time(seconds, digits)} s"
@@ -86,14 +86,14 @@ MAX_ENTRIES = 4
 
 
 def format_features(features: Mapping[str, object], labels: Mapping[str, str] | None = None) -> str:
-    """Write features with four digits: `x0=0.1353, alg=sac, wind=16 values from -1 to 0.93`.
+    """Format features with four digits: `x0=0.1353, alg=sac, wind=16 values from -1 to 0.93`.
 
-    Of columns `wind[0]`, `wind[1]`, ... that are more than four only the range is written; parts of
-    items that do not exist, such as `cars[3].x`, are left out.
+    For more than four columns `wind[0]`, `wind[1]`, ... only the range is written; absent items,
+    such as `cars[3].x`, are left out.
 
     **Arguments:**
     - `features`: values by column.
-    - `labels`: names for people by column, where they differ.
+    - `labels`: readable names of columns, where they differ.
     """
     labels = labels or {}
     entries: dict[str, list[tuple[str, object]]] = {}
@@ -125,15 +125,15 @@ def _format_value(value: object) -> str:
 
 
 def format_error(error: BaseException) -> str:
-    """Write an exception in one line: its type and the first line of its message, shortened."""
+    """Format an exception in one line: its type and the first line of its message, shortened."""
     first = shorten((storable(error).splitlines() or [""])[0], MAX_MESSAGE_LENGTH)
     return f"{type(error).__name__}: {first}" if first else type(error).__name__
 
 
 def shorten(text: str, maximum: int = 60) -> str:
-    """Shorten a text to at most so many characters by leaving out some before its end.
+    """Shorten a text to at most this many characters, leaving out a part before its end.
 
-    The end of a name says more than its middle.
+    The end is kept because the end of a name is more specific than its middle.
     """
     return (
         text
@@ -147,13 +147,13 @@ MAX_MESSAGE_LENGTH = 500
 
 
 def printable(text: str, maximum: int | None = None) -> str:
-    r"""Write characters that steer a terminal as escapes: `\x1b[2J`, `\u202e`.
+    r"""Replace characters that control a terminal by escapes: `\x1b[2J`, `\u202e`.
 
-    Texts of systems, tables and files could otherwise clear the screen, or reorder what is on it.
+    Otherwise texts of systems, tables and files could clear the screen, or reorder its content.
     Line breaks and tabs stay.
 
     **Arguments:**
-    - `maximum`: characters that are kept, of its begin and its end; all when left out.
+    - `maximum`: maximum number of characters, from its start and its end; all when left out.
     """
     text = text if maximum is None else shorten(text, maximum)
     if text.isascii() and text.isprintable():
@@ -162,13 +162,13 @@ def printable(text: str, maximum: int | None = None) -> str:
 
 
 def storable(text: object, maximum: int = 2000) -> str:
-    r"""Return a text from a user's code in a form that files and sockets accept, of bounded length.
+    r"""Return a text from user code in a form that files and sockets accept, of bounded length.
 
-    A lone surrogate, which UTF-8 cannot hold, becomes its escape: `\ud800`.
+    A lone surrogate, which UTF-8 cannot encode, becomes its escape: `\ud800`.
 
     **Arguments:**
-    - `text`: the text; anything else is written by `str`.
-    - `maximum`: characters that are kept, of its beginning and its end.
+    - `text`: the text; other objects are converted by `str`.
+    - `maximum`: maximum number of characters, from its start and its end.
     """
     try:
         written = text if isinstance(text, str) else str(text)
@@ -180,7 +180,7 @@ def storable(text: object, maximum: int = 2000) -> str:
 
 
 def is_control(character: str) -> bool:
-    """Return whether a character breaks a line, or controls a terminal."""
+    """Return whether a character is a line break or controls a terminal."""
     return unicodedata.category(character) in ("Cc", "Zl", "Zp")
 
 
@@ -196,14 +196,14 @@ def _escaped(character: str) -> str:
 
 
 def one_line(text: str, maximum: int = MAX_MESSAGE_LENGTH) -> str:
-    """Write a text in one line of at most so many characters, safe for a terminal."""
+    """Convert a text to one line of at most this many characters, safe for a terminal."""
     return printable(" ".join(shorten(text, maximum).split()))
 
 
 def folder_name(text: str) -> str:
-    """Return a name for a folder, from a text that may hold anything: `a_b` of `../a/b`.
+    """Return a folder name made from any text: `a_b` from `../a/b`.
 
-    Letters, digits and a few signs stay; other characters become `_`, and at most 100 are kept.
+    Letters, digits and a few signs stay, others become `_`; at most 100 characters remain.
     """
     kept = "".join(c if c.isalnum() or c in " ._-+=,()" else "_" for c in shorten(text, 100))
     return kept.strip(" ._") or "unnamed"

@@ -30,17 +30,15 @@ _ELSE = "give another path"
 
 @contextlib.contextmanager
 def replacing(path: str | Path, *, locked: bool = False) -> Iterator[Path]:
-    """Yield the path of a file to write, which replaces the one at `path` once it is whole.
+    """Yield the path of a temporary file, which replaces the one at `path` when it is complete.
 
-    Its ending is that of `path`, which tells some libraries the format. Where writing fails, the
-    file that was at `path` stays, and nothing is left of the new one. Folders that it needs are
-    made.
+    It has the same file ending, from which some libraries infer the format. If writing fails, the
+    file at `path` stays, and the new one is removed. Missing folders are made.
 
     **Arguments:**
-    - `locked`: whether its folder is there and has no other writer. Then the file that a killed
-      process leaves has a name that does not change, and the next writer takes it.
-    **Raises:** `OSError` that names `path`, the reason and a remedy, for whatever the file system
-    refuses.
+    - `locked`: whether the folder exists and has no other writer. The temporary file then has a
+      fixed name, so that the next writer reuses the one that a killed process left.
+    **Raises:** `OSError` that names `path`, the reason and a remedy, if the file system refuses.
     """
     path = Path(path)
     # Several processes and threads may write it at once, such as tests of one problem.
@@ -60,9 +58,9 @@ def replacing(path: str | Path, *, locked: bool = False) -> Iterator[Path]:
 
 
 def append(path: Path, content: bytes) -> None:
-    """Append bytes to a file, all or none of them; folders that it needs are made.
+    """Append bytes to a file, all or none of them; missing folders are made.
 
-    **Raises:** `OSError` as `replacing`.
+    **Raises:** the `OSError` of `replacing`.
     """
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -73,7 +71,7 @@ def append(path: Path, content: bytes) -> None:
 
 
 def append_to(file: io.FileIO | io.BytesIO, content: bytes) -> int:
-    """Append bytes to an open file without a buffer, all or none; return where they begin.
+    """Append bytes to an unbuffered open file, all or none; return their position.
 
     **Raises:** `OSError` of the file system.
     """
@@ -92,10 +90,9 @@ def unwritable(path: str | Path, error: OSError, more: str = "") -> OSError:
     """Return the error for a file or folder that cannot be written.
 
     **Arguments:**
-    - `error`: the error of the file system; one of this function will do.
-    - `more`: what becomes of the results, as a sentence.
-    **Returns:** an error of the same kind and `errno`, whose message names the path, the reason
-    and a remedy.
+    - `error`: the error of the file system; one that this function made is accepted, too.
+    - `more`: a sentence on what happens to the results.
+    **Returns:** an error of the same kind and `errno` that names the path, the reason and a remedy.
     """
     rest = f"{_REMEDIES.get(error.errno or 0, _ELSE)}{f'. {more}' if more else ''}"
     kind = type(error) if type(error).__module__ == "builtins" else OSError
@@ -105,5 +102,5 @@ def unwritable(path: str | Path, error: OSError, more: str = "") -> OSError:
 
 
 def reason(error: OSError) -> str:
-    """Return the reason of the file system alone, such as `No space left on device`."""
+    """Return only the reason from the file system, such as `No space left on device`."""
     return os.strerror(error.errno) if error.errno else error.strerror or str(error)

@@ -32,17 +32,17 @@ _ABOUT = "about"
 
 
 class CacheError(ValueError):
-    """An error for a cache that is damaged, foreign, cannot be written, or is of other work."""
+    """An error for a cache that is damaged, foreign, not writable, or belongs to other work."""
 
 
 class Cache:
     """Finished work on disk.
 
     **Arguments:**
-    - `folder`: in which it is the file `sweep.cache` for a sweep; None keeps everything in this
-      process only.
-    - `kind`: of the work: `"sweep"` or `"augmentation"`.
-    **Raises:** `CacheError` for a file that is not a cache, or damaged.
+    - `folder`: the folder of the cache file, for example `sweep.cache` for a sweep; None stores
+      everything in this process only.
+    - `kind`: the kind of work: `"sweep"` or `"augmentation"`.
+    **Raises:** `CacheError` for a file that is not a cache, or is damaged.
     """
 
     def __init__(self, folder: str | Path | None = None, kind: str = "sweep") -> None:
@@ -68,15 +68,15 @@ class Cache:
         sources: Sources | None = None,
         even_if_changed: bool = False,
     ) -> tuple[Mapping[str, Any], ...]:
-        """Record the work that this cache belongs to, or refuse the cache of other work.
+        """Record which work this cache belongs to, or refuse the cache of other work.
 
         **Arguments:**
         - `fingerprint`: nested dictionaries of plain data.
-        - `sources`: what the work is made of; finished work of other files is refused too.
-        - `even_if_changed`: whether work of other files will do; it is recorded then.
-        **Returns:** what the work was made of when it began, and each time it went on with other
-        files; nothing without `sources`.
-        **Raises:** `CacheError` with the differences.
+        - `sources`: the files of the work; work finished with other files is refused too.
+        - `even_if_changed`: whether work with other files is accepted, and recorded.
+        **Returns:** the recorded files when the work began, and each time it continued with other
+        files; empty without `sources`.
+        **Raises:** `CacheError` that lists the differences.
         """
         given = json.loads(json.dumps(fingerprint))
         about = self.note(_ABOUT)
@@ -107,7 +107,7 @@ class Cache:
         return tuple(known)
 
     def note(self, name: str, value: object = None) -> Any:
-        """Return the plain data stored under a name, after storing `value` where one is given."""
+        """Return the plain data stored under a name, after storing `value` if it is given."""
         if value is not None:
             with self.writing():
                 self._log.put_json(f"{_NOTE}{name}", value)
@@ -130,7 +130,7 @@ class Cache:
     def remember(
         self, name: str, compute: Callable[[], Mapping[str, np.ndarray]]
     ) -> dict[str, np.ndarray]:
-        """Return the arrays of a computation, computed and stored where they are missing."""
+        """Return the arrays of a computation, computing and storing them if they are missing."""
         arrays = self.get(name)
         if arrays is None:
             self.put({name: {key: np.asarray(value) for key, value in compute().items()}})
@@ -140,7 +140,7 @@ class Cache:
         return arrays
 
     def reuse(self) -> dict[str, tuple[int, int]]:
-        """Count the entries that were here before this process, of all that it used, by kind.
+        """Count by kind the entries used by this process, and those that existed before it.
 
         The kind of an entry is its name up to the first slash.
         """
@@ -152,13 +152,13 @@ class Cache:
         return kinds
 
     def entries(self, prefix: str) -> Iterator[dict[str, np.ndarray]]:
-        """Yield the arrays of the finished computations whose names begin like this."""
+        """Yield the arrays of all finished computations whose names start with this prefix."""
         for name in self._log.names():
             if name.startswith(prefix) and (arrays := self._log.get(name)) is not None:
                 yield arrays
 
     def clear(self) -> None:
-        """Forget everything but what the cache is of."""
+        """Remove everything except the record of the work."""
         about = self._log.get_json(f"{_NOTE}{_ABOUT}")
         self._log.clear()
         if about is not None:
@@ -170,14 +170,14 @@ class Cache:
 
     @contextlib.contextmanager
     def writing(self, path: str | Path | None = None) -> Iterator[None]:
-        """Raise `CacheError` where the file system refuses the cache, or results at `path`."""
+        """Raise `CacheError` if the file system refuses the cache, or results at `path`."""
         try:
             yield
         except OSError as error:
             where = self.path if path is None else path
             raise CacheError(
                 f"{where} cannot be written: {reason(error)}; what was finished is in "
-                f"{'it' if path is None else self.path}: make room if the disk is full, and begin "
+                f"{'it' if path is None else self.path}: make room if the disk is full, and run it "
                 "again"
             ) from error
 
@@ -189,10 +189,10 @@ def cache_file(folder: Path, kind: str = "sweep") -> Path:
 
 @contextlib.contextmanager
 def locked_cache(folder: str | Path | None, kind: str = "sweep") -> Iterator[Cache]:
-    """Open a cache, and be the only one who writes to its folder.
+    """Open a cache, and lock its folder for this process.
 
-    **Raises:** `FolderInUse`, which names the process that writes to it; `ValueError` where it
-    cannot be written; as `Cache`.
+    **Raises:** `FolderInUse`, which names the process that has the lock; `ValueError` if the folder
+    cannot be written; the errors of `Cache`.
     """
     with write_lock(None if folder is None else Path(folder)):
         yield Cache(folder, kind)

@@ -24,24 +24,24 @@ _CHECKSUM = "checksum"
 
 
 class DamagedError(ValueError):
-    """An error for a file that is not as it was written."""
+    """An error for a file whose content is not as written."""
 
 
 def checksum(content: "bytes | memoryview | pa.Buffer", before: int = 0) -> int:
-    """Return the checksum of bytes (CRC-32), that of what comes `before` them included.
+    """Return the CRC-32 checksum of bytes, continued from that of the bytes `before` them.
 
-    It finds damage, not forgery: what a file holds is never executed, whoever wrote it.
+    It detects damage, not forgery; no content of files is ever executed.
     """
     return zlib.crc32(content, before)
 
 
 def write_complete(path: Path, content: "pa.Buffer | bytes", locked: bool = True) -> Path:
-    """Write a file such that a reader never meets a half of it; return its path.
+    """Write a file such that a reader never sees a part of it; return its path.
 
-    - `locked`: as of `replacing`. A folder that is gone stays so then: the files of a run are of
-      use together.
+    - `locked`: as in `replacing`. A missing folder is then not made again, since the files of a run
+      are useful only together.
 
-    **Raises:** `OSError` where it cannot be written, as `replacing`; what was at `path` stays.
+    **Raises:** the `OSError` of `replacing` if it cannot be written; the old file stays.
     """
     with replacing(path, locked=locked) as partial:
         partial.write_bytes(content)
@@ -50,16 +50,15 @@ def write_complete(path: Path, content: "pa.Buffer | bytes", locked: bool = True
 
 @contextlib.contextmanager
 def replacing_all(folder: Path, names: Sequence[str]) -> Iterator[Path]:
-    """Yield a folder for files that take the place of those in `folder` once all are whole.
+    """Yield a folder for files that replace those in `folder` together when all are complete.
 
-    So a full disk leaves what was there, and nothing of what was to come.
+    If the disk is full, the old files stay and no new one remains.
 
     **Arguments:**
-    - `folder`: which is there, and has no other writer.
-    - `names`: the names of all files and folders that belong together, also those that may be
-      missing. The last one is that without which the others are worth nothing: it goes first and
-      comes last.
-    **Raises:** `OSError` that names `folder`, for whatever the file system refuses.
+    - `folder`: an existing folder without another writer.
+    - `names`: the names of all files and folders that belong together, including optional ones. The
+      last is the one without which the others are useless: it is removed first and written last.
+    **Raises:** `OSError` that names `folder`, if the file system refuses.
     """
     *others, last = names
     try:
@@ -79,11 +78,11 @@ def replacing_all(folder: Path, names: Sequence[str]) -> Iterator[Path]:
 
 
 def write_record(path: Path, record: Mapping[str, Any], locked: bool = True) -> dict[str, Any]:
-    """Write plain data as JSON with a checksum, whole; return it as it is read back.
+    """Write plain data as JSON with a checksum, atomically; return it as it will be read back.
 
-    - `locked`: as of `write_complete`.
+    - `locked`: as in `write_complete`.
 
-    **Raises:** `OSError` where it cannot be written.
+    **Raises:** `OSError` if it cannot be written.
     """
     stored = json.loads(json.dumps(record))
     write_complete(path, f"{json.dumps(sealed(stored), indent=2)}\n".encode(), locked)
@@ -91,10 +90,10 @@ def write_record(path: Path, record: Mapping[str, Any], locked: bool = True) -> 
 
 
 def read_record(path: Path) -> dict[str, Any]:
-    """Read what `write_record` has written.
+    """Read data written by `write_record`.
 
-    **Raises:** `FileNotFoundError` for a missing file; `DamagedError` for anything that is not a
-    record, or not as it was written.
+    **Raises:** `FileNotFoundError` for a missing file; `DamagedError` for a file that is not a
+    record, or whose content has changed.
     """
     try:
         record = json.loads(path.read_text())
@@ -112,7 +111,7 @@ def read_record(path: Path) -> dict[str, Any]:
 
 
 def plain(value: object) -> Any:
-    """Convert data to what JSON can hold: arrays to lists, and what JSON lacks to text."""
+    """Convert data to JSON types: arrays become lists, and other types text."""
 
     def convert(each: Any) -> Any:
         return each.tolist() if hasattr(each, "tolist") else str(each)
@@ -126,6 +125,6 @@ def record_checksum(record: Mapping[str, Any]) -> int:
 
 
 def sealed(record: Mapping[str, Any]) -> dict[str, Any]:
-    """Return plain data with its checksum, as it stands in a file."""
+    """Return plain data together with its checksum, as stored in a file."""
     content = {name: value for name, value in record.items() if name != _CHECKSUM}
     return {**content, _CHECKSUM: record_checksum(content)}

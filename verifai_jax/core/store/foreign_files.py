@@ -8,9 +8,9 @@ from verifai_jax.core.messages.errors import require
 
 
 def read_xml(data: bytes, name: str) -> Element:
-    """Read XML that may come from anywhere.
+    """Read XML from an untrusted source.
 
-    **Raises:** `ValueError` for text that is not XML, and for a document type, which can declare
+    **Raises:** `ValueError` for a text that is not XML, and a document type, which can declare
     entities.
     """
 
@@ -30,7 +30,7 @@ def read_xml(data: bytes, name: str) -> Element:
 
 
 def read_yaml(text: str) -> object:
-    """Read YAML without tags of Python.
+    """Read YAML without Python tags.
 
     **Raises:** `ValueError` for anything else; `MissingExtra` without PyYAML.
     """
@@ -42,5 +42,5 @@ def read_yaml(text: str) -> object:
 
 
 def write_yaml(value: object) -> str:
-    """Return YAML that `read_yaml` reads again."""
+    """Return a YAML text that `read_yaml` can read."""
     return require("yaml", "yaml").safe_dump(value, sort_keys=False, allow_unicode=True)

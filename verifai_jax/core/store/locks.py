@@ -48,7 +48,7 @@ if hasattr(os, "register_at_fork"):
 
 @contextlib.contextmanager
 def write_lock(folder: Path | None) -> Iterator[None]:
-    """Be the only one who writes to a folder, which is made; with None, nothing is locked.
+    """Lock a folder for writing by this process, making it if needed; None locks nothing.
 
     **Raises:** `FolderInUse`, which names the process that has the lock; `ValueError` for a folder
     that cannot be written.
@@ -73,7 +73,7 @@ def write_lock(folder: Path | None) -> Iterator[None]:
 
 @contextlib.contextmanager
 def writing(folder: Path | None) -> Iterator[None]:
-    """Turn what a file system refuses into one line that says what to do."""
+    """Convert errors of the file system into one line with a remedy."""
     try:
         yield
     except OSError as error:

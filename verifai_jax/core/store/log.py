@@ -47,7 +47,7 @@ class Log:
     """The entries of a file; see the module's docstring.
 
     **Arguments:**
-    - `path`: the file, which is made when the first entry is put; None keeps them in this process.
+    - `path`: the file, made when the first entry is written; None stores entries in this process.
     """
 
     def __init__(self, path: Path | None) -> None:
@@ -59,9 +59,9 @@ class Log:
         self._damaged = False
 
     def put(self, entries: Mapping[str, Arrays]) -> None:
-        """Append entries, all or none of them; they take the place of earlier ones of their names.
+        """Append entries, all or none of them; they replace earlier ones with the same names.
 
-        **Raises:** `TypeError` for arrays of objects; `OSError` where they cannot be written.
+        **Raises:** `TypeError` for arrays of objects; `OSError` if they cannot be written.
         """
         frame = _encode(entries)
         try:
@@ -79,14 +79,14 @@ class Log:
             self._extents.update(_extents(frame, begin))
 
     def get(self, name: str) -> dict[str, np.ndarray] | None:
-        """Return an entry; None for a missing or damaged one."""
+        """Return an entry; None if it is missing or damaged."""
         if (extent := self._index().get(name)) is None:
             return None
         with self._opened() as file:
             return _decode(file, extent)
 
     def entries(self) -> Iterator[tuple[str, dict[str, np.ndarray]]]:
-        """Yield all entries with their names, in the order in which they came first."""
+        """Yield all entries with their names, in the order in which the names first appeared."""
         if extents := [*self._index().items()]:
             with self._opened() as file:
                 for name, extent in extents:
@@ -96,18 +96,18 @@ class Log:
     def put_json(self, name: str, value: object) -> None:
         """Append plain data as an entry.
 
-        **Raises:** `OSError` where it cannot be written.
+        **Raises:** `OSError` if it cannot be written.
         """
         self.put({name: {_JSON: np.frombuffer(json.dumps(value).encode(), np.uint8)}})
 
     def get_json(self, name: str) -> Any:
-        """Return the plain data of an entry; None for a missing or damaged one."""
+        """Return the plain data of an entry; None if it is missing or damaged."""
         entry = self.get(name)
         with contextlib.suppress(ValueError, KeyError, RecursionError):
             return None if entry is None else json.loads(entry[_JSON].tobytes())
 
     def names(self) -> list[str]:
-        """Return the names of all entries, in the order in which they came first."""
+        """Return the names of all entries, in the order in which they first appeared."""
         return [*self._index()]
 
     @property
@@ -124,7 +124,7 @@ class Log:
             self.path.unlink(missing_ok=True)
 
     def close(self) -> None:
-        """Close the file; what is put later opens it again."""
+        """Close the file; the next entry opens it again."""
         close, self._close_file, self._file = self._close_file, None, None
         if close is not None:
             close()
@@ -154,9 +154,9 @@ class Log:
 
 
 def write_log(path: Path, entries: Mapping[str, Arrays]) -> None:
-    """Put a log of these entries in place of the one at `path`, never half of it.
+    """Replace the log at `path` by one with these entries, atomically.
 
-    **Raises:** as `Log.put`.
+    **Raises:** the errors of `Log.put`.
     """
     write_complete(path, _encode(entries) if entries else b"")
 

@@ -24,11 +24,11 @@ _NUMBERS = itertools.count()
 
 
 class CSVLogger:
-    """A CSV file with a row a call: the step, then the values; a cell without a value is empty.
+    """A logger that writes a CSV file: a row for each call, with the step and the values.
 
     **Arguments:**
-    - `path`: the path of the file; one that is there is continued.
-    **Raises:** `ValueError` for a file that is there and has no column `step`.
+    - `path`: the path of the file; an existing one is continued. Cells without a value are empty.
+    **Raises:** `ValueError` for an existing file without a column `step`.
     """
 
     def __init__(self, path: str | Path) -> None:
@@ -64,15 +64,15 @@ class CSVLogger:
 
 
 class TensorBoardLogger:
-    """Scalars in an event file, which `tensorboard --logdir FOLDER` shows.
+    """A logger that writes scalars to an event file, which `tensorboard --logdir FOLDER` shows.
 
-    The file is written without TensorBoard or TensorFlow: records of a length, the event as a
+    It needs neither TensorBoard nor TensorFlow: records consist of a length, the event as a
     protocol buffer, and their checksums (tensorflow/core/lib/io/record_writer.cc,
     tensorflow/core/util/event.proto).
 
     **Arguments:**
-    - `folder`: the folder of the event file; each logger begins a file of its own in it.
-    - `prefix`: before the names of values, such as `"falsify/"`.
+    - `folder`: the folder of the event file; each logger starts its own file.
+    - `prefix`: a prefix for the names of values, such as `"falsify/"`.
     """
 
     def __init__(self, folder: str | Path, prefix: str = "") -> None:

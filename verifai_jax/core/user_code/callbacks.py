@@ -24,12 +24,10 @@ Callback: TypeAlias = Callable[[int, dict[str, float]], object]
 def check_callbacks(callbacks: Iterable[Callback]) -> tuple[Callback, ...]:
     """Return the callbacks as a tuple.
 
-    **Raises:** `TypeError` for something that cannot be called.
+    **Raises:** `TypeError` for an object that cannot be called.
     """
     if callable(callbacks):
-        raise TypeError(
-            f"callbacks must be a list of functions; got {callbacks!r}, so [it] will do"
-        )
+        raise TypeError(f"callbacks must be a list of functions; got {callbacks!r}, so write [it]")
     result = tuple(callbacks)
     for callback in result:
         if not callable(callback):
@@ -41,7 +39,7 @@ def check_callbacks(callbacks: Iterable[Callback]) -> tuple[Callback, ...]:
 
 
 def notify(callbacks: Iterable[Callback], step: int, values: Values) -> None:
-    """Call the callbacks with a step and the values that are numbers, each with its own copy."""
+    """Call each callback with a step and its own copy of the numeric values."""
     # What is not a number, as the return of no episode, is left out: loggers store it as one.
     known = {name: value for name, value in values.items() if value == value}
     for callback in callbacks:

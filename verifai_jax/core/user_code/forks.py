@@ -7,9 +7,9 @@ from collections.abc import Iterator
 
 @contextlib.contextmanager
 def returning_once() -> Iterator[None]:
-    """Run code of the user that may fork: only the process that entered goes on after it.
+    """Run user code that may fork, and continue only in the original process.
 
-    A copy of this process that comes back, as where an `exec` fails, ends without a word: it would
+    A forked copy that returns, for example because `exec` failed, ends silently: otherwise it would
     answer for its parent, and write into the folder of its parent's run.
     """
     owner = os.getpid()

@@ -37,7 +37,7 @@ documents: set[str] = set()
 
 
 def watch() -> None:
-    """Note from now on which files are opened; once for a process, whatever the number of calls."""
+    """Start recording which files are opened; later calls in a process have no effect."""
     global _watching
     if not _watching:
         _watching = True
@@ -54,7 +54,7 @@ def files_read_by(module: str) -> set[str]:
 
 
 def modules_loaded_by(module: str) -> set[str]:
-    """Return the files of modules that a module was the first to import, by whatever name.
+    """Return the files of the modules that a module was the first to import.
 
     **Arguments:**
     - `module`: path of its file.

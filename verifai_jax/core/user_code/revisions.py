@@ -51,13 +51,13 @@ def commit_of(revision: str) -> str:
 
 @contextlib.contextmanager
 def load_at_revision(target: str, kind: type[Kind]) -> Iterator[Kind]:
-    """Load the object that a target names, at its revision if it has one.
+    """Load the object named by a target, at its revision if it has one.
 
     **Arguments:**
-    - `target`: `FILE.py:NAME`, or `FILE.py:NAME@REVISION` with any name of a commit that git knows.
+    - `target`: `FILE.py:NAME`, or `FILE.py:NAME@REVISION` with any revision that git knows.
     - `kind`: class of the object.
-    **Returns:** a context with the object; the files of the revision are removed at its end.
-    **Raises:** `TargetError` for an unknown revision, outside of a repository, and as
+    **Returns:** a context with the object; at its end the files of the revision are removed.
+    **Raises:** `TargetError` for an unknown revision, or without a repository; the errors of
     `load_target`.
     """
     plain, revision = split_revision(target)
@@ -129,7 +129,7 @@ def _imported_from(root: Path, tree: Path, inner: Path) -> Iterator[None]:
 
 
 def lies_in(module: object, folder: Path) -> bool:
-    """Return whether a module was imported from a folder; never one of this package."""
+    """Return whether a module was imported from a folder; never true for this package."""
     name = getattr(module, "__name__", None) or ""
     if name.partition(".")[0] in (_OWN, "__main__"):
         return False

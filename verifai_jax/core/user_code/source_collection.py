@@ -68,7 +68,7 @@ class Import(NamedTuple):
 
 
 class Scan(NamedTuple):
-    """The imports of a program, and the texts in it that may be names of files."""
+    """The imports of a program, and the texts in it that may be file names."""
 
     imports: tuple[Import, ...]
     texts: tuple[str, ...]
@@ -76,7 +76,7 @@ class Scan(NamedTuple):
 
 @lru_cache(maxsize=512)
 def scan(program: bytes) -> Scan:
-    """Read a program; nothing is found in one that is not Python."""
+    """Parse a program; the result is empty if it is not Python."""
     try:
         tree = ast.parse(program)
     except (SyntaxError, ValueError, RecursionError):
@@ -147,10 +147,10 @@ def _operands(node: ast.expr) -> Iterator[ast.expr]:
 
 
 def files_of_model(model: Path) -> list[Path]:
-    """Return the files that a model in XML refers to: includes, meshes, textures, height fields.
+    """Return the files to which an XML model refers: includes, meshes, textures, height fields.
 
     **Arguments:**
-    - `model`: the file; one that is not a model refers to none.
+    - `model`: the model's file; a file that is not a model refers to none.
     """
     found: dict[Path, None] = {}
     waiting, folders = [model.resolve()], {model.resolve().parent: None}
@@ -176,9 +176,9 @@ def files_of_model(model: Path) -> list[Path]:
 
 
 def made_here() -> tuple[Maker, ...]:
-    """Return the user's modules on the stack, from the innermost one to the import of the last.
+    """Return the user's modules on the call stack, from the innermost to the last import.
 
-    What imports the module that makes a problem has no part in it.
+    Modules that import the one that makes a problem are not part of it.
     """
     found: dict[str, Maker] = {}
     frame = sys._getframe(1)
@@ -199,12 +199,12 @@ def made_here() -> tuple[Maker, ...]:
 
 
 def sources_of(*things: object, made: Sequence[Maker] = (), first: int = 0) -> Sources:
-    """Return what some objects are made of, as it is imported, and as data lie on the disk.
+    """Return the files and versions of some objects: code as imported, data as on disk.
 
     **Arguments:**
-    - `things`: such as a problem; their functions, classes and files count.
-    - `made`: where they were made, as `made_here` returned it there.
-    - `first`: the row of a table from which on that holds.
+    - `things`: objects such as a problem; their functions, classes and files are included.
+    - `made`: the modules in which they were made, from `made_here`.
+    - `first`: the first row of a table to which they apply.
     """
     collector = _Collector()
     for maker in made:
@@ -270,7 +270,7 @@ class _Collector:
         try:
             self.data[file] = Source(shown_path(file), role, sha256 or file_hash(Path(file)))
         except OSError:
-            self.without_file.append(f"{shown_path(file)} cannot be read, and is not recorded")
+            self.without_file.append(f"{shown_path(file)} cannot be read, and was not recorded")
 
     def add_function(self, function: Function) -> None:
         where = "notebook" if is_notebook_cell(function.file) else "no file"

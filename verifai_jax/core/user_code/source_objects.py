@@ -33,14 +33,14 @@ _PLAIN = (bool, int, float, complex, str, bytes, type(None))
 
 
 class Module(NamedTuple):
-    """A user's module: its path, and what stands for it until it is imported again."""
+    """A user's module: its path, and an object that represents it until it is imported again."""
 
     file: str
     owner: object
 
 
 class Function(NamedTuple):
-    """A function that is in no file: its name, where it says it is from, and a hash of its text."""
+    """A function without a file: its name, its claimed origin, and a hash of its text."""
 
     name: str
     file: str
@@ -48,7 +48,7 @@ class Function(NamedTuple):
 
 
 class OwnFiles(NamedTuple):
-    """The files that an object says it was read from, with their hashes at that time."""
+    """The files from which an object says it was read, with their hashes at that time."""
 
     files: Mapping[str, str]
 
@@ -57,7 +57,7 @@ Part: TypeAlias = Module | Function | OwnFiles
 
 
 def parts_of(things: object) -> Iterator[Part]:
-    """Return what objects are made of, once each."""
+    """Return the parts of objects, each once."""
     waiting: list[object] = [things]
     kept: dict[int, object] = {}  # So that their identities stay theirs.
     while waiting and len(kept) < MAX_OBJECTS:
@@ -212,13 +212,13 @@ _INSTALLED = ("site-packages", "dist-packages")
 
 
 def is_notebook_cell(file: str) -> bool:
-    """Return whether a name stands for the cell of a notebook."""
+    """Return whether a name is that of a notebook cell."""
     return "ipykernel_" in file or file.startswith("<ipython")
 
 
 @cache
 def is_user_file(file: str) -> bool:
-    """Return whether a file is a user's: neither this package nor Python nor installed."""
+    """Return whether a file is a user's: not of this package, Python, or an installed package."""
     if file.startswith("<") and not file.startswith(("<stdin", "<string", "<ipython")):
         return False
     if "ipykernel_" in file:
@@ -231,7 +231,7 @@ def is_user_file(file: str) -> bool:
 
 @cache
 def library_prefixes() -> tuple[str, ...]:
-    """Return the beginnings of paths of Python's files and of most that are installed."""
+    """Return path prefixes of Python's files and of most installed packages."""
     return tuple(f"{folder}{os.sep}" for folder in _libraries())
 
 

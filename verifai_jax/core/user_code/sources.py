@@ -50,7 +50,7 @@ tree_commits: dict[Path, str] = {}
 class Source(NamedTuple):
     """A file by its name, its role, and the SHA-256 of its content.
 
-    The name is the path from the working directory, absolute where the file lies elsewhere.
+    The name is relative to the working directory, or absolute if the file lies elsewhere.
     """
 
     name: str
@@ -84,15 +84,14 @@ class Change(NamedTuple):
 
 @dataclass(frozen=True)
 class Sources:
-    """The files and versions that a result was made of, as they were then.
+    """The files and versions from which a result was made, at that time.
 
     - `files`: the files of the model, with their hashes.
-    - `versions`: by the name of the package.
-    - `without_file`: what of the model is in no file, such as cells of a notebook.
-    - `root`: the working directory, from which names of files go out.
-    - `first`: the row of a table from which on this is what it was made of.
-    - `commit`: the commit of git, at which the files were taken; empty for those of the working
-      directory.
+    - `versions`: versions by the name of the package.
+    - `without_file`: parts of the model that are in no file, such as notebook cells.
+    - `root`: the working directory, to which names of files are relative.
+    - `first`: the first row of the table to which they apply.
+    - `commit`: the git commit of the files; empty for those of the working directory.
     """
 
     files: tuple[Source, ...]
@@ -115,9 +114,9 @@ class Sources:
 
     @classmethod
     def from_json(cls, data: Mapping[str, Any]) -> "Sources":
-        """Read what `to_json` wrote.
+        """Read the output of `to_json`.
 
-        **Raises:** `ValueError` for anything else.
+        **Raises:** `ValueError` for other data.
         """
         try:
             files = tuple(Source(*map(str, file)) for file in data["files"])
@@ -129,11 +128,10 @@ class Sources:
             raise ValueError("the record of the files of a model has another form") from error
 
     def settled(self, begun: float) -> "Sources":
-        """Return it at the end of the work that it is the record of.
+        """Return the record as it should be at the end of the work.
 
-        Files of data that have been written since the work began are what came of it, such as the
-        state of a simulator, and no part of the model. Files that were read by then are, and
-        modules that were imported by then.
+        Data files written since the work began are its results, such as the state of a simulator,
+        and not part of the model. Files read and modules imported meanwhile are added.
 
         **Arguments:**
         - `begun`: seconds since the epoch.
@@ -167,20 +165,20 @@ class Sources:
 
     @property
     def code(self) -> str:
-        """One hash of the modules, functions and models.
+        """A common hash of the modules, functions and models.
 
-        Data that these read or name are not in it: they may be finished work that is written there.
+        It does not include data files that these read or name: they may be results written there.
         """
         roles = (PROBLEM, IMPORTED, FUNCTION, MODEL)
         hashes = sorted(file.sha256 for file in self.files if file.role in roles)
         return hashlib.sha256("\n".join(hashes).encode()).hexdigest()
 
     def changes(self, now: "Sources | None" = None) -> tuple[Change, ...]:
-        """Return the files that are others by now.
+        """Return the files that have changed.
 
         **Arguments:**
-        - `now`: what the problem is made of now; what lies on the disk counts when left out, and
-          for files that the problem of now does not have.
+        - `now`: the present sources of the problem. When left out, and for files that these do not
+          include, the files on disk are compared.
         """
         if self.commit:
             return ()  # It stays what it is.
@@ -202,7 +200,7 @@ class Sources:
         return tuple(found)
 
     def other_versions(self, now: "Sources") -> tuple[str, ...]:
-        """Return the packages whose version has changed, as text."""
+        """Describe the packages whose version has changed."""
         return tuple(
             f"{name} {was} then, {now.versions[name]} now"
             for name, was in self.versions.items()
@@ -223,7 +221,7 @@ def _same_name(name: str, others: Mapping[str, Source]) -> str | None:
 
 
 def list_changes(changes: Sequence[Change]) -> str:
-    """Write changes in one line."""
+    """Describe changes in one line."""
     listed = ", ".join(map(str, changes[:MAX_SHOWN]))
     more = len(changes) - MAX_SHOWN
     return f"{listed} and {more} more" if more > 0 else listed
@@ -233,7 +231,7 @@ def list_changes(changes: Sequence[Change]) -> str:
 
 
 def file_hash(file: Path) -> str:
-    """Return the SHA-256 of a file; read again only where its size or its time has changed."""
+    """Return the SHA-256 of a file; it is read again only if its size or time has changed."""
     about = os.stat(file)
     return _hash(os.path.abspath(file), about.st_mtime_ns, about.st_size, about.st_ino)
 
@@ -245,7 +243,7 @@ def _hash(file: str, changed: int, size: int, number: int) -> str:
 
 
 def versions() -> dict[str, str]:
-    """Return the versions of Python, of this package and of others that are imported."""
+    """Return the versions of Python, of this package and of other imported packages."""
     found = {"Python": platform.python_version()}
     for name in PACKAGES:
         version = getattr(sys.modules.get(name), "__version__", None)
@@ -264,12 +262,12 @@ def shown_path(file: str) -> str:
 
 
 def add_tree(folder: Path, commit: str) -> None:
-    """Let names of files below a folder go out from there, and imports of them be found there."""
+    """Make names of files below a folder relative to it, and imports of them possible."""
     tree_commits[folder] = commit
 
 
 def remove_tree(folder: Path) -> None:
-    """End what `add_tree` began."""
+    """Undo `add_tree`."""
     del tree_commits[folder]
 
 

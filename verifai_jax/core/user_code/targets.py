@@ -31,31 +31,31 @@ Kind = TypeVar("Kind", bound=Named)
 
 
 class TargetError(ValueError):
-    """A target that cannot be loaded, or that is not a file of the user's own project."""
+    """An error for a target that cannot be loaded, or is not a file of the user's own project."""
 
 
 class NothingDefined(TargetError):
-    """A file or module without an object of the kind that was looked for."""
+    """An error for a file or module without an object of the requested kind."""
 
 
 def definitions(location: str, *kinds: type[Kind]) -> dict[str, Kind]:
     """Return the objects of some classes that a file or module defines.
 
     **Arguments:**
-    - `location`: file (`specs/cartpole.py`) or module (`specs.cartpole`); it is run.
+    - `location`: a file (`specs/cartpole.py`) or module (`specs.cartpole`), which is run.
     - `kinds`: classes to look for.
-    **Returns:** the objects in the order of their definition, by their names; by their variables,
-    where several have one name.
-    **Raises:** `TargetError` where there is no such file or module, or it cannot be run;
-    `NothingDefined` where it defines no such object.
+    **Returns:** the objects in the order of their definition, by their names, or by their variables
+    if several have the same name.
+    **Raises:** `TargetError` if there is no such file or module, or it cannot be run;
+    `NothingDefined` if it defines no such object.
     """
     return _by_name(_variables(location, *kinds))
 
 
 def values_in(location: str) -> tuple[object, ...]:
-    """Return all values that a file or module defines; it is run.
+    """Return all values that a file or module defines, by running it.
 
-    **Raises:** `TargetError` where there is no such file or module, or it cannot be run.
+    **Raises:** `TargetError` if there is no such file or module, or it cannot be run.
     """
     return tuple(vars(_import(location)).values())
 
@@ -83,14 +83,14 @@ def _by_name(variables: dict[str, Kind]) -> dict[str, Kind]:
 
 
 def load_target(target: str, kind: type[Kind]) -> Kind:
-    """Load the object that a target names.
+    """Load the object named by a target.
 
     **Arguments:**
-    - `target`: `FILE.py:NAME` or `MODULE:NAME`, with the name of the object or of its variable;
-      the name may be left out where the file defines one object of this kind.
+    - `target`: `FILE.py:NAME` or `MODULE:NAME`, with the name of the object or of its variable; the
+      name may be left out if the file defines only one object of this kind.
     - `kind`: class of the object.
-    **Raises:** `TargetError` where there is no such file or module, or no single object to take;
-    `UnknownNameError` for a name that the file does not define, with those that it does.
+    **Raises:** `TargetError` if there is no such file or module, or not exactly one object without
+    a name; `UnknownNameError` for a name that the file does not define, with those that it does.
     """
     location, colon, name = target.rpartition(":")
     if not colon:
@@ -116,16 +116,16 @@ def load_target(target: str, kind: type[Kind]) -> Kind:
 def target_of_project(target: object, folder: Path, *, kind: str, remedy: str) -> str:
     """Return a recorded target if it names a file of the user's own project.
 
-    Loading a target runs its file, so a folder that came from elsewhere must not choose one: the
-    target is the path of a Python file that exists, below the current folder, and outside of
-    whatever holds results: the folder that names it, those next to and above it, any that is called
-    `runs` or `sweeps`, and any with the files of a run or a sweep.
+    Loading a target runs its file, so a folder from elsewhere must not choose one. The target must
+    be the path of an existing Python file below the current folder, and outside all folders of
+    results: the folder that names it, its siblings and parents, any folder called `runs` or
+    `sweeps`, and any with the files of a run or a sweep.
 
     **Arguments:**
-    - `target`: the target that the folder records, of any type.
-    - `folder`: folder that records it.
+    - `target`: the target recorded in the folder, of any type.
+    - `folder`: the folder that records it.
     - `kind`: noun of the object, such as `"problem"`, for the message.
-    - `remedy`: words on how to name the target by hand, for the message.
+    - `remedy`: words for the message that say how to name the target by hand.
     **Raises:** `TargetError` for any other target.
     """
     if isinstance(target, str):

@@ -61,19 +61,19 @@ TRACING: tuple[tuple[type[Exception], str], ...] = (
     ),
     (
         jax.errors.NonConcreteBooleanIndexError,
-        f"it selects entries by a condition, and {ONCE_FOR_ALL}, so neither is their number. Use "
+        f"it selects entries by a condition, and {ONCE_FOR_ALL}, nor is the number of entries. Use "
         "jnp.where(condition, values, other)",
     ),
     (
         jax.errors.UnexpectedTracerError,
-        "it uses a value that was kept from another call, in a variable outside the function or "
-        "an attribute. Return such values, and hand them on as state or memory",
+        "it uses a value from another call, stored in a variable outside the function or in an "
+        "attribute. Return such values, and pass them on as state or memory",
     ),
     (
         jax.errors.ConcretizationTypeError,
-        f"it needs a plain number, as float(), int(), .item(), range() and the math module do, and "
-        f"{ONCE_FOR_ALL}. Leave out float() and .item(), use jnp in place of math, and "
-        "jax.lax.fori_loop for a number of turns",
+        "it needs a plain number, as float(), int(), .item(), range() and the math module do, and "
+        f"{ONCE_FOR_ALL}. Leave out float() and .item(), use jnp instead of math, and "
+        "jax.lax.fori_loop for loops",
     ),
 )
 """Errors of JAX about values that it traces, each with what to do; the special before the general.
@@ -84,13 +84,13 @@ WRITES = (
 )
 TRACING_BY_WORDS = {
     "Shapes must be 1D sequences of concrete": (
-        f"it makes an array of a length that is a value, and {ONCE_FOR_ALL}. Take the greatest "
-        "length there can be, and jnp.where(jnp.arange(most) < length, values, other)"
+        f"it makes an array whose length is a value, and {ONCE_FOR_ALL}. Use the greatest possible "
+        "length, and jnp.where(jnp.arange(maximum) < length, values, other)"
     ),
     # The first are the words of JAX 0.10, the second of 0.12.
     "Slice entries must be static|Array slice indices must have static": (
-        f"it cuts out a piece whose ends are values, and {ONCE_FOR_ALL}. Use "
-        "jax.lax.dynamic_slice for a piece of one length, or jnp.where over all entries"
+        f"it slices with values as ends, and {ONCE_FOR_ALL}. Use jax.lax.dynamic_slice for a slice "
+        "of fixed length, or jnp.where over all entries"
     ),
     r"Tracer\.__format__": (
         f"it writes a value into a text, and {ONCE_FOR_ALL}. Use jax.debug.print to see values"
@@ -106,9 +106,9 @@ TRACING_BY_WORDS = {
 class UserLine(NamedTuple):
     """A line of a user's file.
 
-    - `file`: its path, relative where it lies below the working directory.
-    - `line`: its number.
-    - `function`: name of the function around it.
+    - `file`: its path, relative if it lies below the working directory.
+    - `line`: its line number.
+    - `function`: name of the enclosing function.
     - `code`: the text of the line; empty if the file cannot be read.
     """
 
@@ -123,13 +123,13 @@ class UserLine(NamedTuple):
 
 
 def user_line(error: BaseException) -> UserLine | None:
-    """Return the innermost line of the user's own code that an error passed; None without one."""
+    """Return the innermost line of user code in an error's traceback; None if there is none."""
     step = _user_step(error)
     return None if step is None else _line(step.tb_frame.f_code, step.tb_lineno)
 
 
 def defined_at(function: Callable[..., object] | None) -> str:
-    """Write where a function is defined, ` (sim.py, line 3)`; empty if it is not known."""
+    """Write where a function is defined, ` (sim.py, line 3)`; empty if unknown."""
     code = getattr(getattr(function, "__wrapped__", function), "__code__", None)
     if not isinstance(code, CodeType) or not is_user_file(code.co_filename):
         return ""
@@ -139,13 +139,13 @@ def defined_at(function: Callable[..., object] | None) -> str:
 def check_called_with(
     role: str, function: Callable[..., object] | None, arguments: Sequence[str]
 ) -> None:
-    """Check that a function of a user takes the positional arguments that it will be called with.
+    """Check that a user's function accepts the positional arguments with which it will be called.
 
     **Arguments:**
-    - `role`: what the function is, for the message: "dynamics".
-    - `function`: what was given; None if nothing was.
+    - `role`: the role of the function, for the message: "dynamics".
+    - `function`: the function; None if none was given.
     - `arguments`: names of the arguments.
-    **Raises:** `ValueError`, with what it takes and where it is defined.
+    **Raises:** `ValueError`, with the arguments that it accepts and the place of its definition.
     """
     if function is None:
         return
@@ -164,11 +164,10 @@ def check_called_with(
 
 
 def source_line(traceback: object) -> str | None:
-    """Return the user's line at which JAX recorded an operation; None if it is not known.
+    """Return the user's line at which JAX recorded an operation; None if unknown.
 
     **Arguments:**
-    - `traceback`: the traceback of the operation, as JAX keeps it: frames from the innermost one
-      on.
+    - `traceback`: the traceback of the operation in JAX, with the innermost frame first.
     """
     for frame in getattr(traceback, "frames", ()):
         if is_user_file(frame.file_name):
@@ -179,11 +178,11 @@ def source_line(traceback: object) -> str | None:
 def explain_user_error(
     error: BaseException, features: object = None, *, system: bool = True, native: bool = False
 ) -> str:
-    """Write what failed in a user's code, at which line, and the remedy, in one line.
+    """Explain an error in user code in one line: what failed, where, and the remedy.
 
     **Arguments:**
-    - `error`: as the code raised it.
-    - `features`: that the code was called with, to tell a misspelt one from another missing key.
+    - `error`: the error raised by the code.
+    - `features`: the features passed to the code, to recognise a misspelt name.
     - `system`: whether the code belongs to a system, which could also run as a black box.
     - `native`: whether that system could run natively, with a controller in Python.
     """
@@ -202,9 +201,9 @@ def explain_user_error(
 
 
 def format_user_error(error: BaseException) -> str:
-    """Write an error in one bounded line: its type, what it says, and the user's line.
+    """Format an error in one bounded line: its type, message, and the user's line.
 
-    `RuntimeError: no road (sim.py, line 12, in simulate)`.
+    For example `RuntimeError: no road (sim.py, line 12, in simulate)`.
     """
     line = user_line(error)
     return storable(f"{_said(error)}{'' if line is None else f' ({line})'}")
@@ -312,9 +311,9 @@ def _same_names(one: Mapping[Any, Any], other: object) -> bool:
 
 
 def raised_in_callback(error: BaseException) -> str | None:
-    """Return the error of a function that JAX calls on the host, and its line, or None.
+    """Return the error of a function that JAX called on the host, with its line; or None.
 
-    JAX has the whole traceback as the text of an error of its own.
+    JAX only has the traceback as the text of its own error.
     """
     if type(error).__name__ not in ("JaxRuntimeError", "XlaRuntimeError"):
         return None

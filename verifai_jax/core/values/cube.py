@@ -11,21 +11,21 @@ from jaxtyping import Array, Float, Int
 
 @dataclass(frozen=True)
 class Cube:
-    """The unit cube `[0, 1]^d` with the prior uniform on it.
+    """The unit cube `[0, 1]^d` with the uniform prior.
 
     **Arguments:** for each coordinate
-    - `levels`: 0 if it is continuous, or the number `n >= 1` of its cells, inside which points
-      mean the same.
+    - `levels`: 0 if it is continuous, or its number `n >= 1` of cells; all points of a cell are
+      equivalent.
     - `weights`: the probabilities of its cells, which are their widths; None if they are equal.
     - `ordered`: whether its cells have an order; all of them when left out.
-    - `names`: what it is called, such as `cars[0].x`; nothing when left out.
+    - `names`: its name, such as `cars[0].x`; no names when left out.
 
     and `lengths`: which coordinates are lengths of arrays, on which others depend; `signals`: the
     coordinates of each function of time, in the order of its control points; `sequences`: arrays
-    of which items can be put in and taken out, each as its length's coordinate, the first one of
-    its items, how many an item has, and the number of items at most.
+    whose items can be inserted and removed, each given by the coordinate of its length, the first
+    coordinate of its items, the number of coordinates of an item, and the maximum number of items.
 
-    **Raises:** `ValueError` for a negative level, or entries that do not go with the levels.
+    **Raises:** `ValueError` for a negative level, or entries that do not match the levels.
     """
 
     levels: tuple[int, ...]
@@ -83,7 +83,7 @@ class Cube:
         )
 
     def take(self, indices: tuple[int, ...]) -> "Cube":
-        """Return the cube of these coordinates alone."""
+        """Return the cube with only these coordinates."""
         return Cube(
             levels=tuple(self.levels[i] for i in indices),
             weights=tuple(self.weights[i] for i in indices),
@@ -98,7 +98,7 @@ class Cube:
         )
 
     def cells(self, u: Float[Array | np.ndarray, "*n d"]) -> Int[Array | np.ndarray, "*n k"]:
-        """Return the cell of each discrete coordinate of these points; of NumPy's in NumPy."""
+        """Return the cell of each discrete coordinate; NumPy points give NumPy arrays."""
         counts = np.array([self.levels[i] for i in self.discrete], np.int32)
         if isinstance(u, np.ndarray):
             # JAX would compile a program for each number of points.
@@ -115,7 +115,7 @@ class Cube:
         return found
 
     def centres(self, cells: Int[Array | np.ndarray, "*n k"]) -> Float[Array | np.ndarray, "*n k"]:
-        """Return the middles of these cells, as coordinates; of NumPy's in NumPy."""
+        """Return the middles of these cells as coordinates; NumPy cells give NumPy arrays."""
         counts = np.array([self.levels[i] for i in self.discrete], np.float32)
         if isinstance(cells, np.ndarray):
             centres = ((cells + np.float32(0.5)) / counts).astype(np.float32)

@@ -28,11 +28,11 @@ ABSENT = -1
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Events:
-    """Events in the order in which they happen; slots after the last one are absent.
+    """Events in order of time; slots after the last event are empty.
 
     - `kinds`: `[slots]`, the index of each event's name in `names`; -1 in an empty slot.
-    - `waits`: `[slots]`, seconds since the event before, or the start; 0 in an empty slot.
-    - `parameters`: `[slots, ...]` by name; the middle of a domain where an event has none.
+    - `waits`: `[slots]`, seconds since the previous event, or the start; 0 in an empty slot.
+    - `parameters`: `[slots, ...]` by name; the middle of a domain for events without the parameter.
     - `names`: the names of the kinds of events.
     """
 
@@ -68,7 +68,7 @@ class Events:
         return self.parameters[name]
 
     def are(self, *names: str) -> Bool[Array | np.ndarray, " slots"]:
-        """Return the slots that hold an event of one of these names; of any without names."""
+        """Return which slots hold an event with one of these names; without names, any event."""
         if not names:
             return self.mask
         chosen = [self._kind_of(name) for name in names]
@@ -78,18 +78,18 @@ class Events:
         return found
 
     def count(self, time: Real[Array | np.ndarray, "*times"] | float, *names: str) -> Any:
-        """Return how many events of these names have happened until `time`, itself included."""
+        """Return how many events with these names have happened up to and including `time`."""
         return self._past(time, names).sum(axis=-1)
 
     def active(self, time: Real[Array | np.ndarray, "*times"] | float, *names: str) -> Any:
-        """Return the index of the latest event of these names at `time`; -1 before the first."""
+        """Return the index of the latest event with these names at `time`; -1 before the first."""
         past = self._past(time, names)
         indices = past.shape[-1]
         xp = _library(past)
         return xp.max(xp.where(past, np.arange(indices), -1), axis=-1)
 
     def since(self, time: Real[Array | np.ndarray, "*times"] | float, *names: str) -> Any:
-        """Return the seconds since the latest event of these names; infinite before the first."""
+        """Return the seconds since the latest event with these names; infinite before the first."""
         index = self.active(time, *names)
         xp = _library(self.waits)
         elapsed = time - self.times[xp.maximum(index, 0)]
@@ -98,10 +98,10 @@ class Events:
     def within(
         self, name: str, time: Real[Array | np.ndarray, "*times"] | float, seconds: Any
     ) -> Any:
-        """Return whether an event of this name has happened in the last `seconds`.
+        """Return whether an event with this name has happened in the last `seconds`.
 
         **Arguments:**
-        - `seconds`: how long an event lasts: a number, or the name of a parameter that says so.
+        - `seconds`: the duration of an event: a number, or the name of a parameter that gives it.
         """
         ends = self[seconds] if isinstance(seconds, str) else seconds
         xp = _library(self.waits)
@@ -115,7 +115,7 @@ class Events:
         *names: str,
         otherwise: Any = 0.0,
     ) -> Any:
-        """Return a parameter of the latest event of these names; `otherwise` before the first."""
+        """Return a parameter of the latest event with these names; `otherwise` before the first."""
         values, index = self[parameter], self.active(time, *names)
         xp = _library(self.waits)
         chosen = xp.asarray(values)[xp.maximum(index, 0)]
@@ -123,9 +123,9 @@ class Events:
         return xp.where(there, chosen, otherwise)
 
     def listed(self) -> list[dict[str, Any]]:
-        """Return the events one by one for people: `{"time": 1.5, "kind": "cut_in", "gap": 7.0}`.
+        """Return the events as dictionaries: `{"time": 1.5, "kind": "cut_in", "gap": 7.0}`.
 
-        All parameters are listed, also those that an event of this kind does not use.
+        All parameters are listed, including those that an event of this kind does not use.
         """
         count, times = int(self.length), np.asarray(self.times)
         return [

@@ -13,12 +13,12 @@ from verifai_jax.core.messages.checks import is_number
 
 
 def with_gaps(name: str, signal: Any) -> Any:
-    """Return a signal whose masked and missing samples are NaN; any other one as it is.
+    """Return a signal with NaN for masked and missing samples; other signals are unchanged.
 
-    NumPy's own conversions show what lies under a mask. A list becomes an array.
+    NumPy's own conversions would expose masked values. A list becomes an array.
 
-    **Raises:** `TypeError` for what holds no real numbers, such as texts and dates; `ValueError`
-    for rows of several lengths.
+    **Raises:** `TypeError` for values that are not real numbers, such as texts and dates;
+    `ValueError` for rows of different lengths.
     """
     plain = isinstance(signal, jax.Array | jax.ShapeDtypeStruct) or type(signal) is np.ndarray
     if plain and getattr(signal.dtype, "kind", "") != "O":
@@ -89,11 +89,11 @@ def _numbers_of_objects(name: str, values: np.ndarray) -> np.ndarray:
 
 
 def known_times(times: Any) -> Any:
-    """Return sample times as numbers, none of which is masked or missing.
+    """Return sample times as numbers, none of which may be masked or missing.
 
-    Integers of 8 and 16 bits become floats, since their differences would wrap.
+    Integers of 8 and 16 bits become floats, since their differences could overflow.
 
-    **Raises:** `ValueError` that names the first one that is masked or missing; `TypeError` for
+    **Raises:** `ValueError` that names the first time that is masked or missing; `TypeError` for
     anything but an array of numbers.
     """
     if isinstance(times, jax.Array | jax.ShapeDtypeStruct):

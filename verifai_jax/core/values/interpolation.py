@@ -11,12 +11,12 @@ import numpy as np
 
 
 def between(left: Any, right: Any, share: Any, xp: Any) -> Any:
-    """Return `left` where the share is 0 and `right` where it is 1, never beyond them."""
+    """Interpolate between `left` (share 0) and `right` (share 1) without exceeding them."""
     return clamped(left * (1 - share) + right * share, left, right, xp)
 
 
 def monotone_cubic(knots: Any, gaps: Any, left: Any, share: Any, xp: Any) -> Any:
-    """Interpolate by the cubic that is monotone wherever the numbers are.
+    """Interpolate with a cubic that is monotone wherever the numbers are.
 
     Source: F. N. Fritsch and J. Butland, A method for constructing local monotone piecewise cubic
     interpolants, SIAM J. Sci. Stat. Comput. 5 (1984), with the ends of C. Moler, Numerical
@@ -25,8 +25,8 @@ def monotone_cubic(knots: Any, gaps: Any, left: Any, share: Any, xp: Any) -> Any
     **Arguments:**
     - `knots`: `[n, ...]`, at least 2.
     - `gaps`: `[n - 1]`, the distances between their positions.
-    - `left`: index of the number before the position, from 0 to n - 2.
-    - `share`: the share of the distance to the next number, from 0 to 1.
+    - `left`: index of the knot before the position, from 0 to n - 2.
+    - `share`: the position as a share of the distance to the next knot, from 0 to 1.
     """
     count = knots.shape[0]
     begin, end = knots[left], knots[left + 1]
@@ -65,10 +65,10 @@ def _end_slope(near: Any, far: Any, xp: Any) -> Any:
 
 
 def clamped(value: Any, one: Any, other: Any, xp: Any) -> Any:
-    """Return the value, or the nearer of two numbers where it is not between them.
+    """Return the value clipped to the interval between two numbers.
 
-    Between two knots at the end of their domain a sum may be rounded to a value outside. The
-    derivative is that of the value, also where both numbers are the same.
+    Between two knots at the end of their domain, rounding may move a sum outside. The derivative is
+    that of the value, even if both numbers are equal.
     """
     lowest, maximum = xp.minimum(one, other), xp.maximum(one, other)
     if xp is np:

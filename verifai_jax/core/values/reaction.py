@@ -21,12 +21,12 @@ Number = Real[Array | np.ndarray, ""] | float
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Reaction:
-    """A small network, or an affine function, from signals to a number within bounds.
+    """A small network, or an affine function, from signals to a bounded number.
 
-    - `parameters`: weights and biases, layer after layer, `[size]`.
-    - `inputs`: name, low and high of each signal; it is scaled to -1 to 1 over that range.
+    - `parameters`: weights and biases, layer by layer, `[size]`.
+    - `inputs`: name, low and high of each signal, which is scaled from that range to -1 to 1.
     - `hidden`: number of hidden units; 0 for an affine function.
-    - `bounds`: the bounds of the output, which a hyperbolic tangent keeps inside.
+    - `bounds`: the bounds of the output, enforced by a hyperbolic tangent.
     """
 
     # JAX rebuilds the class with placeholders and with batches, which have other shapes.

@@ -49,38 +49,38 @@ class Status(enum.IntEnum):
 
 @dataclass(frozen=True, eq=False)
 class Trace(InNotebook):
-    """Signals of one simulation, sampled on one clock.
+    """The signals of one simulation, with common sample times.
 
     **Arguments:**
     - `signals`: name -> array `[time]` or `[time, k]`; all with the same `time`.
     - `dt`: sampling period in seconds. Exactly one of `dt` and `times` is given.
     - `times`: `[time]` strictly increasing sample times in seconds.
-    - `valid`: how many samples count, `1 <= valid <= time`; all when left out. Samples from
-      `valid` on never influence a verdict.
+    - `valid`: number of valid samples, `1 <= valid <= time`; all when left out. Later samples never
+      influence a verdict.
     - `status`: a `Status` code; `Status.OK` when left out.
-    - `held`: a promise of the producer that every sample from `valid` on repeats the last valid
-      one, which saves the monitor a pass over the signals.
-    - `finite`: names of signals that the producer vouches for: they are finite where the status
-      is OK, which saves another.
-    - `between`: samples that were recorded after each sample and before the next one, the same
-      number for each: a trace of signals `[time * m]` or `[time * m, k]`, with sample times.
-      `mtl.resample` keeps there what its clock passes over, and verdicts count it.
-    - `notes`: what messages of the producer on this simulation or recording, each with how often it
-      came, `{"the solver fell back to Euler": 3}`. A run adds them up and has them among its notes.
-    - `units`: units of signals by name, as their recording has them.
+    - `held`: a promise of the producer that all samples from `valid` on repeat the last valid one,
+      which saves the monitor a pass over the signals.
+    - `finite`: names of signals that the producer guarantees to be finite if the status is OK,
+      which saves another pass.
+    - `between`: values recorded between consecutive samples, the same number after each sample: a
+      trace with signals `[time * m]` or `[time * m, k]`, and sample times. `mtl.resample` stores
+      there what its clock skips, and verdicts include it.
+    - `notes`: messages of the producer on this simulation or recording, each with the number of its
+      occurrences, `{"the solver fell back to Euler": 3}`. A run adds them up in its notes.
+    - `units`: units of signals by name, from the recording.
 
-    Notes and units are for the host: JAX's transformations drop them.
+    Notes and units stay on the host: JAX's transformations drop them.
 
-    A signal with masked or missing samples (`numpy.ma`, `None`, `pandas.NA`) has gaps there: they
-    become NaN, and no verdict counts what lies under a mask.
+    A signal with masked or missing samples (`numpy.ma`, `None`, `pandas.NA`) has gaps: they become
+    NaN, and verdicts never use masked values.
 
-    Whatever is known when the trace is made is checked then; what JAX traces shows in the status
-    of its row (`ERROR`).
+    Values known when the trace is made are checked then; invalid values that JAX traces give the
+    status `ERROR` of the row.
 
-    **Raises:** `ValueError` for no signals, an empty trace, signals of different lengths, a clock
-    that is missing, given twice, not positive or not finite, `valid` below 1 or beyond the samples,
-    or a status that is none, and for masked sample times; `TypeError` for signals that hold no
-    real numbers, and for notes that are not counts by text.
+    **Raises:** `ValueError` for no signals, an empty trace, signals of different lengths, sample
+    times that are missing, given twice, not positive or not finite, `valid` below 1 or beyond the
+    samples, an invalid status, and masked sample times; `TypeError` for signals that are not real
+    numbers, and for notes that are not counts by text.
     """
 
     _internal = frozenset((
@@ -163,15 +163,15 @@ class Trace(InNotebook):
     def from_dataframe(
         cls, frame: "pd.DataFrame", time: str = "time", dt: float | None = None
     ) -> "Trace":
-        """Make a trace of a `pandas.DataFrame`, one column a signal, one row a sample.
+        """Make a trace from a `pandas.DataFrame` with a column for each signal.
 
         Columns `p[0]`, `p[1]`, ... make one vector signal `p`; columns without numbers are left
         out. `verifai_jax.mtl.read` can also choose columns and resample.
 
         **Arguments:**
         - `time`: the column of sample times in seconds, or the name of the index; dates and
-          durations become seconds since the first.
-        - `dt`: the sampling period in seconds, instead of a column of times.
+          durations become seconds since the first one.
+        - `dt`: the sampling period in seconds, if there is no column of times.
         **Raises:** `ValueError` for a frame without rows, numbers or sample times, and for times
         that do not increase.
         """
@@ -183,9 +183,9 @@ class Trace(InNotebook):
         return np.shape(next(iter(self.signals.values())))[0]
 
     def clock(self) -> Real[Array | np.ndarray, " time"]:
-        """Return the sample times `[time]` in seconds, in double precision where they are known.
+        """Return the sample times `[time]` in seconds, in double precision if they are concrete.
 
-        Single precision does not tell apart the stamps of a clock that started long ago.
+        Single precision cannot distinguish time stamps with a distant origin.
         """
         if self.dt is not None:
             return np.arange(self.length) * float(self.dt)
@@ -194,7 +194,7 @@ class Trace(InNotebook):
         return np.asarray(self.times, float)
 
     def hold(self) -> "Trace":
-        """Return the trace with every sample from `valid` on set to the last valid one."""
+        """Return the trace with all samples from `valid` on replaced by the last valid one."""
         if self.valid is None or self.held:
             return self
         index = jnp.minimum(jnp.arange(self.length), jnp.asarray(self.valid) - 1)
@@ -202,7 +202,7 @@ class Trace(InNotebook):
         return replace(self, signals=signals, held=True, between=self.between_until(self.valid))
 
     def between_until(self, valid: Leaf) -> "Trace | None":
-        """Return what lies between the samples, from the last valid one on held there."""
+        """Return `between`, held from the last valid sample on."""
         if self.between is None or valid is None:
             return self.between
         last, more = jnp.asarray(valid) - 1, self.between.length // self.length
@@ -215,7 +215,7 @@ class Trace(InNotebook):
         return replace(self.between, signals=held)
 
     def trim(self) -> "Trace":
-        """Return the valid part only, as NumPy arrays; for people and plots, not under `jit`."""
+        """Return only the valid part, as NumPy arrays; for display, not under `jit`."""
         n = self.length if self.valid is None else int(self.valid)
         between = self.between_until(self.valid)
         if between is not None:
@@ -229,10 +229,10 @@ class Trace(InNotebook):
         return replace(self, signals=signals, times=times, between=None, valid=None)
 
     def finely(self) -> "Trace":
-        """Return all samples in one sequence, those between the others among them.
+        """Return all samples in one sequence, including those between the others.
 
-        Where nothing lies between, it is the trace itself. Its clock is not even: `between` may
-        repeat a sample so that there are equally many after each.
+        If nothing was recorded in between, the trace itself is returned. Sample times are then
+        uneven; `between` may repeat a sample so that there are equally many after each.
         """
         between = self.between
         if between is None:
@@ -256,7 +256,7 @@ class Trace(InNotebook):
 
     @property
     def stride(self) -> int:
-        """Number of samples of `finely` that stand for one of this trace."""
+        """Number of samples of `finely` for each sample of this trace."""
         return 1 if self.between is None else 1 + self.between.length // self.length
 
     def __getitem__(self, name: str) -> Samples:
@@ -311,11 +311,11 @@ def _check_notes(notes: object) -> None:
 
 
 def check_code(name: str, value: Any, wanted: str) -> int | None:
-    """Check that a value of a trace is a whole number, or an array of whole numbers.
+    """Check that a value of a trace is an integer, or an array of integers.
 
     **Arguments:**
-    - `name`, `wanted`: what it is and what it must be, for the message.
-    **Returns:** the number where it is known and a single one, else None.
+    - `name`, `wanted`: its name and its allowed values, for the message.
+    **Returns:** the number if it is concrete and a single one, else None.
     **Raises:** `ValueError` for texts, fractions, truth values and lists.
     """
     if value is None:
@@ -330,10 +330,10 @@ def check_code(name: str, value: Any, wanted: str) -> int | None:
 
 
 def check_period(dt: Any) -> float:
-    """Return a sampling period that JAX can compute with.
+    """Return a sampling period in a form that JAX can compute with.
 
     **Raises:** `TypeError` for anything that is not a number, `ValueError` for one that is too
-    small or large.
+    small or too large.
     """
     if not is_number(dt):
         if getattr(dt, "shape", None) != () or getattr(dt.dtype, "kind", "") not in "iuf":
@@ -351,10 +351,10 @@ def check_period(dt: Any) -> float:
 
 
 def without_wrapping(signal: Samples) -> Samples:
-    """Return a signal whose numbers JAX keeps: 64-bit integers of the host become floats.
+    """Return a signal whose numbers JAX preserves: 64-bit integers of the host become floats.
 
-    JAX would keep the lower 32 bits of an integer of NumPy where it computes in single precision;
-    a float of the precision in force is what the monitor makes of it anyway.
+    In single precision JAX would keep only the lower 32 bits of a NumPy integer; the monitor
+    converts to floats of the present precision anyway.
     """
     if isinstance(signal, jax.Array | jax.ShapeDtypeStruct):
         return signal
@@ -364,7 +364,7 @@ def without_wrapping(signal: Samples) -> Samples:
 
 
 def as_array(signal: Samples) -> Array:
-    """Return a signal as an array of JAX, its integers not cut to 32 bits."""
+    """Return a signal as a JAX array; its integers are not truncated to 32 bits."""
     return jnp.asarray(without_wrapping(signal))
 
 
@@ -382,7 +382,7 @@ def _shape(name: str, signal: Samples) -> tuple[int, ...]:
     except TracerArrayConversionError:
         raise ValueError(
             f"signal {name!r} must be an array; got a {type(signal).__name__} of values: join them "
-            "by jnp.stack"
+            "with jnp.stack"
         ) from None
 
 

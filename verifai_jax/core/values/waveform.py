@@ -33,18 +33,17 @@ Features = TypeVar("Features")
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class Waveform:
-    """Control points at equal distances or given times, and the course between them.
+    """Control points at equal distances or given times, with an interpolation.
 
     **Arguments:**
     - `knots`: `[knots, ...]`. With `"linear"` and `"pchip"` the first is the value at time 0 and
-      the last that at the end; with `"constant"` each is held for an equal part of the duration,
-      its beginning included; with `"pulse"` for the first `width` seconds of that part, and the
-      value is 0 for the rest. None may be masked.
-    - `duration`: in seconds; None until `over` sets it. Before 0 and after the end the first and
-      the last value hold; those of pulses are 0.
-    - `times`: the times of the control points in seconds, increasing; equal distances when left
-      out.
-    - `width`: the width of a pulse in seconds; half the shortest distance of two when left out.
+      the last that at the end. With `"constant"` each is held for an equal part of the duration,
+      including its start. With `"pulse"` each is held for the first `width` seconds of its part,
+      and the value is 0 for the rest. None may be masked.
+    - `duration`: duration in seconds; None until `over` sets it. Before 0 and after the end the
+      first and the last value hold; for pulses the value is 0 there.
+    - `times`: the increasing times of the control points in seconds; equal distances when left out.
+    - `width`: the width of a pulse in seconds; by default half the shortest distance of two pulses.
     """
 
     # JAX rebuilds the class with placeholders and with batches, which have other shapes.
@@ -70,10 +69,10 @@ class Waveform:
         check_width(self.hold, self.times, self.width)
 
     def over(self, duration: float) -> "Waveform":
-        """Return the same control points over so many seconds.
+        """Return the same control points with this duration in seconds.
 
-        **Raises:** `ValueError` for a duration that is not positive, or ends before a control point
-        whose time is given.
+        **Raises:** `ValueError` for a duration that is not positive, or ends before the last given
+        time.
         """
         duration = check_duration(duration)
         if self.times is not None and self.times[-1] > duration * (1 + 1e-6):
@@ -125,8 +124,7 @@ class Waveform:
     def _held(self, knots: Any, time: Any, sign: Any, xp: Any) -> Any:
         """Return the value at a time; `sign` is -1 where a piece that just begins counts not yet.
 
-        An instant at which a piece begins or a pulse ends belongs to what follows, whatever its
-        rounding.
+        An instant at which a piece begins or a pulse ends belongs to the next piece.
         """
         count = knots.shape[0]
         if self.times is not None:
@@ -172,7 +170,7 @@ class Waveform:
         )
 
     def refined(self, factor: int) -> "Waveform":
-        """Return the same function by more control points; see `Signal.refined`."""
+        """Return the same function with more control points; see `Signal.refined`."""
         check_refinable(self.hold)
         knots, times = jnp.asarray(self.knots), refined_times(self.times, factor)
         if (self.hold == "constant" and times is None) or knots.shape[0] == 1:
@@ -189,10 +187,10 @@ class Waveform:
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
 class WaveformWithinStep(Waveform):
-    """A waveform that is held, as an integrator reads it at `now` in a step that began at `begin`.
+    """A piecewise constant waveform, as an integrator sees it at `now` in a step from `begin`.
 
-    At any time of the step it has the value of its beginning. A method of high order evaluates the
-    end of a step too, where the next piece may begin, and would lose its order there.
+    During the step it keeps its value at the start of the step. A method of high order also
+    evaluates the end of a step, where the next piece may begin, and would lose its order there.
     """
 
     __no_type_check__ = True
@@ -264,7 +262,7 @@ def check_duration(duration: object) -> float:
 def check_times(times: object) -> tuple[float, ...]:
     """Check the times of control points, in seconds.
 
-    **Raises:** `ValueError` unless they are finite numbers that increase, the first not negative.
+    **Raises:** `ValueError` unless they are increasing finite numbers, the first not negative.
     """
     listed = tuple(times) if isinstance(times, list | tuple | np.ndarray) else ()
     if not listed or not all(is_number(time) and math.isfinite(time) for time in listed):
@@ -278,8 +276,8 @@ def check_times(times: object) -> tuple[float, ...]:
 def check_width(hold: str, times: tuple[float, ...] | None, width: object) -> None:
     """Check the width of pulses, in seconds.
 
-    **Raises:** `ValueError` unless it is None or positive, for another course than pulses, and for
-    a pulse at one given time, which has no distance to the next one.
+    **Raises:** `ValueError` unless it is None or positive, for other waveforms than pulses, and for
+    a single pulse with a given time, which has no distance to another.
     """
     if width is None:
         if hold == "pulse" and times is not None and len(times) == 1:
@@ -292,19 +290,19 @@ def check_width(hold: str, times: tuple[float, ...] | None, width: object) -> No
 
 
 def check_refinable(hold: str) -> None:
-    """Refuse a course that more control points cannot represent.
+    """Refuse a waveform that more control points cannot represent.
 
-    **Raises:** `ValueError` for a cubic and for pulses.
+    **Raises:** `ValueError` for cubics and pulses.
     """
     if hold in ("pchip", "pulse"):
         raise ValueError(
-            f"a Signal with hold={hold!r} has no refinement: through more control points it would "
-            "be another function of time; a search from coarse to fine needs 'linear' or 'constant'"
+            f"a Signal with hold={hold!r} has no refinement: with more control points it would be "
+            "another function of time; a search from coarse to fine needs 'linear' or 'constant'"
         )
 
 
 def refined_times(times: tuple[float, ...] | None, factor: int) -> tuple[float, ...] | None:
-    """Return the times with each distance divided into so many equal parts."""
+    """Return the times with each interval divided into this many equal parts."""
     if times is None:
         return None
     inner = [a + (b - a) * i / factor for a, b in pairwise(times) for i in range(factor)]
@@ -314,7 +312,7 @@ def refined_times(times: tuple[float, ...] | None, factor: int) -> tuple[float, 
 def control_times(
     count: int, hold: str, times: Sequence[float] | None, duration: float
 ) -> Float[np.ndarray, " knots"]:
-    """Return the time in seconds at which each control point has its value, or begins to."""
+    """Return the time in seconds at which each control point has, or starts to have, its value."""
     if times is not None:
         return np.asarray(times)
     return (
@@ -327,10 +325,10 @@ def control_times(
 def acting_spans(
     count: int, hold: str, times: Sequence[float] | None, width: float | None, duration: float
 ) -> list[tuple[float, float]]:
-    """Return the begin and the end of the time in which each control point acts, in seconds.
+    """Return the start and end of each control point's influence, in seconds.
 
-    A point between two lines acts from the point before to the one after, one of a cubic as far
-    as the second point before and after it, and the first and the last to the ends.
+    With linear interpolation a point acts from the previous point to the next one, in a cubic from
+    the second previous to the second next; the first and the last act up to the ends.
     """
     starts = [float(time) for time in control_times(count, hold, times, duration)]
     if hold in HELD:
@@ -350,7 +348,7 @@ def _listed(times: tuple[float, ...]) -> str:
 
 
 def set_durations(features: Features, duration: float) -> Features:
-    """Return the features with this duration in every waveform that has none."""
+    """Return the features with this duration set in every waveform without one."""
 
     def bind(leaf: object) -> object:
         return leaf.over(duration) if is_waveform(leaf) and leaf.duration is None else leaf
@@ -359,9 +357,9 @@ def set_durations(features: Features, duration: float) -> Features:
 
 
 def within_step(features: Features, begin: Any, now: Any) -> Features:
-    """Return the features for an integrator at `now`, in a step that began at `begin` seconds.
+    """Return the features for an integrator at `now`, in a step that started at `begin` seconds.
 
-    Waveforms that are held keep their value during the step.
+    Piecewise constant waveforms keep their value during the step.
     """
 
     def hold(leaf: object) -> object:
@@ -376,5 +374,5 @@ def within_step(features: Features, begin: Any, now: Any) -> Features:
 
 
 def is_waveform(value: object) -> TypeGuard[Waveform]:
-    """Return whether this is a `Waveform`, which `jax.tree` functions take as a leaf if told so."""
+    """Return whether this is a `Waveform`; pass it to `jax.tree` functions as `is_leaf`."""
     return isinstance(value, Waveform)

@@ -83,8 +83,7 @@ def certify(
     - `budget`: samples of all policies together; four times the minimum when left out. Samples
       beyond the minimum go to policies whose verdict is open, and to those that may be the safest.
     - `attack`: the search that looks for failures first; its failures enter no rate.
-    - `attack_simulations`: simulations of each policy in the attack, rounded up to whole blocks; 0
-      for no attack.
+    - `attack_simulations`: simulations of each attack, rounded up to whole blocks; 0 for no attack.
     - `tie`: failure rates that differ by less than this count as equally safe. When left out, `p /
       10` or less: so small that resolving it takes about as many samples as the minimum of all
       policies together.
@@ -95,8 +94,7 @@ def certify(
       once a minute elsewhere. A function `(done, total, text)` is called instead, with the
       simulations so far; `total` may not be reached.
     - `devices`: JAX devices; all of this process when left out.
-    - `executor`: an executor whose workers simulate, as in `falsify`; the certificates are the
-      same.
+    - `executor`: an executor whose workers simulate, as in `falsify`, with the same result.
 
     Ctrl-C returns the certificates from finished samples. The same seed gives the same
     certificates, bit for bit on one machine, whatever the order of the policies, the number of
@@ -335,8 +333,7 @@ def repeat_failures(
 ) -> Repetitions:
     """Simulate the worst failures of a policy again, and remove those that do not fail again.
 
-    It repeats one failure for every 25 simulations or 32 of them, and up to 1024 if one did not
-    fail again.
+    It repeats 32 failures, or 4 % of the simulations; 1024 if one did not fail again.
 
     **Arguments:**
     - `blocks`: the blocks that simulate the policies.

@@ -46,8 +46,7 @@ class Leader(NamedTuple):
 
     - `number`: the policy with the least posterior mean.
     - `chance`: posterior probability that no other rate is below the leader's by more than `tie`.
-    - `rivals`: for each policy, the probability that its rate is below the leader's by more than
-      `tie`.
+    - `rivals`: probability of each policy that its rate is below the leader's by more than `tie`.
     """
 
     number: int
@@ -88,8 +87,7 @@ class Allocation:
     - `p`, `confidence`: limit and confidence of the verdicts. The safest policy is named at half
       the error that `confidence` allows, because among near ties its posterior chance is a little
       too high.
-    - `samples`: minimum number of samples of each policy; `block`: samples of one policy in one
-      block.
+    - `samples`: minimum samples of each policy; `block`: samples of one policy in one block.
     - `budget`: maximum number of samples of all policies together.
     - `tie`: rates that differ by less count as equal. For a leader without a failure about `2.5 /
       tie` samples decide.

@@ -371,8 +371,8 @@ def _check_same(first: Problem, problem: Problem, number: int) -> None:
     )
     if not same:
         raise ProblemError(
-            "problem_of must give every policy the same features and formulas, or their rates do "
-            f"not compare; those of policy {number} differ:\n{problem}\nFirst:\n{first}"
+            "problem_of must give every policy the same features and formulas, or their rates "
+            f"cannot be compared; those of policy {number} differ:\n{problem}\nFirst:\n{first}"
         )
 
 

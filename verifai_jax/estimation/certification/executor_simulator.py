@@ -42,8 +42,7 @@ class ExecutorSimulator:
     **Arguments:**
     - `shipment`: the pickled code for the workers, with `problem_of`.
     - `policies`: the policies as workers simulate them; those of one structure are padded.
-    - `structure`: the structure of the policies that share a program; None for those simulated by
-      themselves.
+    - `structure`: the structure of policies that share a program; None for those simulated alone.
     - `lanes`: samples in a block.
     - `dim`: coordinates of a sample.
     - `executor`: an executor with `submit`.

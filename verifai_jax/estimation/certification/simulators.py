@@ -50,8 +50,7 @@ class Simulator(Protocol):
 
         **Arguments:**
         - `members`: the index in the group of each block's policy.
-        - `first`: the number of the first sample of each block, from which its random keys are
-          made.
+        - `first`: the number of the first sample of each block, which gives its random keys.
         - `key`: the key of all simulations.
         """
         ...

@@ -230,7 +230,7 @@ class _Prior:
         self._draw = jax.jit(lambda i: jax.random.uniform(jax.random.fold_in(key, i), shape))
 
     def take(self, count: int) -> Float[np.ndarray, "n d"]:
-        """Return the next so many points that the constraint accepts."""
+        """Return the next `count` points that the constraint accepts."""
         while len(self._left) < count:
             u = np.asarray(self._draw(self._block), np.float32)
             if self.space.constraint is not None:
@@ -272,8 +272,8 @@ def _check(
         ours, theirs = baseline.space, problem.space
         if _varying(ours) != _varying(theirs):
             raise ProblemError(
-                f"{name!r} varies other features than the baseline, so that their samples are "
-                f"not the same: {_difference(ours, theirs)}"
+                f"{name!r} varies other features than the baseline, so their samples cannot be the "
+                f"same: {_difference(ours, theirs)}"
             )
         if (ours.where is None) != (theirs.where is None):
             raise ProblemError(f"only one of {name!r} and the baseline has a constraint")
@@ -292,7 +292,7 @@ def _difference(one: FeatureSpace, other: FeatureSpace) -> str:
             if feature not in space.domains:
                 return f"{feature} is missing {where}"
             return (
-                f"{feature} varies in one and is held in the other ({where}): compare what varies "
+                f"{feature} varies in one and is fixed in the other ({where}): compare what varies "
                 f"in both, such as problem.only({', '.join(map(repr, _common(ours, theirs)))})"
             )
         if ours[feature] != theirs[feature]:

@@ -175,7 +175,7 @@ def _common(a: Problem, b: Problem) -> tuple[tuple[Problem, Problem], list[str]]
     for letter, problem, space in zip("ab", (a, b), spaces, strict=True):
         others = [n for n, d in space.items() if d.size and n not in both]
         if others:
-            notes.append(f"{', '.join(others)} of {letter} is held at its nominal value")
+            notes.append(f"{', '.join(others)} of {letter} is fixed at its nominal value")
         held.append(problem.only(*both) if others else problem)
     notes += _other_constants(a, b)
     order = [[n for n, d in p.space.root.fields if d.size] for p in held]
@@ -262,7 +262,7 @@ class _Pairs:
         for letter, trace in zip("ab", known, strict=True):
             alone = sorted({_plain(n) for n in _columns(trace)} - {_plain(n) for n in self._scales})
             if alone:
-                self.notes.append(f"{', '.join(alone)} is a signal of {letter} alone")
+                self.notes.append(f"{', '.join(alone)} is a signal of {letter} only")
 
     def _nudged(self, u: Float[np.ndarray, "n d"]) -> Float[np.ndarray, "n d"]:
         """Move real coordinates by one rounding of single precision, to either side."""

@@ -67,8 +67,8 @@ def error_budget(
     """Bound the error of a probability, part by part, and how wrong the prior may be.
 
     **Arguments:**
-    - `problem`: the simulated problem; for a comparison the candidate, for a certificate that of
-      the policy.
+    - `problem`: the simulated problem: of a comparison the candidate, of a certificate the
+      policy's.
     - `result`: an estimate, a rate (`run.failure_rate`), a certificate, or a candidate of a
       comparison, `comparison["NAME"]`.
     - `baseline`: the baseline of a comparison.
@@ -151,8 +151,8 @@ def _number(result: Number, baseline: Problem | None) -> _Number:
     if isinstance(rate, Rate):
         return _Number(rate.estimate, rate.low, rate.high, False)
     raise TypeError(
-        "an error budget is of an estimate, a rate, a certificate with a sample, or a candidate of "
-        f"a comparison; got {type(rate).__name__}"
+        "an error budget needs an estimate, a rate, a certificate with a sample, or a candidate "
+        f"of a comparison; got {type(rate).__name__}"
     )
 
 
@@ -288,10 +288,10 @@ class _Work:
         """Return the part of the precision."""
         other = "float32" if self.precision == "float64" else "float64"
         if self.sides[0].black_box:
-            text = "The system computes in a precision of its own, which nothing here changes."
+            text = "The system computes in its own precision, which cannot be changed here."
             return ErrorPart("precision", math.nan, math.nan, text)
         if any(depends_on_key(side) for side in self.sides):
-            text = f"In {other} the system draws other random numbers: no pair is the same."
+            text = f"In {other} the system draws other random numbers, so no pair is the same."
             return ErrorPart("precision", math.nan, math.nan, text)
         found = self._between(self.own, self._as(lambda side: side, other))
         counted = self.precision == "float32" and not self.rare
@@ -323,12 +323,12 @@ class _Work:
     def seeds(self, count: int) -> ErrorPart:
         """Return how far estimates with other seeds lie apart."""
         if not isinstance(self.result, Estimate):
-            text = "Only an estimate is made again with other seeds."
+            text = "Other seeds are only tried for an estimate."
             return ErrorPart("seeds", math.nan, math.nan, text)
         found = [self._estimate(self.sides[0], self.result.seed + 1 + i) for i in range(count)]
         values = [each.probability for each in found if each.probability is not None]
         if not values or math.isnan(self.number.value):
-            text = "No estimate came of the other seeds, or of the first one."
+            text = "No estimate resulted from the other seeds, or from the first one."
             return ErrorPart("seeds", math.nan, math.nan, text)
         apart = [value - self.number.value for value in values]
         meet = sum(f.low <= self.number.high and f.high >= self.number.low for f in found)
@@ -352,8 +352,8 @@ class _Work:
         interval = clopper_pearson(int(turned.sum()), max(len(turned), 1), self.each)
         text = (
             f"With the same features and other random numbers {format_percent(np.mean(turned))} of "
-            f"the verdicts turn ({format_percent(interval.low)} to {format_percent(interval.high)}"
-            f"), {said}. It is in the sampling."
+            f"the verdicts change ({format_percent(interval.low)} to "
+            f"{format_percent(interval.high)}), {said}. The sampling error includes it."
         )
         return ErrorPart("randomness", 0.0, 0.0, text, False)
 

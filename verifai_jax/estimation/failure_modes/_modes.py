@@ -165,8 +165,8 @@ def modes(
         notes = [*numbers.notes, *notes]
     if answer.probability is not None and not listed:
         notes.append(
-            "the failures could not be weighed one by one, so the probability is not divided into "
-            "modes; a larger budget may fit a proposal to them"
+            "the failures could not be weighted one by one, so the probability is not divided "
+            "into modes; a larger budget may find a proposal that fits them"
         )
     known = answer.probability is not None
     return Modes(

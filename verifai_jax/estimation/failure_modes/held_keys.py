@@ -48,8 +48,7 @@ class Divided:
     - `joined`, `tried`: the number of failures that a path joins to a region, and of those tried.
     - `under`: share of the failures that fail under one of the keys.
     - `held`: number of keys.
-    - `design`: row of the likeliest failure of each region; by default the one nearest to the
-      origin.
+    - `design`: row of the likeliest failure of each region; by default the nearest to the origin.
     - `failing`: for a system with its own random numbers, how many of `times` simulations of each
       likeliest failure fail.
     """
@@ -75,9 +74,9 @@ class Divided:
         which = "one random key" if self.held == 1 else f"{self.held} random keys"
         return (
             "the system draws random numbers, so that a point fails with a probability: the modes "
-            f"are regions that fail under {which}, held, under which {self.under:.0%} of the "
-            "failures fail; each of the others counts for the mode nearest to it. The likeliest "
-            "failure of a mode fails under its own key, mode.random_key"
+            f"are regions that fail under {which}, which is fixed. {self.under:.0%} of the "
+            "failures fail under it; each of the others counts for the mode nearest to it. The "
+            "likeliest failure of a mode fails under its own key, mode.random_key"
         )
 
 

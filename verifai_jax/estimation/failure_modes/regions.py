@@ -72,7 +72,7 @@ class Regions:
         self.region = np.append(self.region, np.broadcast_to(region, len(points)))
 
     def standard_deviations(self) -> Float[np.ndarray, "k d"]:
-        """Return those of each region, shrunk towards the prior's if it has few points."""
+        """Return the deviations of each region, shrunk to the prior's if it has few points."""
         stds = np.ones((self.count, self.points.shape[1]))
         for k in range(self.count):
             points = self.points[self.region == k]

@@ -35,8 +35,7 @@ class Mode(InNotebook):
     - `distance`: the distance of that point from the middle of the prior, in standard deviations of
       normal space (the reliability index).
     - `rho`: robustness at that point.
-    - `cause`: the formula and the predicate that decide at that point, as text; empty without a
-      verdict.
+    - `cause`: formula and predicate that decide at that point, as text; empty without a verdict.
     - `failures`: features of failures of this mode, distributed as under the prior, one a row.
     - `problem`: the problem.
     - `run`: the simulations of the likeliest failure, all with its random key if the system draws.
@@ -141,8 +140,8 @@ class Modes(Drawn, InNotebook):
     - `probability`, `low`, `high`: probability of any failure, as `estimate` gives it. Without an
       estimate None, with 0 and the guaranteed bound.
     - `confidence`: the confidence of all intervals.
-    - `unexplained`: share of the failures that no path of failures joins to a mode, as an interval
-      `(low, high)`.
+    - `unexplained`: share of the failures that no path joins to a mode, as an interval `(low,
+      high)`.
     - `rest`: total probability of further regions that are too improbable to be listed.
     - `simulations`, `budget`: simulations used and allowed.
     - `upper_bound`: upper bound guaranteed by samples of the prior alone.

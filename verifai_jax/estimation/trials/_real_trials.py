@@ -60,8 +60,7 @@ def real_trials(
     - `trials`: the path of a CSV or Parquet file, or a data frame: a column for each feature as in
       the table of a run, and `failed` (yes or no; empty where a trial may have failed), or
       `recording` with a file of signals for each trial, which the formulas judge.
-    - `simulations`: number of simulations of the prior, which tell how often a failure is
-      predicted.
+    - `simulations`: number of simulations of the prior, for the rate of predicted failures.
     - `confidence`: the probability that the interval holds.
     - `seed`: the seed of the simulations.
     - `allocated`: True if the numbers of trials with and without a predicted failure were chosen

@@ -52,8 +52,7 @@ class RealTrials(InNotebook):
     def predictions(self, predicted: bool) -> Rate | None:
         """Return how often trials fail, among those predicted to fail or among the others.
 
-        None if there is no such trial. These counts show how good the predictions of the simulation
-        are.
+        None if there is no such trial. The counts show how good the simulation's predictions are.
         """
         rows = self.table[self.table["predicted"] == predicted]["failed"]
         if not len(rows):

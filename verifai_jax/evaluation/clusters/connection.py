@@ -27,14 +27,14 @@ SLURM_JOBS = 16
 
 @contextlib.contextmanager
 def connect(address: str) -> Iterator[Executor]:
-    """Connect to a cluster for as long as the context lasts.
+    """Connect to a cluster during a `with` block.
 
     **Arguments:**
     - `address`: `dask://HOST:PORT` of a scheduler; `ray://HOST:PORT` of a head node's client
-      server, or `ray://auto` for the cluster that this machine is part of; `slurm`, with parameters
-      of submitit where they are wanted: `slurm?slurm_partition=cpu&timeout_min=60&jobs=32`.
-    **Raises:** `ValueError` for another address; `MissingExtra` where the package is not installed;
-    `OSError` where there is no cluster.
+      server, or `ray://auto` for the cluster of this machine; `slurm`, optionally with parameters
+      of submitit: `slurm?slurm_partition=cpu&timeout_min=60&jobs=32`.
+    **Raises:** `ValueError` for another address; `MissingExtra` if the package is not installed;
+    `OSError` if there is no cluster.
     """
     kind, rest = _parse(address)
     if kind == "dask":
@@ -109,14 +109,14 @@ class _RayFuture(concurrent.futures.Future):
 
 
 class RayExecutor:
-    """`concurrent.futures`' `submit` on a cluster of Ray.
+    """An executor with `submit`, like those of `concurrent.futures`, on a Ray cluster.
 
     **Arguments:**
-    - `address`: the address of the cluster, as of `ray.init`; the one that Ray is connected to
-      already, or else a new one on this machine, when left out.
-    - `cpus`: cores that a block takes.
-    - `gpus`: GPUs that a block takes.
-    **Raises:** `MissingExtra` where Ray is not installed; what Ray raises where it cannot connect.
+    - `address`: the address of the cluster, as in `ray.init`; by default the cluster to which Ray
+      is connected, or else a new one on this machine.
+    - `cpus`: number of cores for a block.
+    - `gpus`: number of GPUs for a block.
+    **Raises:** `MissingExtra` if Ray is not installed; Ray's errors if it cannot connect.
     """
 
     def __init__(self, address: str | None = None, *, cpus: float = 1, gpus: float = 0) -> None:

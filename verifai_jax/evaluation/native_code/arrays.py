@@ -26,7 +26,7 @@ Move: TypeAlias = Callable[[Params, Elements], Elements]
 
 
 def moved(*names: str) -> Callable[[Move], Move]:
-    """Register a function of NumPy that moves the elements of one array."""
+    """Register a NumPy function that moves the elements of one array."""
 
     def register(function: Move) -> Move:
         def apply(t: Translator, step: Equation, inputs: list[Value]) -> list[Value]:

@@ -33,7 +33,7 @@ _MADE = re.compile(r"\b([uvimw])\d+\b")
 
 
 class Piece:
-    """Code without branches: lines that run once before, for each vector, and once after."""
+    """Code without branches: lines that run before, once for each vector, and after."""
 
     def __init__(self) -> None:
         self.together: list[str] = []
@@ -45,7 +45,7 @@ class Piece:
 
 
 class Code:
-    """A program that grows line by line."""
+    """Code of a program, to which lines are added."""
 
     def __init__(self) -> None:
         self.items: list[Piece | str] = []
@@ -75,9 +75,9 @@ class Code:
         self.items.append(text)
 
     def open_loop(self, head: str, counter: str = "") -> None:
-        """Begin a loop; what does not change in it is computed before it.
+        """Open a loop; expressions that do not change in it are computed before it.
 
-        - `counter`: its variable, if it has one.
+        - `counter`: its variable, if there is one.
         """
         self._before.append(self.piece)
         self._depths[counter] = len(self._before)
@@ -92,12 +92,12 @@ class Code:
             self._depths[name] = min(inside, depth)
 
     def mark(self) -> tuple[int, int]:
-        """Return the place to which `back_to` returns."""
+        """Return the present position, for `back_to`."""
         self.control("")
         return len(self.items), len(self._before)
 
     def back_to(self, mark: tuple[int, int]) -> None:
-        """Forget all lines since a place."""
+        """Remove all lines since a position."""
         del self.items[mark[0] :]
         del self._before[mark[1] :]
 
@@ -109,14 +109,14 @@ class Code:
         return min(now, max((self._depths.get(*each) for each in names), default=0))
 
     def is_older(self, one: Element, other: Element) -> bool:
-        """Return whether a number that is no constant is known in fewer loops than another."""
+        """Return whether a number that is not constant was defined in fewer loops than another."""
         return one.value is None and self._depth_of(one.text) < self._depth_of(other.text)
 
     def _piece_of(self, depth: int) -> Piece:
         return self.piece if depth == len(self._before) else self._before[depth]
 
     def name(self, prefix: str) -> str:
-        """Return a name that nothing has."""
+        """Return an unused name."""
         self._count += 1
         return f"{prefix}{self._count}"
 
@@ -141,14 +141,14 @@ class Code:
         return piece.known.setdefault(text, Element(name, kind, uniform))
 
     def fresh(self, kind: str, uniform: bool) -> Element:
-        """Return a number that the next line computes."""
+        """Return a number that the next line will compute."""
         name = self.name("w")
         text = f"{TYPES[kind][1]}()" if uniform else f"{TYPES[kind][0]}()"
         # With its own name, so that it is no number that is known already.
         return self.define(f"{text} /* {name} */", kind, uniform)
 
     def keep(self, kind: str, uniform: bool) -> Element:
-        """Return a number that `assign` changes, in the loop that is opened next."""
+        """Return a variable that `assign` changes in the loop that is opened next."""
         if uniform:
             name = self.name("u")
             self.declared.append(f"{TYPES[kind][1]} {name};")
@@ -160,7 +160,7 @@ class Code:
         return Element(name, kind, uniform)
 
     def assign(self, changed: list[Element], values: list[Element]) -> None:
-        """Give several numbers of `keep` their values, all at once, at the end of a piece."""
+        """Assign values to several variables of `keep` simultaneously, at the end of a piece."""
         last: list[str] = []
         for name, value in zip(changed, values, strict=True):
             self._count_line()
@@ -175,11 +175,11 @@ class Code:
         self.piece.after += last
 
     def carried(self, name: str) -> None:
-        """Note that an array is changed in the loop that is opened next, and by it alone."""
+        """Record that an array is changed by the loop that is opened next, and only by it."""
         self._depths[f"array {name}"] = len(self._before) + 1
 
     def is_carried(self, name: str) -> bool:
-        """Return whether the innermost open loop changes a number of `keep`, or such an array."""
+        """Return whether the innermost open loop changes a variable of `keep`, or such an array."""
         key = name if name in self.kept else f"array {name}"
         return bool(self._before) and self._depths.get(key) == len(self._before)
 
@@ -210,7 +210,7 @@ class Code:
         self.piece.each.append(f"{target} = {widened(value)};")
 
     def stored(self, values: Sequence[Element], shape: tuple[int, ...]) -> Memory:
-        """Return an array of these elements, which nothing changes."""
+        """Return a constant array of these elements."""
         depth = max(self._depth_of(each.text) for each in values)
         piece, uniform = self._piece_of(depth), all(each.uniform for each in values)
         known = piece.stored.get(tuple(values))
@@ -230,7 +230,7 @@ class Code:
             raise Untranslatable(f"a program of more than {MAX_LINES:,} lines")
 
     def body(self) -> tuple[list[str], int]:
-        """Return the lines of the function, and the vectors of memory that a thread needs."""
+        """Return the lines of the function, and the number of vectors of memory for a thread."""
         crossing = set(self.kept)
         used = {}
         for item in self.items:
@@ -272,9 +272,9 @@ class Code:
 
 
 def shared_divisions(lines: list[str]) -> list[str]:
-    """Divide by constants, and by what is divided by more than once, through the reciprocal.
+    """Replace divisions by constants and by repeated divisors with products of the reciprocal.
 
-    A division takes as long as a dozen multiplications, so many of them are made of these, too.
+    A division takes as long as a dozen multiplications.
     """
     found = [_DIVISION.match(line) for line in lines]
     counts = Counter(each[3] for each in found if each)

@@ -33,8 +33,8 @@ CHOSEN = 6
 class Carry:
     """The values that a loop or a branch changes: variables, or arrays in memory.
 
-    Those of a branch are the ones that it begins with, where nothing else uses these: what it
-    leaves as it was is then copied nowhere.
+    A branch changes its initial values in place if nothing else uses them, so unchanged values need
+    no copy.
     """
 
     def __init__(
@@ -69,7 +69,7 @@ class Carry:
         return out
 
     def assign(self, values: list[Value]) -> None:
-        """Give all of them new values, at once."""
+        """Assign new values to all of them simultaneously."""
         code = self.t.code
         changed: list[Element] = []
         given: list[Element] = []
@@ -99,7 +99,7 @@ class Carry:
             (code.piece.after if mine.uniform else code.piece.each).append(line)
 
     def varies(self, values: list[Value]) -> bool:
-        """Note which of them were taken for uniform and are not; return whether any."""
+        """Record which of them are not uniform after all; return whether there are any."""
         found = False
         for i, value in enumerate(values):
             if self.uniform[i] and not is_uniform(value):
@@ -127,7 +127,7 @@ def _own(t: Translator, start: Sequence[Value]) -> set[int]:
 
 
 def single_numbers(value: Value) -> list[Element]:
-    """Return the numbers of a value, of random keys their words."""
+    """Return the single numbers of a value; for random keys their words."""
     numbers: list[Element] = []
     for each in elements(value).ravel():
         numbers += [each] if isinstance(each, Element) else list(each)
@@ -135,7 +135,7 @@ def single_numbers(value: Value) -> list[Element]:
 
 
 def is_uniform(value: Value) -> bool:
-    """Return whether a value is the same for all simulations."""
+    """Return whether a value is equal for all simulations."""
     if isinstance(value, Memory):
         return value.uniform
     return all(each.uniform for each in single_numbers(value))
@@ -148,9 +148,9 @@ def until_settled(
     emit: Callable[[Carry], list[Value] | None],
     changed: Sequence[Value] = (),
 ) -> list[Value]:
-    """Write a loop or branch, again as long as more of its values turn out to differ.
+    """Translate a loop or branch, repeatedly as long as more of its values turn out to differ.
 
-    - `changed`: the values that a branch begins with. It may change those that nothing else uses.
+    - `changed`: the initial values of a branch; those that nothing else uses are changed in place.
     """
     mark = t.code.mark()
     while True:

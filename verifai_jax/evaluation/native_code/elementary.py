@@ -94,7 +94,7 @@ _FOLDED: dict[str, Callable[..., Any]] = {
 
 
 def fold(name: str, kind: str, values: list[np.generic]) -> Any:
-    """Return the result of an operation on whole numbers or truth values; None if unknown."""
+    """Return the constant result of an operation on integers or truth values; None if unknown."""
     if name == "convert_element_type":
         return values[0] if isinstance(values[0], (np.integer, np.bool_)) or kind == "f" else None
     if name not in _FOLDED or not all(isinstance(v, (np.integer, np.bool_)) for v in values):
@@ -106,13 +106,13 @@ def fold(name: str, kind: str, values: list[np.generic]) -> Any:
 
 
 def expression(name: str, params: Params, kinds: list[str], out: str) -> tuple[str, bool]:
-    """Return the template of an operation, and whether its operands must be alike.
+    """Return the template of an operation, and whether its operands must have the same kind.
 
     **Arguments:**
-    - `name`, `params`: of the primitive.
+    - `name`, `params`: those of the primitive.
     - `kinds`: the kinds of its operands.
     - `out`: the kind of its result.
-    **Raises:** `Untranslatable` for an unknown one.
+    **Raises:** `Untranslatable` for an unknown primitive.
     """
     if name in OPERATORS:
         return OPERATORS[name], False

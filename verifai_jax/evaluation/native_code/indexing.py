@@ -29,7 +29,7 @@ def _bounded(t: Translator, index: Element, highest: int) -> Element:
 def element_at(
     t: Translator, array: Value, strides: Sequence[int], index: Sequence[Element], base: int
 ) -> Element:
-    """Return the element of a flat array at `base` plus the product of numbers and strides."""
+    """Return the element of a flat array at `base` plus the sum of numbers times strides."""
     fixed = base + sum(
         int(i.value) * s for i, s in zip(index, strides, strict=True) if i.value is not None
     )

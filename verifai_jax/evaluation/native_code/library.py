@@ -32,9 +32,9 @@ PARTS = 4
 
 
 class Library:
-    """A loaded program of a batch of simulations.
+    """A loaded library that simulates a batch.
 
-    - `count`: numbers that a simulation returns.
+    - `count`: number of results of a simulation.
     """
 
     def __init__(self, path: Path, count: int) -> None:
@@ -75,30 +75,30 @@ class Library:
 
 
 def library_name(fingerprint: str | None) -> str:
-    """Return the name of the library of a program, by all that it depends on.
+    """Return the name of a program's library, a hash of all that it depends on.
 
     **Arguments:**
     - `fingerprint`: the fingerprint of the program; None if it has none.
-    **Raises:** `Unavailable` where there is no compiler, no cache folder, or no fingerprint.
+    **Raises:** `Unavailable` if there is no compiler, no cache folder, or no fingerprint.
     """
     tool = machine_code.compiler()
     about = tool.stat()
     which = (str(tool), about.st_size, about.st_mtime_ns, _processor(), FLAGS, PRELUDE)
     name = remembered_as("native", fingerprint, which)
     if name is None:
-        raise machine_code.Unavailable("a part of the program cannot be identified")
+        raise machine_code.Unavailable("a part of the program cannot be hashed")
     return name
 
 
 def load(name: str, count: int, translate: Callable[[], str], quickly: bool = False) -> Library:
-    """Return the library of this name, compiled where there is none.
+    """Return the library with this name, compiling it if there is none.
 
     **Arguments:**
-    - `name`: as `library_name` gives it.
-    - `count`: numbers that a simulation returns.
-    - `translate`: makes the source.
-    - `quickly`: whether to compile in half the time, for reverse sweeps.
-    **Raises:** `Unavailable` where it cannot be compiled, kept or loaded.
+    - `name`: the name from `library_name`.
+    - `count`: number of results of a simulation.
+    - `translate`: a function that returns the source.
+    - `quickly`: whether to compile in half the time, used for reverse sweeps.
+    **Raises:** `Unavailable` if it cannot be compiled, stored or loaded.
     """
 
     def program() -> machine_code.Program:
@@ -110,7 +110,7 @@ def load(name: str, count: int, translate: Callable[[], str], quickly: bool = Fa
 
 
 def is_approved(name: str) -> bool | None:
-    """Return whether a library computes what XLA does, as `approve` noted; None if unknown."""
+    """Return whether a library agrees with XLA, as stored by `approve`; None if unknown."""
     try:
         return {"yes": True, "no": False}.get(
             (machine_code.library_folder() / f"{name}.agrees").read_text()
@@ -120,7 +120,7 @@ def is_approved(name: str) -> bool | None:
 
 
 def approve(name: str, agrees: bool) -> None:
-    """Note whether a library computes what XLA does, for later processes."""
+    """Store whether a library agrees with XLA, for later processes."""
     try:
         with replacing(machine_code.library_folder() / f"{name}.agrees") as partial:
             partial.write_bytes((b"no", b"yes")[agrees])

@@ -29,8 +29,8 @@ def translate(program: values.Program) -> str:
 
     **Arguments:**
     - `program`: a closed `Jaxpr` of the row `[d]`, the words `[2]` of a random key, the number of
-      the simulation, a temperature, and numbers `[n]` that all share; it returns a vector of bits.
-    **Raises:** `Untranslatable` for a program with a part that is unknown.
+      the simulation, a temperature, and shared numbers `[n]`; it returns a vector of bits.
+    **Raises:** `Untranslatable` for a program with an unknown part.
     """
     used = without_unused(program.jaxpr, [True] * len(program.jaxpr.outvars))
     t = Translator()
@@ -62,7 +62,7 @@ def translate(program: values.Program) -> str:
 
 
 def one(element: values.Element) -> np.ndarray:
-    """Return an array of no axes."""
+    """Return an array without axes."""
     out = np.empty((), object)
     out[()] = element
     return out

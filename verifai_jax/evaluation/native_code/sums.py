@@ -88,7 +88,7 @@ def _in_loops(
 
 
 def joined(t: Translator, name: str, parts: list[Element], kind: str) -> Element:
-    """Join numbers by an operation, the halves of them each on their own."""
+    """Combine numbers by an operation, recursively by halves."""
     while len(parts) > 1:
         half = [t.compute(name, {}, parts[i : i + 2], kind) for i in range(0, len(parts) - 1, 2)]
         parts = half + parts[len(parts) // 2 * 2 :]

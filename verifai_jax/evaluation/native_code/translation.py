@@ -47,7 +47,7 @@ RULES: dict[str, Rule] = {}
 
 
 def rule(*names: str) -> Callable[[Rule], Rule]:
-    """Register a function for primitives of these names."""
+    """Register a translation rule for primitives with these names."""
 
     def register(function: Rule) -> Rule:
         for name in names:
@@ -70,7 +70,7 @@ class Translator:
     ) -> list[Value]:
         """Translate the steps of a `Jaxpr`, and return its results.
 
-        **Raises:** `Untranslatable` for a part that is unknown.
+        **Raises:** `Untranslatable` for an unknown part.
         """
         used = Counter(each for step in program.eqns for each in map(id, step.invars))
         used.update(map(id, program.outvars))
@@ -99,21 +99,21 @@ class Translator:
     def branch(
         self, program: Program, inputs: Sequence[Value], needed: Sequence[Value]
     ) -> list[Value]:
-        """Translate a program after which some values are needed as they were before."""
+        """Translate a program such that some values can still be used unchanged afterwards."""
         with self._needing(lambda: needed):
             return self.closed(program, inputs)
 
     def needed(self) -> set[str]:
-        """Return the names of all that is used after the present step."""
+        """Return the names of all values used after the present step."""
         return {name for values in self._needed for each in values() for name in names_in(each)}
 
     def closed(self, program: Program, inputs: Sequence[Value]) -> list[Value]:
-        """Translate a program with its constants, or one without."""
+        """Translate a program with its constants, or one without constants."""
         inner = getattr(program, "jaxpr", program)
         return self.program(inner, getattr(program, "consts", ()), inputs)
 
     def step(self, step: Equation, inputs: list[Value]) -> list[Value]:
-        """Translate one step."""
+        """Translate one equation."""
         name = step.primitive.name
         if (inner := called(step)) is not None:
             return self.closed(inner, inputs)
@@ -140,7 +140,7 @@ class Translator:
     def elementwise(
         self, name: str, params: Params, inputs: list[Value], kind: str, shape: tuple[int, ...]
     ) -> Value:
-        """Apply an operation on single numbers to arrays of one shape, or single numbers."""
+        """Apply a scalar operation elementwise to arrays of one shape, or to single numbers."""
         if kind == KEY or any(self._is_key(value) for value in inputs):
             return self._of_keys(name, params, inputs, shape)
         size = int(np.prod(shape, dtype=np.int64))
@@ -168,7 +168,7 @@ class Translator:
         return lazy if self._once and len(formula("")) <= LONG else self.in_memory(lazy)
 
     def flat(self, value: Value) -> Memory:
-        """Return a value as an array whose elements have a C expression by their index."""
+        """Return a value as an array whose elements have a C expression of their index."""
         return value if isinstance(value, Memory) else self.in_memory(value)
 
     def line(self, text: str, uniform: bool = False) -> None:
@@ -177,7 +177,7 @@ class Translator:
         (piece.together if uniform else piece.each).append(text)
 
     def compute(self, name: str, params: Params, operands: list[Element], kind: str) -> Element:
-        """Return the result of an operation on single numbers."""
+        """Return the result of a scalar operation."""
         if all(each.value is not None for each in operands):
             folded = elementary.fold(name, kind, [each.value for each in operands])
             if folded is not None:
@@ -205,7 +205,7 @@ class Translator:
         return self.code.define(text, kind, uniform)
 
     def text(self, name: str, params: Params, operands: list[Element], kind: str) -> str:
-        """Return the C expression of an operation on single numbers."""
+        """Return the C expression of a scalar operation."""
         bounds = {"max": operands[:1], "min": operands[:1], "clamp": operands[::2]}.get(name, ())
         if (
             bounds
@@ -224,7 +224,7 @@ class Translator:
         return template.format(*texts)
 
     def in_memory(self, value: Value) -> Memory:
-        """Return a value as an array in memory, its elements one after another."""
+        """Return a value as an array in memory with contiguous elements."""
         if isinstance(value, Memory):
             return value if value.formula is None else self._stored(value)
         flat = value.ravel()
@@ -241,7 +241,7 @@ class Translator:
         return result
 
     def write(self, out: Memory, value: Value) -> None:
-        """Write the elements of a value into an array, from its offset on."""
+        """Write the elements of a value into an array, starting at its offset."""
         if not value.size:
             return
         if not isinstance(value, Memory) and not isinstance(value.flat[0], Element):
@@ -261,7 +261,7 @@ class Translator:
         self.line(f"{head} {out.at(i)} = {text};", out.uniform)
 
     def joined_in_memory(self, parts: Sequence[Value], form: Form) -> Memory:
-        """Return large arrays one after another, without a line for each element."""
+        """Concatenate large arrays without writing a line for each element."""
         out, begin = self.code.memory(form.shape, kind_of(form.dtype)), 0
         for part in parts:
             self.write(out._replace(offset=str(begin)), part)
@@ -306,7 +306,7 @@ def words_of(keys: Elements, word: int) -> Elements:
 
 
 def pairs(high: Elements, low: Elements) -> Elements:
-    """Return the random keys of these words."""
+    """Return the random keys with these words."""
     out = np.empty(high.shape, object)
     for cell in np.ndindex(high.shape):
         out[cell] = (high[cell], low[cell])

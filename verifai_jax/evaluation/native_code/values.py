@@ -17,7 +17,7 @@ import numpy as np
 
 
 class Untranslatable(Exception):
-    """A program has a part that this translator does not know; the text says which."""
+    """An error for a part of a program that this translator does not support; the text names it."""
 
 
 class Element(NamedTuple):
@@ -25,8 +25,8 @@ class Element(NamedTuple):
 
     - `text`: its C expression.
     - `kind`: `f`, `i`, `u` or `b`, for float, int, unsigned and truth values.
-    - `uniform`: whether it is the same for all simulations.
-    - `value`: the value of a constant; None for others.
+    - `uniform`: whether it is equal for all simulations.
+    - `value`: the value of a constant; otherwise None.
     """
 
     text: str
@@ -36,15 +36,15 @@ class Element(NamedTuple):
 
 
 class Memory(NamedTuple):
-    """An array in the memory of the program, its elements one after another.
+    """An array in the memory of the program, with contiguous elements.
 
     - `name`: the name of the C array.
-    - `kind`, `uniform`: as of an element.
+    - `kind`, `uniform`: as in `Element`.
     - `shape`: the shape of the array.
     - `offset`: C expression of the index of its first element; empty for 0.
-    - `values`: the values of a constant; None for others.
-    - `formula`: C expression of an element by its index, of an array that is not stored but
-      computed where it is used; None for others.
+    - `values`: the values of a constant; otherwise None.
+    - `formula`: for an array that is computed when used instead of stored, the C expression of an
+      element by its index; otherwise None.
     """
 
     name: str
@@ -56,7 +56,7 @@ class Memory(NamedTuple):
     formula: Callable[[str], str] | None = None
 
     def at(self, index: int | str) -> str:
-        """Return the C expression of an element, whose index may be one too."""
+        """Return the C expression of an element; the index may be a C expression, too."""
         if self.formula is not None:
             return f"({self.formula(f'({index})')})"
         index = f"{self.offset} + {index}" if self.offset else f"{index}"
@@ -97,7 +97,7 @@ KEY = "key"
 
 
 def kind_of(dtype: Form) -> str:
-    """Return the kind of a type of JAX.
+    """Return the kind of a JAX type.
 
     **Raises:** `Untranslatable` for types other than those of 32 bits, truth values, and keys.
     """
@@ -147,7 +147,7 @@ def elements(value: Value) -> Elements:
 
 
 def filled(shape: tuple[int, ...], element: Element | tuple[Element, Element]) -> Elements:
-    """Return an array whose elements are all the same one."""
+    """Return an array filled with one element."""
     out = np.empty(shape, object)
     flat = out.reshape(-1)
     for i in range(flat.size):
@@ -156,14 +156,14 @@ def filled(shape: tuple[int, ...], element: Element | tuple[Element, Element]) -
 
 
 def same(value: Elements) -> Any:
-    """Return the element that all elements of an array are; None if they differ."""
+    """Return the element that an array is filled with; None if its elements differ."""
     flat = value.ravel()
     first = flat[0] if flat.size else None
     return first if all(each is first for each in flat) else None
 
 
 def names_in(value: Value) -> Iterator[str]:
-    """Yield the names of the program of which a value is made, one as often as it occurs."""
+    """Yield the program variables that a value uses, each as often as it occurs."""
     if isinstance(value, Memory):
         yield from _NAME.findall(value.at("0"))
         return

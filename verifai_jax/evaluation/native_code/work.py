@@ -7,9 +7,9 @@ from verifai_jax.evaluation.native_code.values import Program
 
 
 def work_of(program: Program) -> int:
-    """Count the operations on single numbers of a `Jaxpr`: those of loops as often as they run.
+    """Count the scalar operations of a `Jaxpr`; those in loops count as often as they run.
 
-    Of a loop that ends by its own condition one round is counted, of branches all.
+    For a loop with a condition one iteration counts, for a conditional all branches.
     """
     count = 0
     for step in program.eqns:

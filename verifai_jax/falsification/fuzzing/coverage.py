@@ -58,7 +58,7 @@ class Covered:
             return share
         shown = ", ".join(self.missing[:MAX_NAMED])
         more = len(self.missing) - MAX_NAMED
-        return f"{share}; missing {shown}{f' and {more} more' if more > 0 else ''}"
+        return f"{share}; not covered: {shown}{f' and {more} more' if more > 0 else ''}"
 
 
 _NOUNS = {

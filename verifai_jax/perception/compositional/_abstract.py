@@ -65,41 +65,42 @@ def abstract(
     images_per_simulation: int | None = None,
     progress: bool | None = None,
 ) -> result.Compositional:
-    """Find failures of a loop that its perception causes, with few rendered images.
+    """Find failures of a loop that its perception causes, rendering few images.
 
     Three stages:
 
-    1. The loop is simulated without images: with a perception that knows the truth (the best), and
-       with the worst one that is allowed. Where it fails with the worst only lies the *region of
-       uncertainty*: there, and only there, an error of the perception can decide. For each of its
-       points the least error with which the loop fails is found by bisection.
-    2. In the region, a search looks for images on which the network errs. One image is rendered
-       for each point: from the last instant at which the perception must err for the loop to fail.
-    3. Points with such an image are simulated with the network in the loop, those with the largest
-       error first. Only what fails there is a failure. After each batch of images as many images
-       go into such simulations at most, or one simulation.
+    1. The loop is simulated without images: once with a perfect perception, and once with the worst
+    allowed one. Where it fails only with the worst one is the *region of uncertainty*: only there
+    can an error of the perception decide. For each of its points, bisection finds the smallest
+    error with which the loop fails. 2. In the region, a search looks for images on which the
+    network errs. One image is rendered for each point: from the last instant at which the
+    perception must err for the loop to fail. 3. Points with such an image are simulated with the
+    network in the loop, those with the largest error first. Only points that fail there are
+    failures. After each batch of images at most as many images are spent on such simulations, but
+    at least one simulation.
 
-    Failures outside the region, from errors that are worse than the worst one allowed, are not
-    looked for. Images that only fill up a compiled batch are not counted.
+    Failures outside the region, which need a larger error than allowed, are not searched for.
+    Images that only fill up a compiled batch are not counted.
 
     **Arguments:**
     - `problem`: the loop with its network, one image at each sample of its traces.
     - `abstraction`: `severity -> system`, the same loop without images: its perception is the truth
-      with an error of a severity from 0 (none) to 1 (the worst allowed); JAX traces it. Its
-      simulations have one random key.
-    - `frame`: `(features, sample) -> signals`: renders one image from where the loop is in one
-      sample of a trace of the abstraction, and returns what `error` speaks of.
-    - `error`: a condition on the signals of one instant, of both the abstraction and `frame`: the
-      perception errs. The search for images raises its robustness, so continuous signals
-      (a logit, a distance) help it more than a decision.
-    - `search`: the search of images: a name, or a search with its options.
-    - `budget`: rendered images, at most.
-    - `stop_after`: confirmed failures after which it ends.
-    - `samples`: of the prior, to sample the region of uncertainty.
-    - `batch`: images of a round.
+      with an error of a severity from 0 (none) to 1 (the worst allowed); JAX traces it. All its
+      simulations use one random key.
+    - `frame`: `(features, sample) -> signals`: renders one image from the state in one sample of
+      the abstraction's trace, and returns the signals that `error` uses.
+    - `error`: a condition that the perception errs, on the signals of one instant, both of the
+      abstraction and of `frame`. The search for images maximises its robustness, so continuous
+      signals (a logit, a distance) work better than a decision.
+    - `search`: the search for images: a name, or a search with its options.
+    - `budget`: maximum number of rendered images.
+    - `stop_after`: number of confirmed failures after which it ends.
+    - `samples`: number of samples of the prior, to sample the region of uncertainty.
+    - `batch`: number of images in a round.
     - `seed`: the same seed gives the same result, bit for bit, on the same machine.
-    - `images_per_simulation`: where it is not one at each sample of a trace.
-    - `progress`: show a progress bar; by default on a terminal or in a notebook.
+    - `images_per_simulation`: number of images in a simulation; by default one for each sample of a
+      trace.
+    - `progress`: whether to show a progress bar; by default on a terminal or in a notebook.
     **Returns:** the region, the images, the candidates and which of them fail in the loop, with the
     number of rendered images of each stage.
     **Raises:** before anything is rendered, `ProblemError` for parts that do not fit; `ValueError`
@@ -170,8 +171,8 @@ def _images(problem: Problem) -> int:
     form = problem.form()
     if form is None:
         raise ValueError(
-            f"how many images a simulation of {problem.name!r} takes is not known before it runs: "
-            "give images_per_simulation"
+            f"the number of images that a simulation of {problem.name!r} takes is not known in "
+            "advance: give images_per_simulation"
         )
     return form.length
 
@@ -298,12 +299,12 @@ CANDIDATE = ("image", "simulated", "rho", "fails", "rendered")
 
 
 class DecisiveImage(System):
-    """The network's reading of the last image that the loop cannot do without.
+    """The network's output for the last image that must be wrong for the loop to fail.
 
     **Arguments:**
     - `loop`: the loop without images.
-    - `frame`: renders one image, and returns the signals of the network's reading.
-    - `lanes`: images that are worked on together.
+    - `frame`: renders one image, and returns the signals of the network's output.
+    - `lanes`: number of images processed together.
     """
 
     exact_step = True

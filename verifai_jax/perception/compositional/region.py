@@ -39,7 +39,7 @@ class Outcome(NamedTuple):
     """The verdict of one abstract simulation.
 
     - `rho`: the least robustness over the formulas; NaN without a verdict.
-    - `fails`: whether it ended properly and breaks a formula.
+    - `fails`: whether the simulation ended properly and breaks a formula.
     - `proper`: whether it has a verdict.
     """
 
@@ -51,10 +51,10 @@ class Outcome(NamedTuple):
 class Decisive(NamedTuple):
     """The instant at which the perception decides.
 
-    - `severity`: the least error with which the loop fails.
+    - `severity`: the smallest error with which the loop fails.
     - `sample`: the signals at the last instant of that loop at which the perception errs.
-    - `instant`: its number.
-    - `erring`: number of instants at which it errs.
+    - `instant`: the index of that instant.
+    - `erring`: number of instants at which the perception errs.
     """
 
     severity: Float[Array, ""]
@@ -67,9 +67,9 @@ class AbstractLoop:
     """A loop whose perception is the truth with an error of a given severity.
 
     **Arguments:**
-    - `problem`: the loop with the network; its formulas decide.
+    - `problem`: the loop with the network, whose formulas decide.
     - `abstraction`: `severity -> system`, without images.
-    - `error`: a condition on the signals of one instant: the perception errs.
+    - `error`: a condition that the perception errs, on the signals of one instant.
     - `seed`: the seed of the random key of all abstract simulations.
     """
 
@@ -80,11 +80,11 @@ class AbstractLoop:
         self.key = run_keys(seed)[1]
 
     def trace(self, features: Features, severity: Float[Array, ""] | float) -> Trace:
-        """Simulate with an error of this severity."""
+        """Return the trace of the loop with an error of this severity."""
         return as_system(self.abstraction(severity))(features, self.key)
 
     def outcome(self, features: Features, severity: Float[Array, ""] | float) -> Outcome:
-        """Simulate the loop with an error of this severity, and return its verdict."""
+        """Return the verdict of the loop with an error of this severity."""
         trace = self.trace(features, severity)
         rho, status = trace_verdict(self.problem, trace)
         proper = status == Status.OK
@@ -92,15 +92,14 @@ class AbstractLoop:
         return Outcome(jnp.min(rho), proper & ~holds, proper)
 
     def uncertain(self, features: Features) -> Bool[Array, ""]:
-        """Return whether the loop fails with the worst perception, and keeps with the best."""
+        """Return whether the loop fails with the worst perception, but not with the best."""
         best, worst = self.outcome(features, 0.0), self.outcome(features, 1.0)
         return best.proper & ~best.fails & worst.fails
 
     def severity(self, features: Features) -> Float[Array, ""]:
-        """Return the least severity at which the loop fails, by bisection between 0 and 1.
+        """Return the smallest severity at which the loop fails, by bisection between 0 and 1.
 
-        Where failing is not monotone in the severity, it is one at which the loop fails, and below
-        which it does not.
+        If failing is not monotone in the severity, the loop fails at the result and not just below.
         """
 
         def halve(_: Any, ends: tuple[Array, Array]) -> tuple[Array, Array]:
@@ -132,8 +131,8 @@ def sample_region(loop: AbstractLoop, samples: int, seed: int) -> pd.DataFrame:
     """Simulate samples of the prior with the best and the worst perception.
 
     **Returns:** a row for each: the features; `kind`; `best` and `worst`, the robustness with
-    either perception; `severity`, the least with which it fails, and `erring`, the number of
-    instants at which the perception errs then, both NaN unless it is uncertain.
+    either perception; `severity`, the smallest with which it fails, and `erring`, the number of
+    instants at which the perception then errs, both NaN unless it is uncertain.
     """
 
     def judge(features: Features) -> dict[str, Array]:

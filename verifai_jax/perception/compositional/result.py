@@ -33,19 +33,19 @@ class Compositional(InNotebook):
     - `name`: the name of the problem.
     - `error`: the condition under which the perception errs.
     - `region`: a row for each sample of the prior: its features; `kind` (`"uncertain"`, `"safe"`
-      with the worst perception too, `"fails anyway"`, `"no verdict"`); `best` and `worst`, the
-      robustness with either perception; `severity`, the least error with which it fails, and
-      `erring`, the number of instants at which the perception errs then, NaN unless uncertain.
+      even with the worst perception, `"fails anyway"`, `"no verdict"`); `best` and `worst`, the
+      robustness with either perception; `severity`, the smallest error with which it fails, and
+      `erring`, the number of instants at which the perception then errs, NaN unless uncertain.
     - `images`: the run that looked for images; None if nothing is uncertain.
-    - `simulations`: a run of one simulation for each candidate that was simulated.
+    - `simulations`: a run with the simulations of candidates.
     - `candidates`: a row for each image on which the network errs: features; `image`, how far it
       errs (minus the robustness of `error`); `simulated`, the status of its simulation with the
-      network, empty if there was none; `rho` and `fails` of it; `rendered`, the images rendered
-      until then, in all.
-    - `images_per_simulation`: rendered in one simulation.
-    - `budget`, `search`, `seed`: as it was called.
-    - `ended`: `"found"`, `"budget"`, `"nothing uncertain"`, `"interrupted"`, or what else ended the
-      search for images.
+      network, empty if there was none; `rho` and `fails` of that; `rendered`, the total number of
+      images rendered until then.
+    - `images_per_simulation`: number of images rendered in one simulation.
+    - `budget`, `search`, `seed`: the arguments of the call.
+    - `ended`: `"found"`, `"budget"`, `"nothing uncertain"`, `"interrupted"`, or another reason why
+      the search for images ended.
     - `version`: the version of verifai_jax.
     """
 
@@ -65,7 +65,7 @@ class Compositional(InNotebook):
 
     @property
     def frames(self) -> dict[str, int]:
-        """Rendered images: of the search for images, of simulations, and in all."""
+        """Number of rendered images: for the search, for simulations, and in all."""
         images = 0 if self.images is None else len(self.images.table)
         simulated = self.images_per_simulation * len(self.simulations)
         return {"images": images, "simulations": simulated, "total": images + simulated}
@@ -79,8 +79,8 @@ class Compositional(InNotebook):
         """Simulate a confirmed failure again, and keep its trace.
 
         **Arguments:**
-        - `number`: 0 is the first that was found.
-        **Raises:** `IndexError` where there are not as many.
+        - `number`: index of the failure, in the order in which they were found.
+        **Raises:** `IndexError` if there are fewer.
         """
         failing = [run for run in self.simulations if len(run.table.counterexamples)]
         if not 0 <= number < len(failing):
@@ -95,7 +95,7 @@ class Compositional(InNotebook):
         Samples that fail anyway or have no verdict are left out.
 
         **Arguments:**
-        - `options`: those of `vj.analysis.rules`.
+        - `options`: the options of `vj.analysis.rules`.
         """
         known = self.region["kind"].isin([UNCERTAIN, SAFE])
         columns = list(self.problem.space.columns)
@@ -105,19 +105,19 @@ class Compositional(InNotebook):
     def plot(
         self, path: str | Path | None = None, features: tuple[str, str] | None = None
     ) -> Figure:
-        """Draw the region of uncertainty over two features, by the least error that fails.
+        """Draw the region of uncertainty over two features, coloured by the smallest failing error.
 
         **Arguments:**
-        - `path`: file that the picture is written to, if given.
-        - `features`: the columns; by default the two that the region depends on most.
+        - `path`: file to which the picture is written, if given.
+        - `features`: the columns; by default the two on which the region depends most.
         **Returns:** the figure.
-        **Raises:** `UnknownNameError` for a column that the table has not.
+        **Raises:** `UnknownNameError` for a column that the table does not have.
         """
         draw = lazy_import("verifai_jax.reports.plotting.compositional", "plot_region")
         return draw(self, path, features)
 
     def summary(self) -> str:
-        """Write in words what was found, every number of it from the tables."""
+        """Write what was found; every number comes from the tables."""
         lines = [f"{self.name}: {self._finding()}", *self._region_lines()]
         if self.images is not None:
             lines += self._image_lines(self.images)

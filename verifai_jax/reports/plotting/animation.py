@@ -26,12 +26,12 @@ SIZE = (572, 330)
 
 @dataclass(frozen=True)
 class Animation:
-    """An animated GIF, which shows itself in a notebook; `gif` is the content of its file."""
+    """An animated GIF, which notebooks display; `gif` is the content of its file."""
 
     gif: bytes = field(repr=False)
 
     def save(self, path: str | Path) -> Path:
-        """Write the file, and the folders that it needs; returns the path.
+        """Write the file, making missing folders; returns the path.
 
         **Raises:** `ValueError` for a path that does not end in `.gif`.
         """
@@ -60,15 +60,14 @@ def animate(
     itself.
 
     **Arguments:**
-    - `replay`: what `run.replay` returned.
-    - `path`: a file that is written too; folders are made.
-    - `camera`: the name of a camera of a MuJoCo model; the one that sees best what moves when left
-      out.
+    - `replay`: the result of `run.replay`.
+    - `path`: a file to write as well; missing folders are made.
+    - `camera`: name of a camera of a MuJoCo model; by default the one that shows the motion best.
     - `size`: width and height of a frame in pixels.
-    - `fps`: frames a second; chosen when left out.
+    - `fps`: frames per second; chosen automatically when left out.
     **Raises:** `ValueError` for any other problem without `draw`, for a path that does not end in
-    `.gif`, a camera without a MuJoCo model, and invalid sizes; `UnknownNameError` for
-    a camera that the model lacks; `mujoco_scene.NoRenderer` where MuJoCo cannot draw.
+    `.gif`, a camera without a MuJoCo model, and invalid sizes; `UnknownNameError` for a camera that
+    the model lacks; `mujoco_scene.NoRenderer` if MuJoCo cannot draw.
     """
     _check_gif(path)
     check_film(size, fps)

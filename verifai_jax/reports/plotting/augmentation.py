@@ -19,11 +19,11 @@ def plot_arms(
     metric: str = "error",
     reference: str = "none",
 ) -> Figure:
-    """Draw a metric of each arm and seed, and the paired difference of each arm to one of them.
+    """Draw a metric of each arm and seed, and the paired difference of each arm and the reference.
 
     **Arguments:**
     - `metric`, `reference`: as in `Augmentation.compare`.
-    **Raises:** as `Augmentation.compare`.
+    **Raises:** the errors of `Augmentation.compare`.
     """
     differences = result.compare(metric, reference)
     arms = [str(arm) for arm in result.table["arm"].unique()]
@@ -69,7 +69,7 @@ def plot_montage(
 
     **Arguments:**
     - `arm`, `seed`: the arm, and the seed of its training.
-    - `count`: images at most.
+    - `count`: maximum number of images.
     **Raises:** `ValueError` for inputs that are not images, or an arm that added nothing.
     """
     check_count("count", count)

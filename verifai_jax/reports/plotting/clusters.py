@@ -31,7 +31,7 @@ DOTS = 4000
 
 
 def plot_clusters(clusters: Clusters, path: str | Path | None = None) -> Figure:
-    """Draw the clusters over the two columns that tell them apart best."""
+    """Draw the clusters over the two columns that separate them best."""
     samples = clusters.samples
     across, up = distinguishing_columns(clusters)
     figure = new_figure(figsize=(6.2, 4.4))
@@ -105,7 +105,7 @@ def distinguishing_columns(clusters: Clusters) -> tuple[str, str]:
 
 
 def plot_diverse(diverse: Diverse, path: str | Path | None = None) -> Figure:
-    """Draw the rows among all, in their order, and the distance of each from those before."""
+    """Draw the chosen rows among all, and the distance of each from the earlier ones."""
     figure = new_figure(figsize=(8.6, 4.0))
     cloud, curve = figure.subplots(1, 2, width_ratios=(1.4, 1))
     across, up = two_columns(diverse.samples)

@@ -14,11 +14,11 @@ from verifai_jax.reports.plotting import style
 def plot_region(
     result: Compositional, path: str | Path | None = None, features: tuple[str, str] | None = None
 ) -> Figure:
-    """Draw the samples of the region by the least error that fails, and the confirmed failures.
+    """Draw the samples of the region by the smallest error that fails, and the confirmed failures.
 
     **Arguments:**
-    - `features`: the columns across and up; by default the two that the region depends on most.
-    **Raises:** `UnknownNameError` for a column that the table has not.
+    - `features`: the columns of the two axes; by default the two on which the region depends most.
+    **Raises:** `UnknownNameError` for a column that the table does not have.
     """
     region, columns = result.region, list(result.problem.space.columns)
     if features is None:

@@ -17,7 +17,7 @@ def plot_estimate(estimate: Estimate, path: str | Path | None = None) -> Figure:
     """Draw the interval, the splitting levels and the weights of an estimate.
 
     **Arguments:**
-    - `estimate`: the estimate; levels and weights are drawn where it has any.
+    - `estimate`: the estimate; levels and weights are drawn if it has them.
     """
     levels = estimate.diagnostics.get("levels") or []
     weights = estimate.drawn.get("weights")

@@ -10,7 +10,7 @@ from verifai_jax.reports.plotting.style import FAILING, new_figure, show_or_save
 
 
 def plot_pairs(coverage: FuzzCoverage, path: str | Path | None = None) -> Figure:
-    """Draw the pairs of transitions that can follow each other, by how often they did.
+    """Draw the possible pairs of consecutive transitions, by how often they occurred.
 
     **Arguments:**
     - `coverage`: the coverage of a run whose features have an automaton; the first one is drawn.

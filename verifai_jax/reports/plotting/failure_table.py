@@ -13,7 +13,7 @@ SMALLEST = 1e-9
 
 
 def plot_failure_table(found: FailureTable, path: str | Path | None = None) -> Figure:
-    """Draw the probability of a failure by each fault and pair, with its interval."""
+    """Draw the probability of a failure for each fault and pair, with its interval."""
     figure = style.new_figure(figsize=(7.2, 0.45 * max(len(found), 3) + 1.4))
     axes = figure.subplots()
     for index, effect in enumerate(found):

@@ -27,7 +27,7 @@ LAST = 1500
 
 
 def check_film(size: Sequence[int] | None, fps: float | None) -> None:
-    """Check the size in pixels and the frames a second of a film.
+    """Check the size in pixels and the frame rate of a film.
 
     **Raises:** `ValueError`, `TypeError`.
     """
@@ -43,12 +43,12 @@ def check_film(size: Sequence[int] | None, fps: float | None) -> None:
 def film_samples(
     clock: Float[np.ndarray, " samples"], fps: float | None, usual: float
 ) -> tuple[Int[np.ndarray, " frames"], float]:
-    """Return the samples that a film shows, in real time where they are not too many.
+    """Return the samples for a film, in real time unless there are too many.
 
     **Arguments:**
-    - `clock`: seconds of each sample.
-    - `fps`: frames a second; None for `usual` many.
-    **Returns:** the samples, and the milliseconds of each frame.
+    - `clock`: time of each sample in seconds.
+    - `fps`: frames per second; None for the `usual` rate.
+    **Returns:** the samples, and the duration of each frame in milliseconds.
     """
     seconds = float(clock[-1] - clock[0])
     maximum = MAX_FRAMES if fps is None else MAX_WANTED
@@ -60,14 +60,14 @@ def film_samples(
 
 
 def caption_of(replay: Replay) -> str:
-    """Return what is written above the frames: the problem, the row and the verdict."""
+    """Return the caption of the frames: the problem, the row and the verdict."""
     row = "" if replay.row is None else f", row {replay.row}"
     verdict = "violated" if replay.violated else replay.status.name.lower()
     return f"{replay.problem.name}{row}: {verdict}"
 
 
 def decided_at(replay: Replay) -> int | None:
-    """Return the sample that decided a failure; None for a simulation that kept its property."""
+    """Return the sample that decided a failure; None if the property held."""
     if not replay.violated:
         return None
     formula = replay.problem.formulas[replay.worst]
@@ -78,9 +78,9 @@ def decided_at(replay: Replay) -> int | None:
 def labelled(
     image: Frame, caption: str, seconds: float, failed: bool
 ) -> UInt8[np.ndarray, "taller width 3"]:
-    """Write caption and time above a frame, with a red edge where the property has `failed`.
+    """Draw caption and time above a frame, with a red edge once the property has `failed`.
 
-    A caption that is too long for the frame lacks its middle.
+    In a caption that is too long for the frame the middle is left out.
     """
     from PIL import Image, ImageDraw, ImageFont
 
@@ -104,7 +104,7 @@ def labelled(
 
 
 def gif(frames: Sequence[Frame], shown: float) -> bytes:
-    """Return an animated GIF of frames that are `shown` milliseconds each."""
+    """Return an animated GIF of frames that are each shown for `shown` milliseconds."""
     from PIL import Image
 
     # One palette for all and no dithering, so that what does not move keeps its colour and the file

@@ -15,7 +15,7 @@ BARS = 16
 
 
 def plot_frequent_patterns(patterns: FrequentPatterns, path: str | Path | None = None) -> Figure:
-    """Draw the shares of the patterns with the greatest lift, and the shares expected."""
+    """Draw the shares of the patterns with the greatest lift, and their expected shares."""
     compared = patterns.against != "nothing"
     shown = patterns.distinctive.head(BARS).sort_values("share", ascending=False, kind="stable")
     longest = max((len(text) for text in shown["combination"]), default=0)

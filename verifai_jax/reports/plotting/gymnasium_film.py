@@ -16,7 +16,7 @@ FRAMES_PER_SECOND = 20
 
 
 def episode_of(system: object) -> EpisodeFunction | None:
-    """Return the episodes of a system that `vj.gymnasium` made; None for any other."""
+    """Return the episodes of a system made by `vj.gymnasium`; None for any other."""
     function = getattr(getattr(system, "simulation", None), "function", None)
     return function if isinstance(function, EpisodeFunction) else None
 
@@ -24,12 +24,12 @@ def episode_of(system: object) -> EpisodeFunction | None:
 def film_episode(
     replay: Replay, size: Sequence[int] | None = None, fps: float | None = None
 ) -> bytes:
-    """Simulate an episode again, in this process, and return what the environment draws as a GIF.
+    """Simulate an episode again in this process, and return the environment's pictures as a GIF.
 
     **Arguments:**
-    - `replay`: the replay of a problem with an environment of Gymnasium.
-    - `size`: width and height in pixels; those of the environment when left out.
-    - `fps`: frames a second; `FRAMES_PER_SECOND` when left out.
+    - `replay`: the replay of a problem with a Gymnasium environment.
+    - `size`: width and height in pixels; by default those of the environment.
+    - `fps`: frames per second; `FRAMES_PER_SECOND` when left out.
     **Raises:** `ValueError` for an environment that draws no pictures.
     """
     film.check_film(size, fps)

@@ -30,7 +30,7 @@ def plot_modes(modes: Modes, path: str | Path | None = None) -> Figure:
     """Draw the probability of each mode with its interval, and failures of each mode.
 
     **Returns:** the figure. Failures are drawn over the two numerical features in which the modes
-    differ most, next to their likeliest ones.
+    differ most, together with each mode's likeliest failure.
     """
     numeric = _apart(modes)
     figure = style.new_figure(figsize=(10.4 if numeric else 6.2, 0.6 * max(len(modes), 4) + 1.6))

@@ -22,13 +22,13 @@ from verifai_jax.systems.mujoco.system import MuJoCo
 
 @dataclass(frozen=True, eq=False)
 class Motion:
-    """A model, and where it was at each sample that counts.
+    """A model, and its positions at each valid sample.
 
-    - `model`: a `mujoco.MjModel` of its own, with the features in place.
-    - `clock`: seconds of each sample.
-    - `pushes`: forces and torques on the bodies, from outside.
-    - `caption`: what is written above the frames.
-    - `decisive`: the sample that decided a failure, None for a simulation that kept its spec.
+    - `model`: a separate `mujoco.MjModel`, with the features applied.
+    - `clock`: time of each sample in seconds.
+    - `pushes`: external forces and torques on the bodies.
+    - `caption`: the caption of the frames.
+    - `decisive`: the sample that decided a failure; None if the property held.
     """
 
     model: Any
@@ -40,7 +40,7 @@ class Motion:
 
 
 def can_draw(system: object) -> bool:
-    """Return whether a system has a MuJoCo model, which can be drawn by itself."""
+    """Return whether a system has a MuJoCo model that can be drawn."""
     return isinstance(system, MuJoCo) or _model_of(system) is not None
 
 
@@ -53,7 +53,7 @@ def _model_of(system: object) -> Any:
 
 
 def record(replay: Replay) -> Motion:
-    """Simulate a replay once more, on the same engine, and keep the positions.
+    """Simulate a replay once more with the same engine, and keep the positions.
 
     **Raises:** `ValueError` for a system without a MuJoCo model.
     """

@@ -44,7 +44,7 @@ ARROW = np.array([0.82, 0.2, 0.3, 1.0], np.float32)
 
 
 class NoRenderer(RuntimeError):
-    """There is no OpenGL to draw with; one line that says what to install or set."""
+    """An error if there is no OpenGL for drawing; the message says what to install or set."""
 
 
 def film(
@@ -55,12 +55,12 @@ def film(
     camera: str | None = None,
     fps: float | None = None,
 ) -> Path:
-    """Write an animated GIF, in real time where its frames are not too many.
+    """Write an animated GIF, in real time unless there are too many frames.
 
     **Arguments:**
     - `size`: width and height in pixels; `SIZE` when left out.
-    - `camera`: as for `frames`.
-    - `fps`: frames a second; `FRAMES_PER_SECOND` when left out.
+    - `camera`: as in `frames`.
+    - `fps`: frames per second; `FRAMES_PER_SECOND` when left out.
     **Raises:** `NoRenderer`; `UnknownNameError` for a camera that the model lacks.
     """
     check_film(size, fps)
@@ -83,15 +83,15 @@ def strip(
     size: tuple[int, int] = (280, 300),
     camera: str | None = None,
 ) -> Path:
-    """Write a PNG of `count` instants side by side, from the start to the end.
+    """Write a PNG of `count` frames side by side, from the start to the end.
 
-    Those of a failure close in on the sample that decided it.
+    For a failure the frames are concentrated around the deciding sample.
 
     **Arguments:**
-    - `count`: instants.
+    - `count`: number of frames.
     - `size`: width and height of each in pixels.
-    - `camera`: as for `frames`.
-    **Raises:** as `film`.
+    - `camera`: as in `frames`.
+    **Raises:** the errors of `film`.
     """
     from PIL import Image
 
@@ -121,10 +121,10 @@ def frames(
     """Draw the motion at some samples.
 
     **Arguments:**
-    - `samples`: their numbers.
+    - `samples`: their indices.
     - `size`: width and height in pixels.
-    - `camera`: the name of one of the model's; when left out, the one that sees best what moves
-      (`mujoco_view.best_view`), of the model's or one that is made for it.
+    - `camera`: the name of one of the model's cameras; by default the one that shows the motion
+      best (`mujoco_view.best_view`), among the model's and some made for this purpose.
     **Returns:** a picture `[height, width, 3]` of each.
     **Raises:** `NoRenderer`; `UnknownNameError`.
     """
@@ -144,14 +144,14 @@ def frames(
 
 @contextmanager
 def canvas(model: Any, size: tuple[int, int]) -> Iterator[Any]:
-    """Give `draw(data, camera, option, arrows) -> pixels` for pictures of `size`, off the screen.
+    """Provide `draw(data, camera, option, arrows) -> pixels` for off-screen pictures of `size`.
 
-    `arrows` are pairs of points, tail and tip. With `numbers=True` it gives, in place of colours,
-    the number of the geom that each pixel shows `[height, width]`, -1 for none.
+    `arrows` are pairs of points, tail and tip. With `numbers=True` it returns, instead of colours,
+    the index of the geom in each pixel `[height, width]`, -1 for none.
 
-    The model's settings of light and buffers are raised to what such pictures need.
+    The model's settings of light and buffers are raised as needed for such pictures.
 
-    **Raises:** `NoRenderer` where no OpenGL answers.
+    **Raises:** `NoRenderer` if there is no OpenGL.
     """
     mujoco = require("mujoco", extra="mujoco")
     width, height = size
@@ -251,7 +251,7 @@ def _gl() -> Any:
 
 
 def explain_failure(error: Exception) -> str:
-    """Explain in one line why there is no picture, and what to do about it."""
+    """Explain in one line why there is no picture, with a remedy."""
     said = (str(error).strip() or type(error).__name__).splitlines()[0]
     return (
         f"MuJoCo cannot draw here (MUJOCO_GL={os.environ.get('MUJOCO_GL', '')!r}): {said}; without "
@@ -292,10 +292,10 @@ def named_view(model: Any, name: str) -> Any:
 
 
 def best_view(motion: Motion, draw: Callable[..., Any], size: tuple[int, int]) -> Any:
-    """Return the camera that sees best what moves.
+    """Return the camera that shows the motion best.
 
     **Arguments:**
-    - `draw`: what `mujoco_scene.canvas` gives, for pictures of this `size`.
+    - `draw`: the function from `mujoco_scene.canvas` for pictures of this `size`.
     """
     mujoco = require("mujoco", extra="mujoco")
     model, data = motion.model, mujoco.MjData(motion.model)

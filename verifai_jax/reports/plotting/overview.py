@@ -125,7 +125,7 @@ def plot_bars(
     **Arguments:**
     - `table`: a row for each feature; intervals are in the columns `NAME_low` and `NAME_high`, or
       in `low` and `high`.
-    - `columns`: the name in the legend of each column to draw, empty for none.
+    - `columns`: the legend text of each column to draw, empty for none.
     """
     figure = style.new_figure(figsize=(6.4, 1.3 + 0.38 * len(table) + 0.2 * (len(columns) > 1)))
     axes = figure.subplots()
@@ -169,7 +169,7 @@ def plot_effects(table: pd.DataFrame, title: str, path: str | Path | None = None
     """Draw the mean size of elementary effects against their standard deviation.
 
     **Arguments:**
-    - `table`: that of `analysis.morris`.
+    - `table`: the table from `analysis.morris`.
     """
     figure = style.new_figure(figsize=(5.6, 4.4))
     axes = figure.subplots()

@@ -20,7 +20,7 @@ MAX_LABELS = 12
 
 
 def plot_rules(rules: Rules, path: str | Path | None = None) -> Figure:
-    """Draw samples over the features that the rules use most, with the rules' boxes."""
+    """Draw samples over the features that the rules use most, with the boxes of the rules."""
     samples = rules.samples
     used = [c.feature for rule in rules.rules for c in rule.conditions]
     across, up = two_features(samples, used)
@@ -36,15 +36,15 @@ def plot_rules(rules: Rules, path: str | Path | None = None) -> Figure:
 
 
 def two_features(samples: Samples, preferred: list[str]) -> tuple[str, str]:
-    """Return the first two of `preferred` and then of all features; a single one twice."""
+    """Return the first two features, starting with `preferred`; a single one twice."""
     names = list(dict.fromkeys([*preferred, *samples.names]))
     return names[0], names[1] if len(names) > 1 else names[0]
 
 
 def draw_samples(axes: Axes, samples: Samples, across: str, up: str, size: float = 9) -> None:
-    """Draw safe rows (green) and then failing ones (red) over two features, 3000 each at most.
+    """Draw safe rows (green), then failing ones (red) over two features, at most 3000 of each.
 
-    Unordered values are spread a little around their place.
+    Unordered values are spread slightly around their position.
     """
     columns = {column.name: column for column in samples.columns}
     x, y = cells(samples, across, up)
@@ -71,7 +71,7 @@ def draw_samples(axes: Axes, samples: Samples, across: str, up: str, size: float
 def cells(
     samples: Samples, across: str, up: str
 ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
-    """Return where the rows are drawn; over a single feature the robustness is the other axis."""
+    """Return the positions of rows; with a single feature the robustness is the other axis."""
     columns = {column.name: column for column in samples.columns}
     x = _positions(samples, columns[across], seed=0)
     if up != across:
@@ -82,9 +82,10 @@ def cells(
 def draw_rule(
     axes: Axes, samples: Samples, rule: Rule, across: str, up: str, number: int, noun: str = ""
 ) -> None:
-    """Draw the boxes of a rule over two features, dashed where it has conditions on others.
+    """Draw the boxes of a rule over two features, dashed if it has conditions on others.
 
-    The labels of four consecutive numbers are inside different corners, as boxes may share theirs.
+    The labels of four consecutive boxes are inside different corners, since boxes may share
+    corners.
     """
     from matplotlib.patches import Rectangle
 

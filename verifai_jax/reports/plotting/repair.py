@@ -9,7 +9,7 @@ from verifai_jax.synthesis.results import Repair
 
 
 def plot_repair(repair: Repair, path: str | Path | None = None) -> Figure:
-    """Draw the worst robustness that the attack of each round found."""
+    """Draw the worst robustness found by the attack of each round."""
     figure = new_figure(figsize=(5.0, 3.0))
     axes = figure.subplots()
     worst = [turn.worst for turn in repair.rounds]

@@ -51,12 +51,12 @@ def plot_replay(
 ) -> Figure:
     """Draw the signals over time with the bounds of all formulas, violations and the instant.
 
-    The signals that formulas speak of come first, then the features that are functions of time
-    (`vj.Signal`), then the others, as many as there is room for.
+    The signals of formulas come first, then the features that are functions of time (`vj.Signal`),
+    then other signals as far as there is room.
 
     **Arguments:**
-    - `signals`: the signals and Signal features to draw, in this order; chosen when left out.
-    **Raises:** `UnknownNameError` for a signal that does not exist; `ValueError` for none.
+    - `signals`: the signals and Signal features to draw, in this order; by default a selection.
+    **Raises:** `UnknownNameError` for a signal that does not exist; `ValueError` for an empty list.
     """
     trace, formulas = replay.trace, replay.problem.formulas
     if isinstance(signals, str):
@@ -150,10 +150,10 @@ def telling_signals(
     curves: Mapping[str, Shaped[np.ndarray, "t *vector"]],
     shown: Sequence[str],
 ) -> list[str]:
-    """Return signals in the order in which they are worth a panel.
+    """Return signals in order of their interest for a panel.
 
-    What changes comes before what does not, and one signal of each body (`car_x`, `car_y` are of
-    one) before a second one: `shown` are drawn already.
+    Changing signals come before constant ones, and one signal of each body (`car_x` and `car_y`
+    belong to one) before a second one; signals in `shown` are already drawn.
     """
     count: dict[str, int] = {}
 

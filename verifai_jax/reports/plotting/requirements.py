@@ -17,7 +17,7 @@ from verifai_jax.reports.plotting import style
 
 
 def plot_mined(mined: Mined, path: str | Path | None = None) -> Figure:
-    """Draw the corners of a front, and the values that were chosen.
+    """Draw the corners of a front, and the chosen values.
 
     **Raises:** `ValueError` for one parameter, which has no front.
     """
@@ -42,9 +42,9 @@ def plot_mined(mined: Mined, path: str | Path | None = None) -> Figure:
 
 
 def plot_examples(examples: Examples, path: str | Path | None = None) -> Figure:
-    """Draw the traces next to each other: a row for each signal, and one for the truth.
+    """Draw the traces side by side: a row for each signal, and one for the truth.
 
-    **Raises:** `ValueError` where no trace was found.
+    **Raises:** `ValueError` if no trace was found.
     """
     titles = {"satisfying": "satisfies", "barely": "barely satisfies", "breaking": "breaks"}
     traces = {
@@ -55,9 +55,9 @@ def plot_examples(examples: Examples, path: str | Path | None = None) -> Figure:
 
 
 def plot_distinction(distinction: Distinction, path: str | Path | None = None) -> Figure:
-    """Draw the trace that tells two formulas apart, and when each of them holds.
+    """Draw the trace that distinguishes two formulas, and when each of them holds.
 
-    **Raises:** `ValueError` where no trace was found.
+    **Raises:** `ValueError` if no trace was found.
     """
     traces = {} if distinction.trace is None else {distinction.source: distinction.trace}
     return _plot_traces([distinction.one, distinction.other], traces, path)

@@ -21,8 +21,8 @@ def plot_robustness_history(
     """Draw robustness over simulations with the running minimum; several runs share the axes.
 
     **Arguments:**
-    - `run`: a run, or runs by the label that the legend gives them.
-    - `axes`: to draw into; those of a new figure when left out.
+    - `run`: a run, or a dictionary of runs by their label in the legend.
+    - `axes`: axes to draw into; a new figure when left out.
     """
     runs = {"": run} if isinstance(run, Run) else run
     given: Any = axes

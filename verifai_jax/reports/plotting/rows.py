@@ -18,7 +18,7 @@ _PRIMES = (2, 3, 5, 7, 11, 13, 17, 19)
 
 
 def two_columns(samples: Samples) -> tuple[str, str]:
-    """Return the two columns to draw over: ordered ones that vary most relative to their range."""
+    """Return the two columns to draw over: ordered ones with the largest relative variation."""
     spread = samples.matrix().std(axis=0)
     ordered = [samples.ordered[j].name for j in np.argsort(-spread, kind="stable")]
     names = [*ordered, *(column.name for column in samples.unordered)]
@@ -26,14 +26,14 @@ def two_columns(samples: Samples) -> tuple[str, str]:
 
 
 def pair(samples: Samples, names: Sequence[str]) -> tuple[str, str]:
-    """Return the first two of the columns; a single one with the robustness, if there is any."""
+    """Return the first two columns; a single column with the robustness, if there is any."""
     if len(names) > 1:
         return names[0], names[1]
     return names[0], "rho" if np.isfinite(samples.rho).any() else names[0]
 
 
 def positions(samples: Samples, name: str, frame: pd.DataFrame) -> Float[np.ndarray, " n"]:
-    """Return where rows are drawn along a column; NaN for an absent entry."""
+    """Return the positions of rows along a column; NaN for an absent entry."""
     index = {column.name: j for j, column in enumerate(samples.columns)}.get(name)
     if index is None or samples.columns[index].ordered:
         return frame[name].to_numpy(np.float64)
@@ -52,7 +52,7 @@ def draw_rows(
     label: str,
     names: Sequence[str] | None = None,
 ) -> Float[np.ndarray, "drawn 2"]:
-    """Draw all samples faintly and `rows` (numbers) as rings; return where these are drawn."""
+    """Draw all samples faintly and `rows` (numbers) as rings; return the positions of these."""
     across, up = names or two_columns(samples)
     everything = samples.frame.iloc[:: max(1, len(samples) // DOTS)]
     chosen = samples.at(rows[:DOTS])
@@ -73,7 +73,7 @@ def draw_rows(
 
 
 def name_axes(axes: Axes, samples: Samples, across: str, up: str) -> None:
-    """Label the two axes; choices by their names."""
+    """Label the two axes, with the names of choices."""
     columns = {column.name: column for column in samples.columns}
     for name, axis in ((across, axes.xaxis), (up, axes.yaxis)):
         axis.set_label_text(name)

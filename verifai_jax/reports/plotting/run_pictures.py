@@ -21,7 +21,7 @@ def write_run_pictures(run: Run, folder: str | Path) -> list[Path]:
     The worst simulation is drawn when the run has its problem and a row with a verdict.
 
     **Arguments:**
-    - `folder`: to write into; made if missing.
+    - `folder`: the folder, made if missing.
     """
     folder = Path(folder)
     paths = [folder / "features.png", folder / "robustness.png"]
@@ -35,15 +35,14 @@ def write_run_pictures(run: Run, folder: str | Path) -> list[Path]:
 def write_replay_pictures(
     replay: Replay, folder: str | Path, name: str | None = None
 ) -> list[Path]:
-    """Write the pictures of one simulation into a folder, animated too where its problem can.
+    """Write the pictures of one simulation into a folder, and an animation if possible.
 
-    A MuJoCo model is also drawn as a strip of frames, `NAME-strip.png`. Where MuJoCo, or an
-    environment of Gymnasium, cannot draw, one line is logged that says why, and the pictures are
-    left out.
+    A MuJoCo model is also drawn as a strip of frames, `NAME-strip.png`. If MuJoCo or a Gymnasium
+    environment cannot draw, the reason is logged in one line, and the pictures are left out.
 
     **Arguments:**
-    - `folder`: to write into; made if missing.
-    - `name`: the name of the files, without an ending; by default that of the row.
+    - `folder`: the folder, made if missing.
+    - `name`: the name of the files without an ending; by default that of the row.
     """
     folder = Path(folder)
     name = name or ("replay" if replay.row is None else f"row-{replay.row}")

@@ -24,12 +24,12 @@ def plot_features(
 ) -> Figure:
     """Draw safe (green) and failing (red) samples over pairs of features.
 
-    Those that fail as simulated, and that closer replays did not confirm, are amber triangles;
-    those without a verdict are grey crosses.
+    Violations that closer replays did not confirm are amber triangles; rows without a verdict are
+    grey crosses.
 
     **Arguments:**
-    - `features`: names; by default the `maximum` that distinguish failing from safe samples best.
-    - `maximum`: features at most, where they are not named.
+    - `features`: names; by default the `maximum` features that best separate failures.
+    - `maximum`: maximum number of features, if they are not named.
     **Raises:** `UnknownNameError` for a feature that is not in the table.
     """
     table = run.table.all
@@ -107,10 +107,10 @@ def plot_features(
 
 
 def distinguishing_features(run: Run) -> list[str]:
-    """Return feature columns, first those that differ most between failing and safe rows.
+    """Return feature columns ordered by their difference between failing and safe rows.
 
-    The difference is the Kolmogorov-Smirnov distance; without failing rows, the correlation of
-    ranks with the robustness.
+    The difference is the Kolmogorov-Smirnov distance; without failing rows, the rank correlation
+    with the robustness.
     """
     table = run.table.all
     # Items that do not exist have no value, which differs from all other values.

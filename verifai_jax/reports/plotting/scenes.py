@@ -15,12 +15,12 @@ MARGIN = 4.0
 
 
 def draw_scene(program: Any, scene: Any, path: str | Path | None = None) -> Figure:
-    """Draw the objects of a scene, each with its name and where it heads; returns the figure.
+    """Draw the objects of a scene with their names and headings; returns the figure.
 
     **Arguments:**
     - `program`: a `ScenicProgram`.
-    - `scene`: one of its scenes, of Scenic.
-    - `path`: file to write the picture to.
+    - `scene`: one of its scenes, in Scenic's form.
+    - `path`: file to which the picture is written.
     """
     figure = new_figure(figsize=(6, 6))
     axes = figure.subplots()

@@ -28,19 +28,19 @@ DPI = 110
 
 
 def new_figure(**options: Any) -> Figure:
-    """Return an empty figure in the common layout and resolution."""
+    """Return an empty figure with the common layout and resolution."""
     return figure.new_figure(layout="constrained", dpi=DPI, **options)
 
 
 def tidy(axes: Axes) -> None:
-    """Remove the box around the data, and draw a faint grid behind it."""
+    """Remove the frame around the data, and draw a faint grid."""
     axes.spines[["top", "right"]].set_visible(False)
     axes.grid(alpha=0.25, linewidth=0.6)
     axes.set_axisbelow(True)
 
 
 def show_or_save(drawn: Figure, path: str | Path | None) -> Figure:
-    """Wrap what would be cut off, and write the figure where a path is given.
+    """Wrap text that would be cut off, and write the figure if a path is given.
 
     **Returns:** the figure, for a notebook to show.
     """
@@ -53,12 +53,12 @@ def show_or_save(drawn: Figure, path: str | Path | None) -> Figure:
 
 
 def wrap_name(name: str, width: int = 20, lines: int = 2) -> str:
-    """Break a name into lines after blanks and signs; one that is too long lacks its middle."""
+    """Break a name into lines after blanks and signs; if it is too long its middle is left out."""
     return "\n".join(_broken(shorten(name, width * lines), width))
 
 
 def log_ticks(axis: Axis) -> None:
-    """Name a few numbers on a logarithmic axis: powers of ten, round ones where these are few."""
+    """Label a few numbers on a logarithmic axis: powers of ten, or round numbers."""
     from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter, NullLocator
 
     low, high = axis.get_view_interval()
@@ -75,13 +75,13 @@ def log_ticks(axis: Axis) -> None:
 def name_points(
     axes: Axes, names: Sequence[str], x: Positions, y: Positions, low: Positions, high: Positions
 ) -> None:
-    """Write names next to points without overlaps; call it when the limits are set.
+    """Write names next to points without overlaps; call it after the limits are set.
 
-    A name that has no room at its point is moved up or down, and a line joins the two.
+    A name without room at its point is moved up or down, and joined to it by a line.
 
     **Arguments:**
     - `names`: the names of the points at `x` and `y`, in the units of the data.
-    - `low`, `high`: ends of a horizontal bar at each point, on which no name lies.
+    - `low`, `high`: ends of a horizontal bar at each point that no name may cover.
     """
     figure: Any = axes.figure
     figure.draw_without_rendering()

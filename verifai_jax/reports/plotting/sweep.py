@@ -39,7 +39,7 @@ MAX_BARS = 8
 
 
 def plot_sweep(sweep: Sweep, path: str | Path | None = None) -> Figure:
-    """Draw safety, learning curves and importance; the last two where there is any to show."""
+    """Draw safety, learning curves and importance, as far as available."""
     curves = _curve_rows(sweep)
     importance = sweep.importance()
     bars = bool(importance.scores)
@@ -59,7 +59,7 @@ def plot_sweep(sweep: Sweep, path: str | Path | None = None) -> Figure:
 
 
 def plot_importance(importance: HyperparameterImportance, path: str | Path | None = None) -> Figure:
-    """Draw the shares of the variance, or the trends where no model is reliable."""
+    """Draw the shares of the variance, or the trends if no model is reliable."""
     figure = style.new_figure(figsize=(6.4, 1.6 + 0.42 * len(importance.table)))
     _draw_importance(figure.subplots(), importance)
     return style.show_or_save(figure, path)

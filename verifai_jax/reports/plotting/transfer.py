@@ -18,10 +18,10 @@ from verifai_jax.reports.plotting.style import (
 
 
 def plot_transfer(result: Transfer, path: str | Path | None = None) -> Figure:
-    """Draw the signal that parts most in both engines, and the gaps by a feature.
+    """Draw the signal with the largest gap in both engines, and the gaps over a feature.
 
     **Arguments:**
-    - `path`: the picture that is written; none when left out.
+    - `path`: the file to write; none when left out.
     """
     figure = new_figure(figsize=(8.4, 3.4))
     left, right = figure.subplots(1, 2)

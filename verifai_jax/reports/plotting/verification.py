@@ -17,7 +17,7 @@ COLORS = {"proved": SAFE, "broken": FAILING, "undecided": NOT_CLAIMED}
 
 
 def plot_verification(result: Verification, path: str | Path | None = None) -> Figure:
-    """Draw each pair of the coordinates that were split most, as mixtures over the others."""
+    """Draw each pair of the coordinates that were split most, averaged over the others."""
     from matplotlib.colors import to_rgb
     from matplotlib.patches import Patch
 

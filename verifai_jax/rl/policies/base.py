@@ -40,16 +40,15 @@ ACTIONS = {
 
 @dataclass(frozen=True)
 class Actions:
-    """The way from the outputs of a network to an action.
+    """The conversion of a network's outputs to an action.
 
     - `kind`: one of `ACTIONS`.
     - `low`, `high`: bounds of each entry of the action; for `clip`, `scale` and `tanh`.
-    - `counts`: the number of options of each of several choices, in the order of the outputs; for
-      `argmax`.
+    - `counts`: the number of options of each choice, in the order of the outputs; for `argmax`.
     - `shape`: the shape of an action with bounds; a vector when left out.
 
-    **Raises:** `UnknownNameError` for another kind; `PolicyError` for bounds that are missing or
-    do not fit.
+    **Raises:** `UnknownNameError` for an unknown kind; `PolicyError` for missing or unsuitable
+    bounds.
     """
 
     kind: str = "outputs"
@@ -96,9 +95,9 @@ class Actions:
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True, eq=False)
 class Normaliser:
-    """The scale of observations: `(observation - mean) / scale`, clipped to `-clip..clip`.
+    """The normalisation of observations: `(observation - mean) / scale`, clipped to `-clip..clip`.
 
-    **Raises:** `PolicyError` for another form than numbers, and for a scale that is not positive.
+    **Raises:** `PolicyError` for values that are not numbers, and for a scale that is not positive.
     """
 
     # JAX rebuilds the class with placeholders.
@@ -116,18 +115,17 @@ class Normaliser:
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True, eq=False)
 class Policy:
-    """A network of any framework in JAX, with the meaning of its inputs and outputs.
+    """A network of any framework in JAX, with the conversions of its inputs and outputs.
 
-    It is a pytree: its weights are batched, differentiated and computed in double precision as
-    those of `rl.Policy` are.
+    It is a pytree: its weights are batched, differentiated and computed in double precision like
+    those of `rl.Policy`.
 
-    - `weights`: pytree of arrays.
+    - `weights`: a pytree of arrays.
     - `compute(weights, observation, memory) -> (outputs, memory)`: a pure function; the memory is
       None for a network without memory.
-    - `initial_memory`: what it remembers at the start of an episode; None for a policy that
-      remembers nothing.
-    - `normaliser`: applied to observations first; None for none.
-    - `actions`: how outputs become an action.
+    - `initial_memory`: the memory at the start of an episode; None for a policy without memory.
+    - `normaliser`: the normalisation of observations; None for none.
+    - `actions`: the conversion of outputs to an action.
     """
 
     __no_type_check__ = True
@@ -142,9 +140,9 @@ class Policy:
         (remembered,) = memory or (None,)
         if (self.initial_memory is None) != (remembered is None):
             form = (
-                "remembers nothing: act(observation)"
+                "has no memory: call act(observation)"
                 if self.initial_memory is None
-                else "remembers: act(observation, memory) returns (action, memory), and "
+                else "has a memory: act(observation, memory) returns (action, memory), and "
                 "policy.initial_memory is the first"
             )
             raise TypeError(f"this policy {form}")
@@ -154,13 +152,12 @@ class Policy:
         return outputs if self.initial_memory is None else (outputs, after)
 
     def act(self, observation: PyTree, *memory: PyTree) -> Any:
-        """Return the action; for a policy that remembers, `(action, memory)`.
+        """Return the action; for a policy with memory, `(action, memory)`.
 
         **Arguments:**
         - `observation`: one observation, or a batch for a network of vectors.
-        - `memory`: the memory of a policy that remembers; `initial_memory` at the start of an
-          episode.
-        **Raises:** `TypeError` for a memory that is missing, or that it does not have.
+        - `memory`: the memory of a policy with memory; `initial_memory` at the start of an episode.
+        **Raises:** `TypeError` for a missing memory, or one given to a policy without memory.
         """
         if self.initial_memory is None:
             return self.actions(self(observation, *memory))
@@ -168,14 +165,15 @@ class Policy:
         return self.actions(outputs), after
 
     def save(self, path: str | Path, observation: PyTree = None) -> Path:
-        """Write the policy as a file that `vj.policy` and, for ONNX, any runtime reads.
+        """Write the policy to a file that `vj.policy` reads, and any runtime if it is ONNX.
 
-        The file gives the action, so scales, squashing and bounds are part of it. The memory of a
-        policy that remembers becomes inputs and outputs `memory.0`, `memory.0.next` and so on.
+        The file computes the action, including scales, squashing and bounds. The memory of a policy
+        becomes inputs and outputs `memory.0`, `memory.0.next` and so on.
 
         **Arguments:**
-        - `path`: ends in `.onnx`, in `.safetensors`, or in `.npz`, which needs no other package.
-        - `observation`: an example of an observation, where the network does not say its size.
+        - `path`: a path that ends in `.onnx`, `.safetensors`, or `.npz`, which needs no other
+          package.
+        - `observation`: an example observation, if the network does not determine its size.
         **Returns:** the path.
         **Raises:** `PolicyError` for another ending, and for a policy that ONNX cannot express:
         one that draws random numbers, or that runs in Python.
@@ -186,9 +184,9 @@ class Policy:
     def as_graph(
         self, observation: PyTree = None
     ) -> tuple[Graph, dict[str, np.ndarray], tuple[np.ndarray, ...]]:
-        """Return the policy as a graph of ONNX operators with its arrays and its first memory.
+        """Return the policy as a graph of ONNX operators with its arrays and its initial memory.
 
-        **Raises:** `PolicyError` as `save`.
+        **Raises:** the `PolicyError` of `save`.
         """
         if observation is None:
             example = getattr(self.compute, "example", None)
@@ -210,13 +208,13 @@ class Policy:
 
 @dataclass(frozen=True)
 class Stacked:
-    """The function of a policy that is given its last `count` observations, the oldest first."""
+    """The function of a policy that receives its last `count` observations, the oldest first."""
 
     inner: Compute
     count: int
 
     def example(self, weights: PyTree) -> np.ndarray | None:
-        """Return zeros in the form of one observation; None if the network does not say it."""
+        """Return zeros in the form of one observation; None if the network leaves it open."""
         network, _ = weights
         inner = getattr(self.inner, "example", lambda _: None)(network)
         return None if inner is None else np.zeros(np.size(inner) // self.count)
@@ -232,11 +230,11 @@ class Stacked:
 
 
 def stack_frames(policy: Policy, count: int, size: int) -> Policy:
-    """Return a policy that is given one observation and remembers the `count - 1` before it.
+    """Return a policy that receives one observation and remembers the previous `count - 1`.
 
     Before the first observation there are zeros, as in the frame stack of Stable-Baselines3.
 
-    - `size`: numbers of one observation.
+    - `size`: number of entries in one observation.
     """
     return Policy(
         weights=(policy.weights, policy.normaliser),
@@ -249,7 +247,7 @@ def stack_frames(policy: Policy, count: int, size: int) -> Policy:
 def bounds(values: object, name: str) -> tuple[float, ...]:
     """Return bounds of an action as a tuple.
 
-    **Raises:** `PolicyError` for something else than numbers.
+    **Raises:** `PolicyError` for values that are not numbers.
     """
     try:
         array = np.atleast_1d(np.asarray(values, float)).ravel()
@@ -267,8 +265,8 @@ def write(
 ) -> Path:
     """Write a graph that was `traced` with its arrays and its first memory.
 
-    **Raises:** `PolicyError` for another ending than `.onnx`, `.safetensors` and `.npz`, and for a
-    first memory that ONNX cannot hold.
+    **Raises:** `PolicyError` for an ending other than `.onnx`, `.safetensors` and `.npz`, and for
+    an initial memory that ONNX cannot store.
     """
     endings = (".onnx", ".safetensors", ".npz")
     if path.suffix not in endings:
@@ -277,9 +275,7 @@ def write(
     if path.suffix != ".onnx":
         arrays = {**arrays, **named}
     elif any(np.any(first) for first in start):
-        raise PolicyError(
-            "ONNX has no place for a memory that does not start at zero: save it as .npz"
-        )
+        raise PolicyError("ONNX cannot store a memory that does not start at zero: save it as .npz")
     # In the order of their names, so that equal policies are equal bytes.
     arrays = {name: np.ascontiguousarray(arrays[name]) for name in sorted(arrays)}
     with replacing(path) as partial:

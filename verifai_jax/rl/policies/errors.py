@@ -9,4 +9,4 @@ hundredth; a graph of a few bytes can ask for any number of them."""
 
 
 class PolicyError(ValueError):
-    """Raised for a file or an object that is not a usable policy."""
+    """An error for a file or an object that is not a usable policy."""

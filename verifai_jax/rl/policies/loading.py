@@ -51,37 +51,36 @@ def policy(
     stack: int = 1,
     batched: bool = False,
 ) -> Policy | OwnPolicy:
-    """Load a policy that was trained anywhere, as a pure function of JAX with its weights.
+    """Load a policy trained in any framework, as a pure JAX function with its weights.
 
     **Arguments:**
     - `source`: a file or a model:
-      - `.zip`: a model of Stable-Baselines3 (PPO, A2C, SAC, TD3, DDPG, DQN), with its spaces, its
-        squashing and its bounds;
-      - `.onnx`: a graph; recurrent ones remember what they feed back;
+      - `.zip`: a model of Stable-Baselines3 (PPO, A2C, SAC, TD3, DDPG, DQN), with its spaces,
+        squashing and bounds;
+      - `.onnx`: a graph; outputs that are fed back to inputs become the memory of a recurrent one;
       - `.safetensors`, or `.pt` and `.pth` of `torch.save(module.state_dict())`: weights of an MLP
-        by `activation=`, or of a `network=` of your own;
+        with `activation=`, or of your own `network=`;
       - `.npz` of `rl.save_policy`;
-      - a folder: a checkpoint of Brax' or Playground's PPO;
-      - a model of Stable-Baselines3; a module of PyTorch with `observation=`; one of equinox or
+      - a folder: a PPO checkpoint of Brax or MuJoCo Playground;
+      - a model of Stable-Baselines3; a PyTorch module with `observation=`; a module of equinox or
         flax (nnx); `(module, variables)` of flax (linen); an inference function of Brax; any
-        function of the observation. What JAX cannot trace runs in Python, and the log says what a
-        call costs.
-    - `observation`: an example of an observation, to translate a module of PyTorch, and for the
-      size of one with `stack=`.
-    - `normalise`: how observations are scaled first: the file of `VecNormalize.save`, or
+        function of the observation. A function that JAX cannot trace runs in Python, and the log
+        says how long a call takes.
+    - `observation`: an example observation, needed to translate a PyTorch module, and to know its
+      size with `stack=`.
+    - `normalise`: how observations are normalised first: the file of `VecNormalize.save`, or
       `(mean, scale)`.
-    - `action`: the meaning of the outputs, if the file does not state it: `"argmax"`; `"clip"`,
+    - `action`: how outputs become an action, if the file does not state it: `"argmax"`; `"clip"`,
       `"scale"` or `"tanh"` with `low=` and `high=`; `"positive"`; `"outputs"` (default).
     - `low`, `high`: bounds of the action.
     - `activation`: the activation of an MLP, after every layer except the last.
-    - `network(weights, observation) -> outputs`: of other weights; `weights` by their names.
-    - `layers`: names of the layers of an MLP, in order; otherwise in the order of their names.
-    - `output`: the output of an ONNX graph with several outputs, the one that is the action.
-    - `memory`: the memory of an ONNX graph, `{input: output}` of its recurrent values; by default
-      found by their shapes.
-    - `stack`: observations that the policy sees at once, the newest last.
-    - `batched`: a Python function takes a batch of observations.
-    **Returns:** a `Policy`, which any system takes as its policy or controller (`policy.act`), or
+    - `network(weights, observation) -> outputs`: the network for other weights, given by name.
+    - `layers`: names of the layers of an MLP, in order; by default sorted by name.
+    - `output`: the output that is the action, for an ONNX graph with several.
+    - `memory`: recurrent values of an ONNX graph, `{input: output}`; by default found by shape.
+    - `stack`: number of observations that the policy receives at once, the newest last.
+    - `batched`: whether a Python function takes a batch of observations.
+    **Returns:** a `Policy`, which any system accepts as its policy or controller (`policy.act`), or
     the `rl.Policy` of an `.npz`.
     **Raises:** `FileNotFoundError`; `PolicyError` for a file that is damaged or not supported, and
     for unused options. Nothing in a file is executed.
@@ -97,7 +96,8 @@ def policy(
     if isinstance(loaded, OwnPolicy):
         if normalise is not None or stated or stack > 1:
             raise PolicyError(
-                "the policy's own file says its scale and actions: leave these options out"
+                "the policy's own file defines its normalisation and actions: leave these "
+                "options out"
             )
         return loaded
     changes: dict[str, Any] = {}
@@ -132,14 +132,16 @@ def _of_file(
         raise PolicyError(f"{path} has to be one of {', '.join(FORMATS)}, or a folder of Brax")
     if path.stat().st_size > MAX_BYTES:
         raise PolicyError(
-            f"{path} has {path.stat().st_size / 1e6:z.0f} MB, and a policy may have "
+            f"{path} has {path.stat().st_size / 1e6:z.0f} MB, and a policy may have at most "
             f"{MAX_BYTES / 1e6:z.0f} MB"
         )
     data = path.read_bytes()
     stored = _stored_graph(data, path)
     weights_alone = kind in (".safetensors", ".pt", ".pth") and stored is None
     if not weights_alone and (activation or network or layers):
-        raise PolicyError(f"{path} says its network: leave out activation=, network= and layers=")
+        raise PolicyError(
+            f"{path} defines its network: leave out activation=, network= and layers="
+        )
     if stored is not None:
         graph, weights, first = read_graph(*stored, str(path))
         return Policy(weights, graph, first)
@@ -209,7 +211,7 @@ def _of_weights(
     """Return the policy of weights whose network is stated."""
     if (activation is None) == (network is None):
         raise PolicyError(
-            f"{what} holds weights and no network: give activation= for an MLP, or "
+            f"{what} contains weights but no network: give activation= for an MLP, or "
             f"network=function(weights, observation); it has {', '.join(sorted(arrays)[:8])}"
         )
     if network is not None:
@@ -222,7 +224,7 @@ def _of_weights(
     try:
         return Policy(linear_layers(arrays, names, what), Mlp(activation_name(activation)))
     except PolicyError as error:
-        raise PolicyError(f"{error}; say the layers of the policy in order by layers=") from None
+        raise PolicyError(f"{error}; give the layers of the policy in order with layers=") from None
 
 
 def _normaliser(given: str | Path | tuple[ArrayLike, ArrayLike] | Normaliser) -> Normaliser:

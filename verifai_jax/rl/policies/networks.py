@@ -42,12 +42,12 @@ def activation_name(name: str) -> str:
 
 @dataclass(frozen=True)
 class Mlp:
-    """A multilayer perceptron: an activation after each layer but the last.
+    """A multilayer perceptron, with an activation after each layer except the last.
 
     - `activation`: a name of `ACTIVATIONS`.
-    - `categories`: observations that are integers become one-hot vectors of these lengths.
-    - `pixels`: observations are images `[channels, height, width]` of 0 to 255 that go through the
-      three convolutions of Mnih et al. (2015) first.
+    - `categories`: if given, integer observations become one-hot vectors of these lengths.
+    - `pixels`: whether observations are images `[channels, height, width]` from 0 to 255, which
+      first pass through the three convolutions of Mnih et al. (2015).
     """
 
     activation: str
@@ -86,7 +86,7 @@ class Mlp:
 
 
 def check_size(observation: Array, size: int) -> None:
-    """Check that an observation has as many numbers as a network takes.
+    """Check that an observation has as many numbers as a network needs.
 
     **Raises:** `PolicyError`.
     """
@@ -107,9 +107,9 @@ def _nature(convolutions: Layers, image: Float[Array, "c h w"]) -> Float[Array, 
 def linear_layers(
     weights: Mapping[str, np.ndarray], names: Sequence[str], what: str
 ) -> tuple[Any, ...]:
-    """Return the layers `([in, out], [out])` of these names of PyTorch, in this order.
+    """Return the PyTorch layers with these names as `([in, out], [out])`, in this order.
 
-    **Raises:** `PolicyError` for one that is missing or does not fit to the one before.
+    **Raises:** `PolicyError` for a layer that is missing or does not fit its predecessor.
     """
     layers, before = [], None
     for name in names:

@@ -37,9 +37,9 @@ def from_object(source: object, observation: ArrayLike | None, batched: bool) ->
 
     **Arguments:**
     - `source`: see `policy`.
-    - `observation`: an example, where the object cannot be translated without one.
-    - `batched`: a Python function takes a batch of observations.
-    **Raises:** `PolicyError` for something that is not a policy.
+    - `observation`: an example observation, for an object that cannot be translated without one.
+    - `batched`: whether a Python function takes a batch of observations.
+    **Raises:** `PolicyError` for an object that is not a policy.
     """
     root = type(source).__module__.partition(".")[0]
     if root in ("stable_baselines3", "sb3_contrib"):
@@ -59,7 +59,7 @@ def from_object(source: object, observation: ArrayLike | None, batched: bool) ->
     if not callable(source):
         raise PolicyError(
             "a policy is a file, a model or a function of the observation; got "
-            f"{type(source).__name__}. Of a flax module give (module, variables)"
+            f"{type(source).__name__}. For a flax module give (module, variables)"
         )
     leaves, structure = jax.tree.flatten(source)
     if leaves and leaves != [source]:
@@ -79,11 +79,11 @@ def _is_a(source: object, module: str, name: str) -> bool:
 
 
 class RandomPolicy(Policy):
-    """A policy that draws: a function of `(observation, key)`, such as those of Brax."""
+    """A random policy: a function of `(observation, key)`, such as those of Brax."""
 
     def as_graph(self, observation: PyTree = None) -> Any:
-        """Refuse: a graph of ONNX does not draw."""
-        raise PolicyError("a policy that draws cannot be saved: give its deterministic function")
+        """Raise an error, because a graph of ONNX operators cannot draw random numbers."""
+        raise PolicyError("a random policy cannot be saved: give its deterministic function")
 
     def act(self, observation: PyTree, key: Key[Array, ""]) -> Any:
         """Return an action drawn with the random key of the step."""
@@ -202,7 +202,7 @@ def _of_sb3(model: Any) -> Policy:
 def _of_torch(module: Any, observation: ArrayLike | None, batched: bool) -> Policy:
     """Return a module of PyTorch by way of ONNX, or as a function of the host."""
     if observation is None:
-        raise PolicyError("of a torch module give observation=, an example of what it takes, too")
+        raise PolicyError("for a torch module give observation= as well, an example of its input")
     torch = require("torch", extra="policies")
     require("onnx", extra="policies")
     example = np.asarray(observation, np.float32)
@@ -247,14 +247,16 @@ def _translated(
         for seen, scale in zip(draws, np.resize(scales, len(draws)), strict=True):
             one, other = np.asarray(policy.act(seen * scale)), _plain(on_host(seen * scale))
             if one.shape != other.shape or not np.allclose(one, other, rtol=1e-3, atol=1e-4):
-                raise ValueError("its translation gives other actions, as one that decides does")
+                raise ValueError(
+                    "its translation gives other actions, as for a module with branches"
+                )
     return policy
 
 
 def read_brax(folder: Path) -> Policy:
-    """Return the deterministic policy of a checkpoint of Brax' or Playground's PPO.
+    """Return the deterministic policy of a PPO checkpoint of Brax or Playground.
 
-    **Raises:** `PolicyError` for a folder that holds none.
+    **Raises:** `PolicyError` for a folder without one.
     """
     networks = require("brax.training.agents.ppo.networks", extra="brax")
     known = require("brax.training.networks", extra="brax").ACTIVATION

@@ -34,11 +34,10 @@ OPSET = 18
 class Graph:
     """The function of a graph: `(weights, observation, memory) -> (outputs, memory)`.
 
-    Graphs of equal content are equal, so that policies which differ in their weights share a
-    program.
+    Graphs with equal content are equal, so policies that only differ in weights share a program.
 
-    - `nodes`: in the order in which they are computed.
-    - `constants`: arrays that are no weights: shapes, indices, flags.
+    - `nodes`: the nodes in the order of computation.
+    - `constants`: arrays that are not weights: shapes, indices, flags.
     - `inputs`: names of the observations, with their shapes.
     - `memory`: pairs of an input and the output that is its next value.
     - `output`: name of the output.
@@ -75,14 +74,14 @@ class Graph:
         return f"Graph({self.digest})"
 
     def example(self, weights: PyTree) -> Any:
-        """Return zeros in the form of an observation, without the axis of a batch."""
+        """Return zeros in the form of an observation, without a batch axis."""
         zeros = {n: np.zeros(s[1:] if s[:1] == (1,) else s) for n, s in self.inputs.items()}
         return next(iter(zeros.values())) if len(zeros) == 1 else zeros
 
     def to_json(self) -> dict[str, Any]:
         """Return the graph as plain data, for `read_graph`.
 
-        Only for the graphs of `writing.traced`, whose attributes are numbers and texts.
+        Only for graphs of `writing.traced`, whose attributes are numbers and texts.
         """
         nodes = [[n.operator, n.inputs, n.outputs, n.attributes] for n in self.nodes]
         inputs = {name: list(shape) for name, shape in self.inputs.items()}
@@ -116,9 +115,9 @@ class Graph:
 
 
 def run(nodes: Sequence[Node], values: Values) -> None:
-    """Compute nodes one after the other, and put their outputs among the values.
+    """Compute nodes one after the other, and store their outputs among the values.
 
-    **Raises:** `PolicyError` that names the node, its operator and the shapes that it got.
+    **Raises:** `PolicyError` that names the node, its operator and its input shapes.
     """
     total = 0
     for node in nodes:
@@ -157,7 +156,7 @@ def _branch(node: Node, condition: Any, values: Values) -> tuple[Any, ...]:
     """Compute the branch of an `If` whose condition is a constant."""
     if not isinstance(condition, np.ndarray | np.generic):
         raise PolicyError(
-            f"{node} decides by a value of the observation, which is not supported: export the "
+            f"{node} branches on a value of the observation, which is not supported: export the "
             "model with torch.where instead"
         )
     inner, outputs = node.attributes["then_branch" if np.all(condition) else "else_branch"]
@@ -174,14 +173,14 @@ def read_onnx(
     output: str | None,
     memory: Mapping[str, str] | None,
 ) -> tuple[Graph, dict[str, Array], PyTree]:
-    """Read a model of ONNX.
+    """Read an ONNX model.
 
     **Arguments:**
-    - `path`: the path of the file, next to which tensors may be kept; None for bytes alone.
-    - `what`: its name, for errors.
-    - `output`: name of the output that is meant, of several.
-    - `memory`: `{input: output}` of what the network remembers; found by the shapes where None.
-    **Returns:** the graph, its weights, and its memory at the start: zeros, or None.
+    - `path`: path of the file, next to which tensors may be stored; None for bytes.
+    - `what`: its name in errors.
+    - `output`: name of the output to use, if there are several.
+    - `memory`: the recurrent values `{input: output}`; found by their shapes if None.
+    **Returns:** the graph, its weights, and its initial memory: zeros, or None.
     **Raises:** `PolicyError` for a damaged model, or one with unsupported operators.
     """
     package = require("onnx", extra="policies")
@@ -233,9 +232,9 @@ def _sorted_out(arrays: Mapping[str, np.ndarray]) -> tuple[dict[str, Array], dic
 def read_graph(
     data: Mapping[str, Any], arrays: Mapping[str, np.ndarray], what: str
 ) -> tuple[Graph, dict[str, Array], PyTree]:
-    """Return what `read_onnx` does, from `Graph.to_json` and all arrays by name.
+    """Return the result of `read_onnx`, from `Graph.to_json` and all arrays by name.
 
-    **Raises:** `PolicyError` for data that are no graph.
+    **Raises:** `PolicyError` for data that do not describe a graph.
     """
     try:
         nodes = tuple(
@@ -260,7 +259,7 @@ def read_graph(
 
 
 def check_nodes(nodes: Sequence[Node], known: set[str], outputs: Sequence[str], what: str) -> None:
-    """Check that operators exist, and that what nodes and outputs read is computed before.
+    """Check that operators exist, and that inputs of nodes and outputs are computed earlier.
 
     **Raises:** `PolicyError` that names the node.
     """

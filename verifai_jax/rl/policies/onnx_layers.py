@@ -16,7 +16,7 @@ IN_TRAINING = "is in training mode: export the model after model.eval()"
 
 
 def layer_normalization(node: Node, x: Value, scale: Value, bias: Value | None = None) -> Value:
-    """Return entries in units of their spread over the last axes; of RMS, around zero."""
+    """Return entries divided by their deviation over the last axes, or their RMS about zero."""
     axes = tuple(range(node.get("axis", -1) % x.ndim, x.ndim))
     if node.operator == "LayerNormalization":
         x = x - jnp.mean(x, axis=axes, keepdims=True)
@@ -31,7 +31,7 @@ def _across(x: Value, vector: Value) -> Value:
 
 
 def channel_normalization(node: Node, x: Value, scale: Value, b: Value, *moments: Value) -> Value:
-    """Return channels in units of their stored spread, or of that of each image."""
+    """Return channels divided by their stored deviation, or by that of each image."""
     node.refuse(node.get("training_mode", 0), IN_TRAINING)
     if moments:
         mean, variance = (_across(x, v) for v in moments)
@@ -75,7 +75,7 @@ def conv(node: Node, x: Value, kernel: Value, bias: Value | None = None) -> Valu
 
 
 def pool(node: Node, x: Value) -> Value:
-    """Return the greatest entry, or the mean, of each window."""
+    """Return the maximum or the mean of each window."""
     kernel = tuple(node.attributes["kernel_shape"])
     strides, dilations, around = _window(node, x, kernel)
     beyond = [0] * len(kernel)

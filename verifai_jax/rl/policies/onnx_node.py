@@ -19,8 +19,8 @@ which has the same operations."""
 class Node:
     """One operation of a graph.
 
-    - `operator`, `name`: as the file has them.
-    - `inputs`, `outputs`: names of values; an input that is left out is empty.
+    - `operator`, `name`: those in the file.
+    - `inputs`, `outputs`: names of values; an omitted input is empty.
     - `attributes`: plain values, arrays, and subgraphs as `(nodes, outputs)`.
     - `opset`: version of the operators.
     """
@@ -40,25 +40,25 @@ class Node:
         return self.attributes.get(name, default)
 
     def refuse(self, what: object, why: str) -> None:
-        """Raise `PolicyError` if there is what the operators here do not have."""
+        """Raise `PolicyError` for attributes that are not supported here."""
         if np.any(what):  # pyright: ignore[reportArgumentType, reportCallIssue]
             raise PolicyError(f"{self} {why}")
 
 
 def known(*values: Value | None) -> bool:
-    """Return whether values do not depend on the observation: they are arrays of NumPy."""
+    """Return whether values are independent of the observation: they are NumPy arrays."""
     return all(isinstance(v, np.ndarray | np.generic) for v in values)
 
 
 def module(*values: Value) -> Any:
-    """Return NumPy where all values are its arrays, otherwise JAX's."""
+    """Return NumPy if all values are its arrays, otherwise `jax.numpy`."""
     return np if known(*values) else jnp
 
 
 def static(node: Node, value: Value) -> tuple[int, ...]:
-    """Return numbers that say a shape, axes or indices.
+    """Return concrete numbers for a shape, axes or indices.
 
-    **Raises:** `PolicyError` where they depend on the observation.
+    **Raises:** `PolicyError` if they depend on the observation.
     """
     node.refuse(not known(value), "has a shape that depends on the observation")
     return tuple(int(n) for n in np.ravel(value))

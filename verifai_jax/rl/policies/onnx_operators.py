@@ -238,9 +238,9 @@ _ELEMENTWISE = {*_OF_NUMPY, "Min", "Max", "Sum", "Mean", "Div", "Mod", "PRelu", 
 
 
 def output_size(node: Node, *inputs: Any) -> int:
-    """Return how many numbers an operator gives at most, before it is computed.
+    """Return the maximum number of results of an operator, before it is computed.
 
-    Only for those that can give many more than they take; 0 for all others.
+    Only operators whose result can be much larger than their input are covered; others give 0.
     """
     shapes: list[tuple[int, ...]] = [() if v is None else np.shape(v) for v in inputs]
     match node.operator, len(inputs):

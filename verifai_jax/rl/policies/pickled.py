@@ -20,7 +20,7 @@ from verifai_jax.rl.policies.errors import PolicyError
 
 @dataclass(frozen=True)
 class Name:
-    """A class or function that a pickle names."""
+    """The name of a class or function in a pickle."""
 
     module: str
     name: str
@@ -28,12 +28,12 @@ class Name:
 
 @dataclass(eq=False)
 class Record:
-    """An object that a pickle would make by a call.
+    """A record of an object that a pickle would make by a call.
 
-    - `function`: what would be called.
+    - `function`: the function that would be called.
     - `arguments`: the arguments of the call.
-    - `state`: what would be set on the object afterwards, or None.
-    - `items`: what would be put into it, as for a dictionary.
+    - `state`: the state that would be set on the object afterwards, or None.
+    - `items`: the items that would be added to it, for example to a dictionary.
     """
 
     function: Any
@@ -44,7 +44,7 @@ class Record:
 
 @dataclass(frozen=True)
 class Persistent:
-    """A reference to data that is kept outside of the pickle."""
+    """A reference to data stored outside the pickle."""
 
     reference: Any
 
@@ -138,13 +138,13 @@ _OPERATIONS: dict[str, Callable[[_Stack, Any], object]] = {
 
 
 def read_pickle(data: bytes, what: str) -> Any:
-    """Return what a pickle describes, without calling anything.
+    """Return the content of a pickle, without calling anything.
 
     **Arguments:**
-    - `what`: where they are from, for errors.
-    **Returns:** numbers, texts, bytes, tuples, lists and dictionaries as they are; a `Name` for a
-    class or function, a `Record` for an object, a `Persistent` for data outside.
-    **Raises:** `PolicyError` for bytes that are no pickle.
+    - `what`: the origin of the bytes, for errors.
+    **Returns:** numbers, texts, bytes, tuples, lists and dictionaries as such; a `Name` for a class
+    or function, a `Record` for an object, a `Persistent` for data outside.
+    **Raises:** `PolicyError` for bytes that are not a pickle.
     """
     stack = _Stack()
     try:
@@ -163,7 +163,7 @@ def read_pickle(data: bytes, what: str) -> Any:
 
 
 def array_of(record: object) -> np.ndarray | None:
-    """Return the array that a record of NumPy's describes; None for anything else.
+    """Return the array described by a NumPy record; None for anything else.
 
     Arrays are pickled as `_reconstruct` with a state `(version, shape, dtype, fortran, bytes)`,
     scalars as `scalar(dtype, bytes)`.

@@ -36,9 +36,9 @@ _KINDS = (
 def read_sb3(data: bytes, what: str) -> Policy:
     """Return the deterministic policy of a model of Stable-Baselines3.
 
-    It gives what `model.predict(observation, deterministic=True)` gives.
+    It returns the same actions as `model.predict(observation, deterministic=True)`.
 
-    **Raises:** `PolicyError` for a file that holds none, or one of a form that is not supported.
+    **Raises:** `PolicyError` for a file without a model, or with one of an unsupported form.
     """
     archive = open_archive(data, what)
     if "data" not in archive.namelist() or "policy.pth" not in archive.namelist():
@@ -64,9 +64,9 @@ def read_sb3(data: bytes, what: str) -> Policy:
 
 
 def read_normaliser(data: bytes, what: str) -> Normaliser:
-    """Return the scale of observations in a file of `VecNormalize.save`.
+    """Return the normalisation of observations from a file of `VecNormalize.save`.
 
-    **Raises:** `PolicyError` for another file, and for one of observations by name.
+    **Raises:** `PolicyError` for another file, and for dictionary observations.
     """
     record = read_pickle(data, what)
     state = record.state if isinstance(record, Record) else None
@@ -172,8 +172,8 @@ def _network(
     image = len(space.get("_shape") or ()) == 3 and options.get("normalize_images", True) is True
     if kind != "Box" or not image or not all(f"{n}.weight" in weights for n in convolutions):
         raise PolicyError(
-            f"{what} reads observations of {kind} by a features extractor that is not supported: "
-            "export it as ONNX, and load that"
+            f"{what} reads observations of {kind} with an unsupported features extractor: export "
+            "it as ONNX, and load that"
         )
     kernels = tuple(
         tuple(jnp.asarray(weights[f"{name}.{part}"], np.float32) for part in ("weight", "bias"))

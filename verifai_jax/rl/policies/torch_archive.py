@@ -35,7 +35,7 @@ _STORAGES: dict[str, Any] = {
 def open_archive(data: bytes, what: str) -> zipfile.ZipFile:
     """Open an archive.
 
-    **Raises:** `PolicyError` for another file, and for one that unpacks to over `MAX_BYTES`.
+    **Raises:** `PolicyError` for another file, and for one larger than `MAX_BYTES` when unpacked.
     """
     try:
         archive = zipfile.ZipFile(io.BytesIO(data))
@@ -51,9 +51,9 @@ def open_archive(data: bytes, what: str) -> zipfile.ZipFile:
 
 
 def read_member(archive: zipfile.ZipFile, name: str, what: str) -> bytes:
-    """Return the bytes of a file of an archive.
+    """Return the bytes of a member of an archive.
 
-    **Raises:** `PolicyError` for one that is missing, damaged, or larger than the archive says.
+    **Raises:** `PolicyError` for a member that is missing, damaged, or larger than stated.
     """
     try:
         entry = archive.getinfo(name)
@@ -67,11 +67,11 @@ def read_member(archive: zipfile.ZipFile, name: str, what: str) -> bytes:
 
 
 def read_state(data: bytes, what: str) -> dict[str, np.ndarray]:
-    """Return the tensors of a file of `torch.save`, by their names.
+    """Return the tensors in a file of `torch.save`, by their names.
 
-    Names of nested dictionaries are joined by dots. What is no tensor is left out.
+    Names of nested dictionaries are joined by dots. Values that are not tensors are left out.
 
-    **Raises:** `PolicyError` for a file that holds no tensors, or damaged ones.
+    **Raises:** `PolicyError` for a file without tensors, or with damaged ones.
     """
     archive = open_archive(data, what)
     pickles = [n for n in archive.namelist() if n.rpartition("/")[2] == "data.pkl"]

@@ -61,15 +61,15 @@ _TYPES = {"f": 1, "b": 9, "i": 6, "u": 12}
 def traced(
     function: Callable[..., Any], weights: PyTree, observation: PyTree, memory: PyTree
 ) -> tuple[Graph, dict[str, np.ndarray], tuple[np.ndarray, ...]]:
-    """Translate a function `(weights, observation, memory) -> (action, memory)`.
+    """Translate a function `(weights, observation, memory) -> (action, memory)` to ONNX.
 
     **Arguments:**
-    - `function`: a pure function of JAX.
-    - `weights`: pytree of arrays, which keep their paths in it as names.
-    - `observation`: an example; several arrays by name become several inputs.
-    - `memory`: pytree at the start of an episode; None for none.
-    **Returns:** the graph, all its arrays by name, and its memory at the start.
-    **Raises:** `PolicyError` for an operation that ONNX, or this translation of it, does not have.
+    - `function`: a pure JAX function.
+    - `weights`: a pytree of arrays, whose paths become their names.
+    - `observation`: an example observation; several arrays by name become several inputs.
+    - `memory`: the memory at the start of an episode, a pytree; None for none.
+    **Returns:** the graph, all its arrays by name, and its initial memory.
+    **Raises:** `PolicyError` for an operation that ONNX, or this translation, does not support.
     """
     named = observation if isinstance(observation, Mapping) else {"observation": observation}
     shapes = {name: tuple(np.shape(value)) for name, value in named.items()}
@@ -176,7 +176,7 @@ class _Translation:
         except NotImplementedError:
             raise PolicyError(
                 f"the policy computes {kind}, which cannot be saved as a graph: save its weights "
-                "by the means of its own framework"
+                "with its own framework"
             ) from None
 
     def scan(self, given: list[Value], options: Mapping[str, Any]) -> list[Value]:
@@ -400,5 +400,5 @@ def _i(values: Iterable[int]) -> np.ndarray:
 
 
 def number_type(dtype: np.dtype[Any]) -> int:
-    """Return ONNX's number of a type."""
+    """Return ONNX's number for a type."""
     return _TYPES[np.dtype(dtype).kind]

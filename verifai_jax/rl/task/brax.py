@@ -36,8 +36,8 @@ class BraxTask:
     """A task of a Brax environment, made by `brax_task`.
 
     - `env`: the environment.
-    - `name`: the environment's name, for error messages.
-    - `time_limit`: steps after which an episode is cut off.
+    - `name`: the environment's name in error messages.
+    - `time_limit`: number of steps after which an episode is truncated.
     """
 
     env: "Env"
@@ -50,7 +50,7 @@ class BraxTask:
         return Continuous(-1.0, 1.0, self.env.action_size)
 
     def reset(self, key: Key[Array, ""]) -> ObservedState:
-        """Draw the environment's own start."""
+        """Draw a start from the environment's own distribution."""
         with explain_errors(self.env, self.name, "reset"):
             first = self.env.reset(key)
         start = self._observed(first)
@@ -61,7 +61,7 @@ class BraxTask:
     def step(
         self, key: Key[Array, ""], state: ObservedState, action: Float[Array, " size"]
     ) -> tuple[ObservedState, Float[Array, ""], Bool[Array, ""]]:
-        """Take the environment's own step, in which nothing is drawn at random."""
+        """Take the environment's own step, which draws nothing at random."""
         after = match_types(self._step(state, action), state, self.name)
         # Its `done` is an end for good: the time limit is in a wrapper, which is refused.
         return after, jnp.asarray(after.state.reward, jnp.float32), after.state.done > 0.5
@@ -87,17 +87,17 @@ def brax_task(
     time_limit: int = 1000,
     options: Mapping[str, Option] | None = None,
 ) -> BraxTask:
-    """Make a `Task` of an environment of Brax.
+    """Make a `Task` from an environment of Brax.
 
     **Arguments:**
     - `env`: the name of an environment of Brax, or an `Env` of your own.
-    - `backend`: the physics pipeline, as for `brax`.
-    - `time_limit`: in steps, after which an episode is cut off; Brax trains on 1000.
-    - `options`: keyword arguments of an environment by name, numbers or text.
+    - `backend`: the physics pipeline, as in `brax`.
+    - `time_limit`: number of steps after which an episode is truncated; Brax uses 1000 in training.
+    - `options`: keyword arguments of an environment given by name, numbers or text.
     **Returns:** a task with actions from -1 to 1 for each actuator.
     **Raises:** `MissingExtra` without brax; `UnknownNameError` for an unknown environment or
     backend; `ValueError` for an environment in a wrapper that resets, ends or batches episodes, for
-    observations that are no array, and for a `time_limit` that is not a positive integer.
+    observations that are not an array, and for a `time_limit` that is not a positive integer.
     """
     check_count("time_limit", time_limit)
     chosen = tuple(sorted((options or {}).items()))
@@ -111,15 +111,16 @@ def brax_task(
 def playground_task(
     env: str | PlaygroundEnv, *, time_limit: int = 1000, options: Mapping[str, object] | None = None
 ) -> BraxTask:
-    """Make a `Task` of an environment of MuJoCo Playground.
+    """Make a `Task` from an environment of MuJoCo Playground.
 
     **Arguments:**
     - `env`: the name of an environment, or an `MjxEnv` of your own.
-    - `time_limit`: in steps, after which an episode is cut off.
-    - `options`: overrides of the configuration of an environment by name.
+    - `time_limit`: number of steps after which an episode is truncated.
+    - `options`: overrides of the configuration of an environment given by name.
     **Returns:** a task with actions from -1 to 1 for each actuator.
     **Raises:** `MissingExtra` without Playground; `UnknownNameError` for an unknown environment;
-    `ValueError` for observations that are no array, and for one whose assets are not installed.
+    `ValueError` for observations that are not an array, and for an environment whose assets are not
+    installed.
     """
     check_count("time_limit", time_limit)
     made, name = loaded(env, options)

@@ -34,10 +34,10 @@ if TYPE_CHECKING:
 class GymnaxTask:
     """A task of a gymnax environment, made by `gymnax_task`.
 
-    - `params`: the environment's parameters, whose numbers JAX may trace.
+    - `params`: the environment's parameters; JAX may trace their numbers.
     - `env`: the environment.
-    - `adapter`: from the policy's actions to the environment's.
-    - `time_limit`: steps after which an episode is cut off.
+    - `adapter`: converts the policy's actions to the environment's.
+    - `time_limit`: number of steps after which an episode is truncated.
     """
 
     params: PyTree
@@ -51,7 +51,7 @@ class GymnaxTask:
         return self.adapter.action
 
     def reset(self, key: Key[Array, ""]) -> stepping.ObservedState:
-        """Draw the environment's own start."""
+        """Draw a start from the environment's own distribution."""
         observation, state = self.env.reset_env(key, self.params)
         start = stepping.ObservedState(state, stepping.flat_observation(observation, self.env.name))
         action = jax.ShapeDtypeStruct(self.adapter.shape, self.adapter.dtype)
@@ -63,7 +63,7 @@ class GymnaxTask:
     def step(
         self, key: Key[Array, ""], state: stepping.ObservedState, action: Shaped[Array, "..."]
     ) -> tuple[stepping.ObservedState, Float[Array, ""], Bool[Array, ""]]:
-        """Take the environment's own step, `terminated` only where its episode ends for good."""
+        """Take the environment's own step; `terminated` is true only if it ends for good."""
         after, reward, over = self._step(key, state, self.adapter(action))
         after = stepping.match_types(after, state, self.env.name)
         return after, jnp.asarray(reward, jnp.float32).reshape(()), over
@@ -92,16 +92,17 @@ class GymnaxTask:
 def gymnax_task(
     env: "str | Environment", *, params: PyTree = None, time_limit: int | None = None
 ) -> GymnaxTask:
-    """Make a `Task` of an environment of gymnax.
+    """Make a `Task` from an environment of gymnax.
 
     **Arguments:**
     - `env`: the id of a registered environment, or an `Environment` of your own.
-    - `params`: the environment's parameters; its default ones when left out.
-    - `time_limit`: in steps; the environment's `max_steps_in_episode` when left out.
-    **Returns:** a task with the environment's actions: a choice, or a box. A box whose entries have
-    different bounds takes actions from -1 to 1 for each. Observations are one vector of float32.
-    **Raises:** `MissingExtra` without gymnax, or with one that is too old; `UnknownNameError` for
-    an unknown environment; `ValueError` for an environment in a wrapper, a missing time limit, and
+    - `params`: the environment's parameters; its defaults when left out.
+    - `time_limit`: number of steps; the environment's `max_steps_in_episode` when left out.
+    **Returns:** a task with the environment's actions: a choice, or a box. For a box whose entries
+    have different bounds the policy's actions are from -1 to 1. Observations are one vector of
+    float32.
+    **Raises:** `MissingExtra` without gymnax, or with an outdated one; `UnknownNameError` for an
+    unknown environment; `ValueError` for an environment in a wrapper, a missing time limit, and
     actions or observations of another kind.
     """
     made = _by_name(env) if isinstance(env, str) else _checked(env, params)
@@ -140,7 +141,7 @@ def _action_adapter(env: "Environment", params: PyTree) -> stepping.ActionAdapte
             space.low, space.high, tuple(space.shape), space.dtype, env.name
         )
     raise ValueError(
-        f"the actions of {env.name} are {space!r}; a task takes a choice of several, or a box"
+        f"the actions of {env.name} are {space!r}; a task supports one choice of several, or a box"
     )
 
 

@@ -52,8 +52,8 @@ class MjxState(NamedTuple):
     """The state of an episode.
 
     - `qpos`, `qvel`, `act`: joints and activations, as in MuJoCo.
-    - `warmstart`: accelerations from which the constraint solver begins.
-    - `varied`: fields of the model that are this episode's own, by name.
+    - `warmstart`: accelerations from which the constraint solver starts.
+    - `varied`: fields of the model that have their own values in this episode, by name.
     """
 
     qpos: Float[Array, " nq"]
@@ -65,10 +65,10 @@ class MjxState(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class MjxTask:
-    """A task of a MuJoCo model, made by `mjx_task`, which describes its parts.
+    """A task of a MuJoCo model, made by `mjx_task`, which documents its parts.
 
     - `compiled`: the model.
-    - `substeps`: steps of the model in one step of the task.
+    - `substeps`: number of model steps in one step of the task.
     """
 
     compiled: MjModel
@@ -83,7 +83,7 @@ class MjxTask:
     vary: Vary
 
     def reset(self, key: Key[Array, ""]) -> MjxState:
-        """Start as the model does, changed by `initial` and `vary`."""
+        """Return the model's start, changed by `initial` and `vary`."""
         model, blank = self._mjx
         start_key, vary_key = jax.random.split(key)
         qpos, qvel = self.initial(start_key, blank.qpos, blank.qvel)
@@ -99,7 +99,7 @@ class MjxTask:
     ) -> tuple[MjxState, Float[Array, ""], Bool[Array, ""]]:
         """Take one control period.
 
-        Where the next state is not finite the episode ends in the state before, without a reward.
+        If the next state is not finite the episode ends in the previous state, without a reward.
         """
         mjx = require("mujoco.mjx", extra="mujoco")
         model, before = self._at(state)
@@ -155,27 +155,27 @@ def mjx_task(
     control: Control | None = None,
     vary: Vary | None = None,
 ) -> MjxTask:
-    """Make a `Task` of a MuJoCo model.
+    """Make a `Task` from a MuJoCo model.
 
     **Arguments:**
     - `model`: the path of an MJCF file, its text, an `mujoco.MjSpec` or an `mujoco.MjModel`.
-    - `control_period`: seconds of a step, a multiple of the model's timestep.
-    - `time_limit`: steps after which an episode is cut off.
+    - `control_period`: duration of a step in seconds, a multiple of the model's timestep.
+    - `time_limit`: number of steps after which an episode is truncated.
     - `reward(before, action, after) -> number`: the reward of one step. `before` and `after` are
-      MJX data with joints, activations, and positions of bodies, geoms and sites; no sensors or
-      forces.
-    - `observe(data) -> [k]`: what the policy observes; `qpos` and `qvel` when left out.
+      MJX data with joints, activations, and positions of bodies, geoms and sites; they contain no
+      sensors or forces.
+    - `observe(data) -> [k]`: the policy's observation; `qpos` and `qvel` when left out.
     - `initial(key, qpos, qvel) -> (qpos, qvel)`: the start; the model's own when left out.
     - `terminate(data) -> bool`: ends an episode for good.
     - `action`: the kind of action; one from -1 to 1 for each actuator when left out.
-    - `control(action) -> [nu]`: the actuators' signals. When left out: a continuous action itself,
-      from -1 to 1 spread over the actuators' `ctrlrange` where all have one.
-    - `vary(key, model) -> {field: array}`: fields of the MJX model that differ from one episode to
-      the next, `{"body_mass": ...}`. Constants that MuJoCo derives from them stay as they are.
+    - `control(action) -> [nu]`: the actuators' signals. By default a continuous action itself; if
+      all actuators have a `ctrlrange`, [-1, 1] is mapped to these.
+    - `vary(key, model) -> {field: array}`: fields of the MJX model that differ between episodes,
+      `{"body_mass": ...}`. Constants that MuJoCo derives from them are not updated.
     **Returns:** a task; its states are `MjxState`.
     **Raises:** `MissingExtra` without MuJoCo; `FileNotFoundError`; `ValueError` for a model that
-    does not compile or that MJX does not support, times that do not fit the model's timestep, and
-    functions whose results have the wrong shape.
+    does not compile or that MJX does not support, times that are not multiples of the model's
+    timestep, and functions whose results have a wrong shape.
     """
     compiled = load(model).compiled
     timestep = float(compiled.opt.timestep)
@@ -192,7 +192,8 @@ def mjx_task(
     if control is None:
         if not isinstance(kind, Continuous) or kind.size != compiled.nu:
             raise ValueError(
-                f"{kind} needs control=..., a function to the signals of {compiled.nu} actuators"
+                f"{kind} needs control=..., a function that returns the signals of "
+                f"{compiled.nu} actuators"
             )
         control = _over_control_range(compiled) if action is None else _identity
     task = MjxTask(

@@ -54,9 +54,9 @@ class OdeState(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class OdeTask:
-    """A task of a system made by `ode`; made by `ode_task`, which describes its parts.
+    """A task from a system made by `ode`; made by `ode_task`, which documents its parts.
 
-    One whose reward has weights also has a field for each of them, and is a pytree of these.
+    If its reward has weights, it has a field for each of them, and is a pytree of these.
     """
 
     weights: ClassVar[tuple[str, ...]] = ()
@@ -69,12 +69,12 @@ class OdeTask:
     features: DrawFeatures
 
     def reset(self, key: Key[Array, ""]) -> OdeState:
-        """Start as the loop does, under features drawn for this episode."""
+        """Start as the loop does, with features drawn for this episode."""
         features_key, start_key = jax.random.split(key)
         return self.start(start_key, self.features(features_key))
 
     def start(self, key: Key[Array, ""], features: PyTree) -> OdeState:
-        """Start as the loop does, under these features."""
+        """Start as the loop does, with these features."""
         features = jax.tree.map(jnp.asarray, features)
         state = as_floating(self.loop.initial(features, key), "initial")
         return OdeState(jnp.zeros((), jax.tree.leaves(state)[0].dtype), state, features)
@@ -82,7 +82,7 @@ class OdeTask:
     def step(
         self, key: Key[Array, ""], state: OdeState, action: Shaped[Array, "..."]
     ) -> tuple[OdeState, Float[Array, ""], Bool[Array, ""]]:
-        """Take one period of the control, cut short where the loop ends."""
+        """Take one control period, shorter if the loop ends."""
         loop, start = self.loop, state
         features, control = start.features, self.control(action)
         dt = loop.dt / loop.substeps
@@ -126,7 +126,7 @@ def ode_task(
     time_limit: int | None = None,
     weights: Mapping[str, float] | None = None,
 ) -> OdeTask:
-    """Make a `Task` of an `ode`: its start, dynamics, step, control period and end.
+    """Make a `Task` from an `ode`, with its start, dynamics, step, control period and end.
 
     The loop's own controller is not used.
 
@@ -135,18 +135,18 @@ def ode_task(
     - `action`: the kind of action.
     - `reward(time, state, control, after) -> number`: the reward of one control period that begins
       in `state` at `time` seconds and leads to `after`.
-    - `control(action) -> control`: what the dynamics are given. When left out: a continuous action
-      itself, one number as a scalar. Discrete actions need it.
-    - `observe(state) -> [k]`: what the policy observes; all numbers of the state when left out.
-    - `features`: what dynamics and start are given, or a function `key -> features` that draws
-      them for each episode (domain randomisation). None at all when left out.
-    - `time_limit`: in control periods; the loop's duration when left out.
-    - `weights`: numbers that `reward` is given by name, such as `{"effort": 0.01}`. They are fields
-      of the task, so that `dataclasses.replace` changes them and a sweep may vary them: all values
-      share one compiled training.
+    - `control(action) -> control`: the input of the dynamics. By default a continuous action
+      itself, a single number as a scalar. Discrete actions need it.
+    - `observe(state) -> [k]`: the policy's observation; all numbers of the state when left out.
+    - `features`: the features passed to dynamics and start, or a function `key -> features` that
+      draws them for each episode (domain randomisation). No features when left out.
+    - `time_limit`: number of control periods; by default the loop's duration.
+    - `weights`: numbers passed to `reward` by name, such as `{"effort": 0.01}`. They are fields of
+      the task, so `dataclasses.replace` changes them and a sweep may vary them; all values share
+      one compiled training.
     **Returns:** a task; its states are `OdeState`.
     **Raises:** `ValueError` for a loop with a traced step, discrete actions without `control`,
-    weights that are no numbers or whose names are taken, and functions that do not fit together.
+    weights that are not numbers or whose names are taken, and functions that do not fit together.
     """
     if not isinstance(loop, Ode):
         raise ValueError(f"loop must be made by ode(...); got {outline(loop)}")
@@ -157,7 +157,8 @@ def ode_task(
     if control is None:
         if isinstance(action, Discrete):
             raise ValueError(
-                f"{action} needs control=..., a function from the index to what the dynamics take"
+                f"{action} needs control=..., a function from the index to the input of the "
+                "dynamics"
             )
         control = _action_itself
     limit = max(1, loop.steps // loop.steps_per_control) if time_limit is None else time_limit

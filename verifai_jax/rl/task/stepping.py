@@ -18,18 +18,18 @@ from verifai_jax.systems.pytree_checks import outline
 
 
 class ObservedState(NamedTuple):
-    """A state of an environment with its observation, which some environments draw at random."""
+    """A state of an environment with its observation, which may be random."""
 
     state: PyTree
     observation: Float[Array, " k"]
 
 
 class ActionAdapter(NamedTuple):
-    """The kind of action that a policy takes, and how an environment wants it: hashable.
+    """The policy's kind of action, and its conversion to the environment's: hashable.
 
     - `action`: the kind of action of the policy.
-    - `shape`, `dtype`: of the environment's action.
-    - `low`, `high`: bounds of each entry, where they differ and the policy acts from -1 to 1.
+    - `shape`, `dtype`: those of the environment's action.
+    - `low`, `high`: bounds of each entry, if they differ and the policy acts in [-1, 1].
     """
 
     action: Action
@@ -47,21 +47,21 @@ class ActionAdapter(NamedTuple):
 
 
 def abstract_action(action: Action) -> jax.ShapeDtypeStruct:
-    """Return shape and dtype of an action as `Task.step` takes it."""
+    """Return shape and dtype of an action in the form of `Task.step`."""
     if isinstance(action, Discrete):
         return jax.ShapeDtypeStruct((), jnp.int32)
     return jax.ShapeDtypeStruct((action.size,), jnp.float32)
 
 
 def discrete_actions(n: int, shape: tuple[int, ...], dtype: DTypeLike) -> ActionAdapter:
-    """Adapt one of `n` choices."""
+    """Return the adapter for one of `n` choices."""
     return ActionAdapter(Discrete(int(n)), tuple(shape), str(np.dtype(dtype)))
 
 
 def box_actions(
     low: ArrayLike, high: ArrayLike, shape: tuple[int, ...], dtype: DTypeLike, name: str
 ) -> ActionAdapter:
-    """Adapt a box of actions. Where its entries have different bounds the policy acts in [-1, 1].
+    """Return the adapter for a box. If its bounds differ the policy acts in [-1, 1].
 
     **Raises:** `ValueError` for a box without bounds.
     """
@@ -83,23 +83,23 @@ def box_actions(
 def flat_observation(observation: object, name: str) -> Float[Array, " k"]:
     """Return an observation as one vector of float32.
 
-    **Raises:** `ValueError` for one that is not an array of numbers.
+    **Raises:** `ValueError` for an observation that is not an array of numbers.
     """
     if not hasattr(observation, "shape") or not hasattr(observation, "dtype"):
         raise ValueError(
-            f"a policy is given one array of numbers; an observation of {name} is "
+            f"a policy receives one array of numbers; an observation of {name} is "
             f"{outline(observation)}: use an environment whose observation is one array"
         )
     return jnp.ravel(jnp.asarray(observation)).astype(jnp.float32)
 
 
 def match_types(state: PyTree, following: PyTree, name: str) -> PyTree:
-    """Return a state in the dtypes that it has from step to step: a count may begin as an integer.
+    """Return a state with the dtypes that a step returns: a count may start as an integer.
 
     **Arguments:**
     - `following`: the state after a step, or its shapes and dtypes.
-    - `name`: the environment's, for the error message.
-    **Raises:** `ValueError` for a step that leads to a state of another structure.
+    - `name`: the environment's name, for the error message.
+    **Raises:** `ValueError` for a step that returns a state of another structure.
     """
     if jax.tree.structure(state) != jax.tree.structure(following):
         raise ValueError(

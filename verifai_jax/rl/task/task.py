@@ -57,20 +57,21 @@ Action = Discrete | Continuous
 
 @runtime_checkable
 class Task(Protocol):
-    """An episodic task: pure functions that JAX can trace, for one environment at a time.
+    """An episodic task: pure functions that JAX can trace, for one environment.
 
     - `action`: the kind of action that `step` takes.
-    - `time_limit`: steps after which an episode is cut off. That does not end it: the state goes on
-      to have a value. Only `terminated`, which `step` returns, ends an episode for good.
-    - `reset(key) -> state`: a first state, drawn with the random key.
-    - `step(key, state, action) -> (state, reward, terminated)`: one step of the environment.
-    - `observe(state) -> [k]`: the numbers that the policy is given.
+    - `time_limit`: number of steps after which an episode is truncated. Truncation does not end it:
+      the last state still has a value. Only `terminated`, returned by `step`, ends an episode for
+      good.
+    - `reset(key) -> state`: returns a first state, drawn with the random key.
+    - `step(key, state, action) -> (state, reward, terminated)`: takes one step of the environment.
+    - `observe(state) -> [k]`: returns the policy's observation.
 
-    A task may also have `start(key, features) -> state`, the first state of an episode with given
-    features of a problem; `vj.harden` trains on counterexamples by it.
+    A task may also define `start(key, features) -> state`, the first state of an episode with given
+    features of a problem, which `vj.harden` uses to train on counterexamples.
 
-    The object is a static argument of compiled programs, so it must be hashable; or it is a pytree,
-    whose numbers are then arguments of the program, so that other values compile nothing.
+    The object is a static argument of compiled programs, so it must be hashable, or a pytree, whose
+    numbers are then arguments of the program, so that other values need no compilation.
     """
 
     @property
@@ -80,14 +81,14 @@ class Task(Protocol):
 
     @property
     def time_limit(self) -> int:
-        """Steps after which an episode is cut off."""
+        """Number of steps after which an episode is truncated."""
         ...
 
     def reset(self, key: Key[Array, ""]) -> State:
         """Draw a first state.
 
         **Arguments:**
-        - `key`: a random key, of this episode's start alone.
+        - `key`: a random key for this episode's start only.
         **Returns:** a state with the structure, shapes and dtypes that `step` returns.
         """
         ...
@@ -98,14 +99,14 @@ class Task(Protocol):
         """Take one step.
 
         **Arguments:**
-        - `key`: a random key, of this step alone.
-        - `state`: as `reset` or `step` returned it.
-        - `action`: an int32 scalar of a `Discrete` task, a float32 vector `[size]` of a
+        - `key`: a random key for this step only.
+        - `state`: a state returned by `reset` or `step`.
+        - `action`: an int32 scalar for a `Discrete` task, a float32 vector `[size]` for a
           `Continuous` one.
         **Returns:** the next state; the reward; whether the episode is over for good.
         """
         ...
 
     def observe(self, state: State) -> Float[Array, " k"]:
-        """Return the observation `[k]` of a state, which is what the policy is given."""
+        """Return the policy's observation `[k]` of a state."""
         ...

@@ -54,8 +54,8 @@ def pickled_setup(
         file = getattr(sys.modules["__main__"], "__file__", None)
         if not main or ("init_main_from_path" in main and not (file and Path(file).exists())):
             raise ValueError(
-                f"blackbox(..., workers=...) starts new processes, which cannot import {name} "
-                "from a notebook or an interactive session: put it into a file beside it "
+                f"blackbox(..., workers=...) starts new processes, which cannot import {name} from "
+                "a notebook or an interactive session: put it into a file next to the notebook "
                 f"(`%%writefile simulator.py`), {where}, and import it from there, or leave out "
                 "workers"
             )

@@ -63,7 +63,7 @@ class Pool:
     - `function`: the user's function, which errors name.
     - `workers`, `timeout` (in seconds), `retries`: see `blackbox`.
     - `fresh`: whether each simulation gets its own process.
-    **Raises:** `ValueError` for numbers out of range, and for a function that a new process cannot
+    **Raises:** `ValueError` for numbers out of range, and a function that a new process cannot
     import.
     """
 

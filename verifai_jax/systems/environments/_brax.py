@@ -62,8 +62,7 @@ class Brax(PolicyLoop):
     def refined(self, factor: int | Int[Array, ""]) -> "Brax":
         """Return the same episode with a step divided by `factor`; samples and decisions stay.
 
-        The factor may be traced if `traced_factor` is true: one program then replays with every
-        step.
+        If `traced_factor` is true the factor may be traced: one program then serves all steps.
 
         **Raises:** `ValueError` for a factor that is not a positive integer, for an environment
         whose step belongs to it, and for the backends spring and positional, whose model changes
@@ -72,7 +71,7 @@ class Brax(PolicyLoop):
         if self.exact_step:
             raise ValueError(
                 f"the step belongs to {self.name} (exact_step=True), so a finer one would simulate "
-                "another environment; to take its step for an approximation, give exact_step=False"
+                "another environment; if its step is an approximation, give exact_step=False"
             )
         if not isinstance(factor, jax.Array):
             check_factor(factor)
@@ -204,7 +203,7 @@ def brax(
         name = type(getattr(env, "unwrapped", env)).__name__
         if backend is not None or options:
             raise ValueError(
-                f"backend and options are for an environment by its name; got {name} itself"
+                f"backend and options need the name of an environment; got the object {name}"
             )
     _check_env(env, name)
     if dt is None:

@@ -371,8 +371,7 @@ def gymnasium(
     """Make a black box from an environment of Gymnasium and a policy.
 
     **Arguments:**
-    - `env`: the id of a registered environment, or a function that makes one, called once in each
-      process.
+    - `env`: the id of a registered environment, or a function that makes one, in each process.
     - `policy`: `observation -> action`, or an object with such a method `act`, such as an
       `rl.Policy`. If it has an argument `features`, it receives the features at that instant. A
       policy with memory must have a method `reset()`, called before each episode.
@@ -390,8 +389,7 @@ def gymnasium(
     - `configure(env, features)`: for other changes, called before the reset.
     - `reset(env, features, seed) -> observation`: starts the episode in the state given by the
       features; `env.reset(seed=seed)` when left out.
-    - `dt`: duration of a step in seconds; by default the environment's attribute `dt` or `tau`, or
-      1.
+    - `dt`: seconds of a step; by default the environment's attribute `dt` or `tau`, or 1.
     - `workers`, `timeout`, `retries`: see `blackbox`.
     - `observation_delay`, `action_delay`: number of steps after which an observation reaches the
       policy, and an action takes effect: a number, or `{feature: maximum}` for a number given by a
@@ -399,8 +397,7 @@ def gymnasium(
     - `clip`: whether an action outside the bounds of a Box is clipped before it reaches the
       environment, as libraries do in training; False passes it on. In both cases the run counts
       such actions in its notes. Any other invalid action is an error of its row.
-    **Returns:** a black box, with its own processes if `workers` are given; one episode is one
-    simulation.
+    **Returns:** a black box, with processes if `workers` are given; an episode is a simulation.
     **Raises:** `MissingExtra` without Gymnasium; `ValueError` for invalid options; when the problem
     is checked, `UnknownNameError` for an attribute that the environment lacks.
     """

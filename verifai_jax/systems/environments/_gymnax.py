@@ -140,8 +140,7 @@ def gymnax(
       `action` and `reward` are added. Or a function `(state, observation, action, reward, features)
       -> dict`. By default: the parts of the state (except `time`), `observation`, `action` and
       `reward`, if they are scalars or vectors. An action of one number is a scalar signal.
-    - `dt`: duration of a step in seconds; by default the environment's parameter `dt` or `tau`, or
-      1.
+    - `dt`: seconds of a step; by default the environment's parameter `dt` or `tau`, or 1.
     - `params`: the parameters to which features are applied; by default the environment's own.
     - `policy_memory`: the initial memory of a policy with memory. It is then called as
       `(observation, memory)` or `(observation, memory, key)` and returns `(action, memory)`.
@@ -174,8 +173,8 @@ def gymnax(
     if not hasattr(type(env), "step_env"):
         # What it passes on is the inner environment's step, without what the wrapper adds.
         raise ValueError(
-            f"{type(env).__name__} is a wrapper, whose step resets the environment at its end: "
-            "give the environment itself, and do in the policy what the wrapper does"
+            f"{type(env).__name__} is a wrapper, whose step resets the environment when an episode "
+            "ends: give the environment itself, and move the wrapper's work into the policy"
         )
     if env.supports_transition_gradients and not env.transition_gradients_enabled:
         env = env.with_transition_gradients()
@@ -241,8 +240,8 @@ def _as_action(action: PyTree, space: Space, name: str) -> Array:
 
 
 _STOPS = (
-    "the environment stops gradients between its steps, so derivatives of a trace would be zero, "
-    "not true; use a search without gradients, or an environment that gymnax can differentiate "
+    "the environment stops gradients between its steps, so derivatives of a trace would wrongly "
+    "be zero; use a search without gradients, or an environment that gymnax can differentiate "
     "(Pendulum-v1, MountainCarContinuous-v0, Reacher-misc, Swimmer-misc, PointRobot-misc)"
 )
 

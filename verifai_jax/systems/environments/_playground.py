@@ -130,10 +130,8 @@ def playground(
       -> dict`, with Playground's state. By default: `qpos`, `qvel`, the metrics, `observation`,
       `action` and `reward`, if they are scalars or vectors.
     - `dt`: duration of a step in seconds; `env.dt` when left out.
-    - `policy_memory`: the initial memory of a policy with memory; by default that of `policy`
-      itself.
-    - `options`: overrides of an environment's configuration by name; `impl` is `"jax"` when left
-      out.
+    - `policy_memory`: the initial memory of a policy with memory; by default its own.
+    - `options`: overrides of an environment's configuration by name; `impl` is by default `"jax"`.
     - `observation_delay`, `action_delay`: number of steps after which an observation reaches the
       policy, and an action takes effect: a number, or `{feature: maximum}`.
     **Returns:** a `Playground` system; one episode is one simulation.
@@ -171,7 +169,7 @@ def loaded(env: Env, options: Mapping[str, object] | None = None) -> tuple[Any, 
     if not isinstance(env, str):
         name = type(getattr(env, "unwrapped", env)).__name__
         if options:
-            raise ValueError(f"options are for an environment by its name; got {name} itself")
+            raise ValueError(f"options need the name of an environment; got the object {name}")
         if not isinstance(env, package.MjxEnv) or env.unwrapped is not env:
             raise ValueError(
                 f"env must be the name of an environment or an MjxEnv without wrappers; got {name}"

@@ -52,8 +52,7 @@ class Episode:
     """An environment with its features applied: its start, its step and its signals.
 
     - `start(key) -> Moment`
-    - `step(time, state, action, key) -> Moment`: goes from the sample at `time` seconds to the
-      next.
+    - `step(time, state, action, key) -> Moment`: goes from the sample at `time` to the next.
     - `decide(time, observation, memory, key) -> (action, memory)`: see `policy_function`.
     - `signals(time, moment, action) -> dict`: returns one sample of the signals.
     - `steps`, `dt`: maximum number of steps, and seconds between two samples.

@@ -64,8 +64,7 @@ class FMUSimulation:
     def check(self, features: Features) -> None:
         """Check that there is a variable for every feature.
 
-        **Raises:** `ValueError` that names the first feature without one, and the existing
-        variables.
+        **Raises:** `ValueError` with the first feature without one, and the existing variables.
         """
         for name in features:
             variable = self._variable(name)
@@ -148,9 +147,8 @@ class FMUSimulation:
         if self._key not in _instances:
             if self.description.only_once and any(key[0] == self.file for key in _instances):
                 raise FMUError(
-                    f"a process can have one instance of {self.file.name} only, and this one has "
-                    "another one already; let each system simulate in processes of its own, by "
-                    "workers=1"
+                    f"a process can only have one instance of {self.file.name}, and this process "
+                    "already has one; simulate each system in its own process with workers=1"
                 )
             kind = ExchangeInstance if self.description.exchange else Instance
             _instances[self._key] = kind(self.description, _unpacked(self.file))
@@ -201,8 +199,7 @@ def fmu(
       names may not have.
     - `controller`: a function `(time, outputs, features)` that returns inputs by the variables'
       names, called once a step; features that are not variables are passed only to it.
-    - `workers`: number of processes that simulate; None for this process, which a crash of the FMU
-      would end.
+    - `workers`: number of processes; None for this process, which a crash of the FMU would end.
     - `timeout`: seconds after which a simulation is aborted.
     - `reuse`: whether a process reuses its instance for the next simulation, which saves loading
       it. The instance is set back to its initial state, or reset if the FMU cannot save its state.
@@ -219,7 +216,7 @@ def fmu(
     description = read_description(file, exchange)
     if description.only_once and not reuse:
         raise ValueError(
-            f"a process can have one instance of the FMU {description.file.name} only; leave out "
+            f"a process can only have one instance of the FMU {description.file.name}; leave out "
             "reuse=False"
         )
     _ = description.binary
@@ -278,9 +275,9 @@ def fmu_ranges(
         if not np.isfinite([low, high]).all():
             if around is None or variable.start is None:
                 raise ValueError(
-                    f"{name} of the FMU {description.file.name} declares no range, only "
-                    f"{low:zg} to {high:zg}, and the start value {variable.start}; give around=0.2 "
-                    "for a fifth to both sides of that, or write its domain"
+                    f"{name} of the FMU {description.file.name} declares no finite range ({low:zg} "
+                    f"to {high:zg}), but the start value {variable.start}; give around=0.2 for a "
+                    "range of 20 % to both sides, or write its domain"
                 )
             start = float(variable.start)
             reach = around * abs(start)

@@ -38,8 +38,7 @@ class Variable:
     """A scalar variable of an FMU.
 
     - `name`, `reference`, `description`: as in the FMU.
-    - `type`: the type in the names of the functions that set and read it, such as `Real` or
-      `Float64`.
+    - `type`: the type in the names of its set and get functions, such as `Real` or `Float64`.
     - `causality`: `parameter`, `input`, `output`, `local` ...
     - `variability`: `constant`, `fixed`, `tunable`, `discrete` or `continuous`.
     - `unit`: its unit; empty if there is none.
@@ -159,7 +158,7 @@ def read_description(file: str | Path, exchange: bool | None = None) -> Descript
             )
     except (zipfile.BadZipFile, KeyError) as error:
         raise ValueError(
-            f"{path.name} is no FMU: an archive with modelDescription.xml is expected ({error})"
+            f"{path.name} is not an FMU: an archive with modelDescription.xml is expected ({error})"
         ) from error
     version = root.get("fmiVersion", "").split(".")[0]
     if version not in ("2", "3"):
@@ -174,7 +173,8 @@ def read_description(file: str | Path, exchange: bool | None = None) -> Descript
         wanted = "co-simulation or model exchange" if exchange is None else kinds[exchange]
         raise ValueError(
             f"the FMU {path.name} does not offer {wanted}; it has "
-            f"{' and '.join(kinds[k] for k in there) or 'neither'}. Export it again with that"
+            f"{' and '.join(kinds[k] for k in there) or 'neither'}. Export it again with this "
+            "interface"
         )
     token = root.get("guid") if version == "2" else root.get("instantiationToken")
     states = len(root.findall("ModelStructure/Derivatives/Unknown"))

@@ -97,8 +97,7 @@ class Bindings:
     def leaves(self, features: Mapping[str, Any]) -> dict[str, Float[Array, "..."]]:
         """Return the model's arrays for this row of features, in the model's shapes.
 
-        Geometry is computed first, then masses with their inertia, then the bound values
-        themselves.
+        Geometry is computed first, then masses with inertia, then the bound values.
         """
         ordered = ("geom_size", "geom_pos", "geom_quat", GEOM_MASS)
         groups = [
@@ -171,7 +170,8 @@ class Bindings:
                 shape = np.shape(value.knots)[1:]
             elif isinstance(value, Mapping | list | tuple):
                 raise ValueError(
-                    f"feature {binding.feature!r} has parts; bind needs a number or an array"
+                    f"feature {binding.feature!r} has several parts; bind needs a number or an "
+                    "array"
                 )
             else:
                 shape = np.shape(value)

@@ -68,8 +68,8 @@ def bodies_of_geoms(
         if geom not in found:
             body = compiled.body(int(compiled.geom_bodyid[geom])).name
             raise ValueError(
-                f"{path!r}: the inertia of body {body!r} is stated, and does not come from its "
-                f"geoms; bind 'body/{body}/mass' instead"
+                f"{path!r}: the inertia of body {body!r} is given explicitly, not computed from "
+                f"its geoms; bind 'body/{body}/mass' instead"
                 if body != "world"
                 else f"{path!r}: the world has no mass"
             )
@@ -107,11 +107,11 @@ def _solids(
 def _check_solid(compiled: MjModel, solid: SolidBody) -> None:
     """Refuse a body whose recomputed inertia is not the one that MuJoCo compiled."""
     name = compiled.body(solid.body).name
-    advice = f"give body {name!r} an <inertial>, which then stays as it is"
+    advice = f"give body {name!r} an <inertial>, which is then kept"
     if not set(solid.kinds) <= set(_SHAPES):
         raise ValueError(
-            f"a geom of body {name!r} is bound, whose mass comes from a shape other than sphere, "
-            f"capsule, ellipsoid, cylinder and box; {advice}"
+            f"a geom of body {name!r} is bound, but the body's mass comes from a shape other than "
+            f"sphere, capsule, ellipsoid, cylinder and box; {advice}"
         )
     names = ("geom_size", "geom_pos", "geom_quat", "body_mass", "body_inertia", "body_ipos")
     with jax.enable_x64():

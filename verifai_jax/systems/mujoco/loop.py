@@ -198,7 +198,9 @@ class Loop:
         **Raises:** `ValueError` for a loop without a controller.
         """
         if self.controller is None:
-            raise ValueError("faults lie between a model and its controller; there is none")
+            raise ValueError(
+                "faults act between a model and its controller; there is no controller"
+            )
         state, _ = jax.eval_shape(lambda: self.state(jnp.zeros((), jnp.result_type(float)), {}))
         compiled, named = self.compiled, {}
         for kind, path in (("joint", "joint/{}/qpos"), ("sensor", "sensor/{}")):

@@ -221,7 +221,7 @@ def why_not(bindings: Bindings) -> str | None:
     try:
         _mjx_model(bindings)
     except NotImplementedError as error:
-        return f"MJX cannot do this model: {error}{_cure(bindings.model)}"
+        return f"MJX does not support this model: {error}{_cure(bindings.model)}"
     compiled = bindings.model.compiled
     arrays = {"body_pos", "body_quat", "site_pos", "site_quat"}
     if compiled.neq and bindings.arrays & arrays:

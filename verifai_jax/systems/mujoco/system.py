@@ -258,8 +258,7 @@ def mujoco(
       controller that JAX cannot trace, such as one in NumPy or PyTorch, is called with NumPy
       arrays, once for each decision.
     - `controller_memory`: as in `ode`.
-    - `initial(features, key, qpos, qvel) -> (qpos, qvel)`: changes the state at time 0, after
-      `bind`.
+    - `initial(features, key, qpos, qvel) -> (qpos, qvel)`: the state at time 0, after `bind`.
     - `signals`: a dictionary from a signal to a path (`"joint/slider/qpos"`,
       `"body/torso/xpos[2]"`, `"sensor/imu"`, or `"contact/floor/foot"` for the number of contacts)
       or to a function `(time, state, control, features) -> value`; or one function that returns the

@@ -49,8 +49,7 @@ def ode(
       state; `time` in seconds; `control` is None without a controller. A `Signal` with constant
       pieces keeps its value during a step; a piece that begins during a step takes effect with the
       next.
-    - `initial(features, key) -> state`: any pytree of real numbers, which are all converted to one
-      float dtype.
+    - `initial(features, key) -> state`: a pytree of real numbers, converted to one float dtype.
     - `controller(time, state, features) -> control`: returns any pytree.
     - `dt`: step and sampling period in seconds; the trace has a sample at 0 and after each step.
     - `duration`: duration in seconds, a multiple of `dt`; alternatively the number of `steps`.
@@ -76,8 +75,7 @@ def ode(
       such a part is 0.
     - `switches`: jumps of the state, such as an impact or a change of the mode, at instants located
       within the step; see `vj.blocks.Switch`.
-    **Returns:** an `Ode`. The status of its trace is `NONFINITE` if the state became NaN or
-    infinite.
+    **Returns:** an `Ode`, whose traces have the status `NONFINITE` if the state becomes so.
     **Raises:** `ValueError` for inconsistent times, an unknown method, and functions with other
     arguments; when the system is traced, for functions whose results do not fit together.
     """

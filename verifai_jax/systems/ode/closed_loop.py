@@ -33,8 +33,7 @@ from verifai_jax.systems.pytree_checks import (
 class Ode(System):
     """A closed loop `(features, key) -> Trace`; made by `ode`, which documents its parts.
 
-    - `substeps`: number of integration steps between two samples; more than one in a `refined`
-      loop.
+    - `substeps`: integration steps between two samples; more than one in a `refined` loop.
     - `exact_step`: whether the step is part of the plant, so that the loop has no finer one.
     """
 
@@ -66,13 +65,13 @@ class Ode(System):
 
         JAX may trace the factor; the loop then has no reverse-mode derivative.
 
-        **Raises:** `ValueError` for a factor that is not a positive integer, and for a loop with
+        **Raises:** `ValueError` unless the factor is a positive integer, and for a loop with
         `exact_step`.
         """
         if self.exact_step:
             raise ValueError(
                 "the step belongs to this system (exact_step=True), so a finer one would simulate "
-                "another; a plant whose step is an approximation has exact_step=False"
+                "another; for a plant whose step is an approximation, give exact_step=False"
             )
         if not isinstance(factor, jax.Array):
             check_factor(factor)
@@ -103,7 +102,7 @@ class Ode(System):
         """
         if self.controller is None:
             raise ValueError(
-                "faults lie between a plant and its controller; this system has no controller"
+                "faults act between a plant and its controller; this system has no controller"
             )
 
         def first(features: Features, key: Seed) -> Any:
@@ -381,8 +380,8 @@ class _Rollout:
         for line in filter(is_line, jax.tree.leaves(tree, is_leaf=is_line)):
             if not fed:
                 raise ValueError(
-                    "a delay_line in the state needs update=, which pushes it at each sample; "
-                    "got none"
+                    "a delay_line in the state needs update=, which pushes it at each sample; got "
+                    "none"
                 )
             count = round(line.period / beat)
             if count < 1 or abs(count * beat - line.period) > 1e-6 * beat:

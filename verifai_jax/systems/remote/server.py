@@ -179,7 +179,7 @@ class Server(threading.Thread):
         others = [client for client in self.clients if not client.here]
         if others:
             oldest = min(others, key=lambda client: client.since)
-            self._drop(oldest, "was dropped for another, as it had not said hello")
+            self._drop(oldest, "was dropped in favour of another one, as it had not sent hello")
 
     def _bound_memory(self) -> None:
         """Disconnect clients with the oldest unfinished messages while all hold too much."""
@@ -242,9 +242,9 @@ class Server(threading.Thread):
         if client.leaving:
             return
         why = wire.printable(why, 1000)
-        log.warning("simulator %s is sent away: %s", client.name, why)
+        log.warning("simulator %s is disconnected: %s", client.name, why)
         client.tell(why, fatal=True, retry=retry)
-        self._release(client, "was sent away")
+        self._release(client, "was disconnected")
         client.leaving = True
         client.frames, client.began = wire.Frames(0), math.inf
         client.deadline = time.monotonic() + connection.LINGER_SECONDS
@@ -287,7 +287,7 @@ class Server(threading.Thread):
             match message.header["type"]:
                 case "hello" if not client.greeted:
                     client.greet(message.header, self.rules)
-                    log.info("simulator %s is here", client.name)
+                    log.info("simulator %s has connected", client.name)
                 case "result" if client.greeted:
                     self._take_back(client, message)
                 case _ if not client.greeted:
@@ -328,10 +328,10 @@ class Server(threading.Thread):
         client.faults += 1
         if client.faults <= MAX_LOGGED:
             about = "" if number is None else f" (point {number})"
-            last = "; no more of its faults are logged" if client.faults == MAX_LOGGED else ""
+            last = "; further errors of it are not logged" if client.faults == MAX_LOGGED else ""
             log.warning("simulator %s%s: %s%s", client.name, about, what, last)
         if len(client.out) > MAX_UNREAD:
-            raise wire.WireError("it is sent errors and does not read them")
+            raise wire.WireError("it does not read the errors sent to it")
         client.tell(what, number)
 
     def _settle(self, point: Point, outcome: Outcome) -> None:

@@ -70,8 +70,7 @@ class Frames:
     def feed(self, data: bytes) -> Iterator[Message]:
         """Yield the complete messages among the bytes received so far.
 
-        **Raises:** `WireError` for an invalid message, after which later bytes cannot be read
-        either.
+        **Raises:** `WireError` for an invalid message; later bytes cannot be read either.
         """
         self._bytes += data
         at = 0
@@ -190,7 +189,8 @@ def _raw_array(name: str, value: dict[str, Any], raw: bytes) -> np.ndarray:
     dtype, count = np.dtype(kind), math.prod(shape)
     if not isinstance(at, int) or at < 0 or at + count * dtype.itemsize > len(raw):
         raise WireError(
-            f"{name} needs {brief(count * dtype.itemsize)} bytes from {brief(at)}; {len(raw)} came"
+            f"{name} needs {brief(count * dtype.itemsize)} bytes from {brief(at)}; {len(raw)} "
+            "were received"
         )
     return np.frombuffer(raw, dtype, count, at).reshape(shape)
 

@@ -68,9 +68,9 @@ def scenic(
         raise ValueError(f"the program has a value {taken[0]!r} already: give another name")
     if not sampling.domains and not features:
         raise ProgramError(
-            f"{compiled.filename} draws nothing at random, and nothing happens over time in it (no "
-            "behaviour, compose block, monitor, record, end or simulator), so it has one scene and "
-            "no feature: write Range(1, 2) where a number may vary"
+            f"{compiled.filename} draws nothing at random, and is static (no behavior, compose "
+            "block, monitor, record, end or simulator), so it has a single scene and no feature: "
+            "write Range(1, 2) where a number may vary"
         )
     constraint = Constraint(sampling, compiled, mode2D)
     outputs = Outputs(sampling, mode2D)

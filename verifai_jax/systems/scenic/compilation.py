@@ -64,8 +64,7 @@ def compile_program(
     """Compile a Scenic program.
 
     **Arguments:**
-    - `program`: path of a `.scenic` file, or the code of a program, recognised by line breaks or
-      spaces.
+    - `program`: path of a `.scenic` file, or code, recognised by line breaks or spaces.
     - `mode2D`: Scenic's planar mode, in which objects lie in the plane.
     - `params`: global parameters to override.
     - `model`: Scenic module to use as world model instead of the program's own.

@@ -138,8 +138,8 @@ class ScenicProgram:
         - `steps`: the maximum number of steps of a simulation.
         - `records`: names of `record` statements, which become signals; all when left out.
         - `dt`: duration of a step in seconds; the simulator's own when left out.
-        - `workers`: number of processes, each of which compiles the program once; in this process
-          when left out.
+        - `workers`: number of processes, each of which compiles the program; by default this
+          process.
         - `timeout`: wall-clock seconds for one simulation; needs `workers`. Compiling the program
           in a worker's first simulation counts.
         - `options`: further options of `verifai_jax.blackbox`.
@@ -262,10 +262,10 @@ class _NoCodeError(Exception):
 
 
 def scene_code(scene: Any, planar: bool) -> str:
-    """Return Scenic code with this scene as its only one.
+    """Return Scenic code whose only scene is this one.
 
-    Scenic's own `dumpAsScenicCode` needs the classes of the program. Here they are defined, without
-    their properties, which each object lists. Parts that code cannot express, such as a behavior,
+    Scenic's own `dumpAsScenicCode` needs the classes of the program. This code defines them without
+    properties, since each object lists its own. Parts that code cannot express, such as a behavior,
     are named in a comment. Requirements are left out, since they hold in this scene.
 
     **Arguments:**

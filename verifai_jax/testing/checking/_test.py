@@ -41,25 +41,26 @@ def test(
     corpus: str | Path | None = None,
     rename: Mapping[str, str] | None = None,
 ) -> Callable[[Callable[..., Any]], Callable[..., None]]:
-    """Make a test of a problem: the corpus is replayed first, then the budget is spent.
+    """Make a test function of a problem: it replays the corpus, then spends the budget.
 
-    It fails where a saved counterexample is not fixed, and where a new one is found, which is then
-    shrunk and added to the corpus. Under pytest `--vj-budget` and `--vj-seed` go first.
+    It fails if a saved counterexample is not fixed, or if a new one is found, which is then shrunk
+    and added to the corpus. Under pytest the options `--vj-budget` and `--vj-seed` take precedence.
 
     **Arguments:**
-    - `problem`: the problem, or `FILE.py:NAME`; one file is loaded once for all tests.
-    - `budget`: simulations at most.
-    - `max_failure_probability`: accept failures that are as rare, or rarer; the test passes only
-      where independent samples show it. No counterexample is accepted when left out.
+    - `problem`: the problem, or `FILE.py:NAME`; each file is loaded once for all tests.
+    - `budget`: maximum number of simulations.
+    - `max_failure_probability`: accept failures up to this probability; the test passes only if
+      independent samples show that it is not exceeded. When left out, no counterexample is
+      accepted.
     - `seed`: the seed of the search and the samples.
-    - `search`: for counterexamples.
+    - `search`: the search for counterexamples.
     - `confidence`: the confidence of statements about the failure probability.
     - `corpus`: folder of saved counterexamples, from the root of the project; by default
       `counterexamples`, or pytest's setting `vj_corpus`.
-    - `rename`: new names of features that older files of the corpus have.
-    **Returns:** a decorator of a test function, which is called after the test has passed; a
-    parameter `run` gets the `Run`, and all others are pytest's fixtures.
-    **Raises:** `TypeError` for something that is not a problem; `ValueError` for numbers out of
+    - `rename`: new names of features, for older files of the corpus.
+    **Returns:** a decorator for a test function, which is called after the test has passed; a
+    parameter `run` receives the `Run`, all others are pytest's fixtures.
+    **Raises:** `TypeError` for an object that is not a problem; `ValueError` for numbers out of
     range, and for a budget with which no test could pass.
     """
     if not isinstance(problem, Problem | str):
@@ -99,9 +100,9 @@ setattr(test, "__test__", False)  # noqa: B010
 def run_check(
     problem: Problem, check: Check, corpus: str | Path | None = None, target: str | None = None
 ) -> CheckOutcome:
-    """Test a problem in the present session, and print what came of it.
+    """Test a problem in the present session, and print the outcome.
 
-    **Raises:** `CounterexampleFound` where it failed.
+    **Raises:** `CounterexampleFound` if it failed.
     """
     __tracebackhide__ = True
     now = current_session()
@@ -123,13 +124,13 @@ def tested_problem(function: object) -> Problem | None:
 
 @functools.cache
 def problems_of(path: str) -> dict[str, Problem]:
-    """Return the problems that a file defines, by name; it is run once for all tests."""
+    """Return the problems that a file defines, by name; the file is run once for all tests."""
     return definitions(path, Problem)
 
 
 @functools.cache
 def load(target: str) -> Problem:
-    """Return the problem that `FILE.py:NAME` names, the same one for all tests."""
+    """Return the problem named by `FILE.py:NAME`, the same object for all tests."""
     path, colon, name = target.rpartition(":")
     problems = problems_of(path if colon else target)
     if colon and name in problems:
@@ -145,12 +146,12 @@ CORPUS = "counterexamples"
 
 @dataclass(frozen=True)
 class Session:
-    """The settings of one test, given by the test runner.
+    """The settings of a test session, given by the test runner.
 
-    - `root`: folder that the corpus lies in.
-    - `corpus`: folder of the corpus, as a path from there.
-    - `budget`, `seed`: in place of those of the test, where they are given.
-    - `outcomes`: what came of it, in order.
+    - `root`: the folder that contains the corpus.
+    - `corpus`: folder of the corpus, relative to `root`.
+    - `budget`, `seed`: values that replace those of the tests, if given.
+    - `outcomes`: the outcomes of the tests, in order.
     """
 
     root: Path = field(default_factory=Path)
@@ -160,13 +161,13 @@ class Session:
     outcomes: list[CheckOutcome] = field(default_factory=list)
 
     def settings(self, check: Check) -> Check:
-        """Return the settings of a test, with what is given for all in their place."""
+        """Return the settings of a test, with the session's values where given."""
         budget = check.budget if self.budget is None else self.budget
         seed = check.seed if self.seed is None else self.seed
         return replace(check, budget=budget, seed=seed)
 
     def corpus_folder(self, corpus: str | Path | None) -> Path:
-        """Return the folder of a corpus: that of the test, or the usual one."""
+        """Return the folder of a corpus: the test's own, or the usual one."""
         path = self.root / (self.corpus if corpus is None else corpus)
         # What is printed and typed again is the path from where one stands.
         return path.relative_to(Path.cwd()) if path.is_relative_to(Path.cwd()) else path
@@ -177,7 +178,7 @@ _SESSION: ContextVar[Session | None] = ContextVar("verifai_jax_session", default
 
 @contextlib.contextmanager
 def session(settings: Session) -> Iterator[Session]:
-    """Let checks inside take their settings from this session."""
+    """Make checks inside the block take their settings from this session."""
     token = _SESSION.set(settings)
     try:
         yield settings

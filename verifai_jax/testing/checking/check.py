@@ -31,7 +31,7 @@ SHRINKING = 1000
 
 
 class CounterexampleFound(AssertionError):
-    """A problem failed as a test; the `outcome` has the run and what was replayed."""
+    """An error for a problem that failed as a test; its `outcome` has the run and the corpus."""
 
     def __init__(self, outcome: "CheckOutcome") -> None:
         super().__init__(str(outcome))
@@ -42,16 +42,15 @@ class CounterexampleFound(AssertionError):
 class Check:
     """The settings with which a problem is tested.
 
-    - `budget`: simulations at most.
-    - `max_failure_probability`: failure probability that is still accepted; None accepts no
+    - `budget`: maximum number of simulations.
+    - `max_failure_probability`: largest accepted failure probability; None accepts no
       counterexample at all.
     - `seed`: the seed of the search and the samples.
-    - `search`: the search of counterexamples, where none is accepted.
+    - `search`: the search for counterexamples, if none is accepted.
     - `confidence`: the confidence of statements about the failure probability.
     - `rename`: new names of features, for older files of the corpus.
 
-    **Raises:** `ValueError` for numbers out of range, and for a budget with which no test could
-    pass.
+    **Raises:** `ValueError` for numbers out of range, and a budget with which no test could pass.
     """
 
     budget: int = BUDGET
@@ -72,21 +71,21 @@ class Check:
         if self.budget < minimum:
             raise ValueError(
                 f"a budget of {self.budget:,} simulations cannot show a failure probability of at "
-                f"most {format_percent(self.max_failure_probability)}: if none fails, {minimum:,} "
-                "do"
+                f"most {format_percent(self.max_failure_probability)}: it needs {minimum:,}, if "
+                "none fails"
             )
 
     def run(
         self, problem: Problem, corpus: str | Path | None = None, target: str | None = None
     ) -> "CheckOutcome":
-        """Replay the corpus, and spend the budget where all of it is fixed.
+        """Replay the corpus, and spend the budget if all of it is fixed.
 
         **Arguments:**
-        - `problem`: to be tested.
+        - `problem`: the problem to test.
         - `corpus`: folder of saved counterexamples, to which a new one is added; None for none.
-        - `target`: the command line's name of the problem, for the files of the corpus.
+        - `target`: the problem's name on the command line, for the files of the corpus.
         **Returns:** the outcome.
-        **Raises:** `ValueError` for a corpus that is a file; as `falsify`.
+        **Raises:** `ValueError` for a corpus that is a file; the errors of `falsify`.
         """
         replayed = None
         if corpus is not None and Path(corpus).is_file():
@@ -124,13 +123,13 @@ class Check:
 class CheckOutcome(InNotebook):
     """The outcome of testing a problem.
 
-    - `problem`: its name.
+    - `problem`: the name of the problem.
     - `check`: the settings.
-    - `target`: the command line's name of the problem, where it is known.
+    - `target`: the problem's name on the command line, if known.
     - `replayed`: the replayed corpus; None without one.
-    - `run`: what the budget was spent on; None if the corpus failed already.
+    - `run`: the run on which the budget was spent; None if the corpus failed already.
     - `saved`: files that were added to the corpus.
-    - `unsaved`: why a counterexample could not be added; empty if none was to be.
+    - `unsaved`: the reason why a counterexample could not be added; empty if there was none.
     """
 
     problem: str
@@ -143,7 +142,7 @@ class CheckOutcome(InNotebook):
 
     @property
     def rate(self) -> Rate | None:
-        """Failure rate with its interval, where a probability was asked for."""
+        """Failure rate with its interval, if a probability was given."""
         if self.run is None or self.check.max_failure_probability is None:
             return None
         counts = self.run.table.counts
@@ -153,7 +152,7 @@ class CheckOutcome(InNotebook):
 
     @property
     def refuted(self) -> bool:
-        """True where the run shows that the problem fails, or fails too often."""
+        """True if the run shows that the problem fails, or fails too often."""
         if self.run is None:
             return False
         if self.rate is None:
@@ -162,7 +161,7 @@ class CheckOutcome(InNotebook):
 
     @property
     def failed(self) -> bool:
-        """True unless the corpus is fixed and the run shows what was asked for."""
+        """True unless the corpus is fixed and the run shows what was required."""
         if self.run is None or self.refuted:
             return True
         if self.run.table.counts.without_verdict == self.run.simulations:
@@ -171,7 +170,7 @@ class CheckOutcome(InNotebook):
 
     @property
     def properties(self) -> dict[str, str | int | float]:
-        """Plain numbers and texts about it, as for a report of tests."""
+        """Plain numbers and texts about it, for a report of tests."""
         result: dict[str, str | int | float] = {
             "vj_problem": self.problem,
             "vj_seed": self.check.seed,
@@ -198,9 +197,8 @@ class CheckOutcome(InNotebook):
         if self.run is None:
             assert self.replayed is not None
             return printable(
-                f"{self.replayed}\n"
-                "  saved counterexamples are replayed first, and not all of these are fixed; "
-                "delete the file of a failure that is accepted"
+                f"{self.replayed}\n  saved counterexamples are replayed first, and some of these "
+                "are not fixed; to accept a failure, delete its file"
             )
         parts = [self.run.summary()]
         if self.rate is not None:
@@ -252,7 +250,7 @@ def _short(value: object) -> str:
 
 
 def min_budget(probability: float, confidence: float) -> int:
-    """Return the simulations without a failure that show a failure probability."""
+    """Return how many simulations without a failure show a failure probability."""
     low, high = 0, 1
     while anytime_interval(0, high, confidence).high > probability:
         low, high = high, 2 * high

@@ -23,7 +23,7 @@ def qualify(only: Sequence[str] | None = None) -> Qualification:
     **Arguments:**
     - `only`: names of oracles; all when left out, which takes a minute or two.
     **Returns:** the outcomes, with versions and one hash of all files of the package.
-    **Raises:** `UnknownNameError` for the name of no oracle; it lists all names.
+    **Raises:** `UnknownNameError` for an unknown oracle; it lists all names.
     """
     check_names("oracle", only or (), ORACLES)
     outcomes = []

@@ -288,7 +288,7 @@ vj.falsify(_problem(), "cross_entropy", 900, batch=100, progress=False, folder={
 
 
 def kills() -> None:
-    """Check that a run whose process is killed goes on to the table that it would have had."""
+    """Check that a killed and resumed run has the same table as an undisturbed run."""
     with tempfile.TemporaryDirectory() as folder:
         into = str(Path(folder) / "run")
         code = KILLED.format(path=sys.path, folder=into)

@@ -26,8 +26,8 @@ from verifai_jax.reports.signing import signing_section
 class Outcome:
     """The outcome of one oracle.
 
-    - `what`: it checks, as a sentence.
-    - `message`: what was wrong; empty where it passed.
+    - `what`: a sentence on what it checks.
+    - `message`: the error; empty if it passed.
     """
 
     name: str
@@ -43,7 +43,7 @@ class Qualification(InNotebook):
 
     - `versions`: the versions of packages, Python and the machine.
     - `package_sha256`: one hash of all files of the package, by name and content.
-    - `date`: in UTC.
+    - `date`: the date in UTC.
     - `complete`: whether all oracles were run.
     """
 
@@ -55,7 +55,7 @@ class Qualification(InNotebook):
 
     @property
     def passed(self) -> bool:
-        """True if every oracle that was run passed."""
+        """True if all oracles that were run passed."""
         return all(each.passed for each in self.outcomes)
 
     @property
@@ -152,7 +152,7 @@ class Hazard(NamedTuple):
     """A possible error of the tool.
 
     - `oracle`: the name of the check that catches it.
-    - `error`: the error in words.
+    - `error`: a description of the error.
     """
 
     oracle: str

@@ -43,17 +43,17 @@ def trace_matrix(
 ) -> TraceMatrix:
     """Follow each requirement to its formula, problem, tests, runs, claims and reports.
 
-    A link is missing where nothing is there, and suspect where something has changed since: the
-    formula, what the requirement says, the model, or the run that claims are about.
+    A link is missing if there is nothing to link to, and suspect if something has changed since:
+    the formula, the content of the requirement, the model, or the run that claims refer to.
 
     **Arguments:**
     - `problems`: problems, or files `FILE.py` and names `FILE.py:NAME`, which are run.
-    - `requirements`: a file, or what it says; those of the problems when left out.
+    - `requirements`: a file, or its content; by default those of the problems.
     - `tests`: test functions of `vj.test`, files, and folders whose files `test_*.py` are run; a
-      file of problems without such functions, as pytest's `vj_specs` names it, tests all of them.
+      file of problems without such functions, as in pytest's `vj_specs`, tests all of them.
     - `runs`: folders of runs, and folders of such folders.
-    - `reports`: files and folders of reports; those in the folders of the runs are always found.
-      What is None is not asked for, and not missing.
+    - `reports`: files and folders of reports; those in the folders of the runs are always included.
+      Kinds of links that are None are not required.
     **Returns:** the matrix.
     **Raises:** `TargetError` for a file that cannot be run; `ValueError` for a damaged record,
     claims of another form, and two problems of one name.
@@ -216,13 +216,12 @@ CLAIMS = ".claims.json"
 
 
 class ModelNow(NamedTuple):
-    """The model of a problem as it is now.
+    """The present model of a problem.
 
-    - `digests`: the digests of what it simulates, by backend; empty texts where that cannot be
-      said.
+    - `digests`: hashes of what it simulates, by backend; empty texts if unknown.
     - `sources`: its files.
-    - `chains`: last hashes of the inputs that reports on its runs would have.
-    - `chain`: that of a report on another result of the same files.
+    - `chains`: last hashes of the chains that reports on its runs would have now.
+    - `chain`: that of a report on another result with the same files.
     """
 
     digests: Mapping[str | None, str]
@@ -236,15 +235,16 @@ class Evidence:
     """A run, or the claims of a report.
 
     - `kind`: `"runs"` or `"claims"`.
-    - `result`: that claims are on, `"run"` or `"estimate"`.
+    - `result`: the kind of result that the claims are about, `"run"` or `"estimate"`.
     - `name`: its path.
-    - `problem`: the name of the problem that it is about.
+    - `problem`: the name of its problem.
     - `formulas`: their texts by name, at that time.
-    - `requirements`: what these stood for.
-    - `model`: hash of what was simulated; empty where it is not recorded.
-    - `backend`: that simulated it.
+    - `requirements`: the content of their requirements at that time.
+    - `model`: hash of the simulated model; empty if not recorded.
+    - `backend`: the backend that simulated it.
     - `sources`: the sources of a run, as it recorded them.
-    - `chain`: last hash of the chain of its inputs: as it is now of a run, as it was of claims.
+    - `chain`: last hash of the chain of its inputs: the present one of a run, the recorded one of
+      claims.
     """
 
     kind: str
@@ -260,16 +260,16 @@ class Evidence:
 
     @property
     def folder(self) -> Path:
-        """The folder that it is in, or is."""
+        """The folder that contains it, or that it is."""
         return Path(self.name) if self.kind == "runs" else Path(self.name).parent
 
     @property
     def page(self) -> Path:
-        """The report of claims."""
+        """The report that contains the claims."""
         return Path(self.name.removesuffix(CLAIMS) + ".html")
 
     def links(self) -> Iterator[tuple[str, str]]:
-        """Yield what it is a link to: the kind, and a name."""
+        """Yield the links that it provides: their kind, and a name."""
         yield self.kind, self.name
         if self.kind == "claims" and self.page.is_file():
             yield "reports", str(self.page)
@@ -277,10 +277,10 @@ class Evidence:
     def suspicions(
         self, name: str, formula: str, about: Requirement | None, model: ModelNow
     ) -> Iterator[str]:
-        """Yield sentences on what has changed since.
+        """Yield sentences on changes since it was made.
 
         **Arguments:**
-        - `about`: what it stands for now.
+        - `about`: its present subject.
         """
         if (was := self.formulas[name]) != formula:
             yield f"{name}: the formula has changed since {self.name}: {was} then, {formula} now"
@@ -295,7 +295,7 @@ class Evidence:
             yield f"{name}: the model has changed since {self.name}: {list_changes(changes)}"
         if self.kind == "claims":
             if self.result == "run" and self.chain not in model.chains:
-                yield f"{name}: the run has changed since {self.name}, or is not among those named"
+                yield f"{name}: the run has changed since {self.name}, or was not given"
             elif self.result != "run" and not self.model and self.chain != model.chain:
                 yield f"{name}: the model has changed since {self.name}"
             if not self.page.is_file():
@@ -308,7 +308,7 @@ def _said(entry: Mapping[str, str]) -> dict[str, str]:
 
 
 def model_now(problem: Problem, about: Sequence[Evidence]) -> ModelNow:
-    """Return the model of a problem as it is now, for all evidence that is about it."""
+    """Return the present model of a problem, for all evidence on it."""
     digests = {}
     for backend in {each.backend for each in about if each.model}:
         digests[backend] = digest_of_model(problem.on_backend(backend) if backend else problem)
@@ -335,7 +335,7 @@ def runs_in(folders: Sequence[str | Path]) -> Iterator[Evidence]:
 
 
 def claims_in(paths: Sequence[str | Path]) -> Iterator[Evidence]:
-    """Yield the claims of reports, and of folders of reports, that say what they are about.
+    """Yield the claims of reports, and of folders of reports, that name their subject.
 
     **Raises:** `ValueError` for a file of another form.
     """

@@ -21,12 +21,12 @@ LINKS = ("tests", "runs", "claims", "reports")
 
 
 class Gap(NamedTuple):
-    """A link that is not there, or not to be relied on.
+    """A link that is missing, or not reliable any more.
 
     - `kind`: `"missing"` or `"suspect"`.
     - `link`: the kind of the link, such as `"tests"`.
-    - `subject`: identifier of the requirement, or the name of what has none.
-    - `text`: a sentence.
+    - `subject`: identifier of the requirement, or the name of an object without one.
+    - `text`: a sentence that describes the gap.
     """
 
     kind: Literal["missing", "suspect"]
@@ -39,7 +39,7 @@ class TraceRow(NamedTuple):
     """A requirement with one problem that has its formula.
 
     - `requirement`, `text`: its identifier and its sentence; empty for a formula without one.
-    - `formula`, `problem`: empty if not written yet.
+    - `formula`, `problem`: their names; empty if not written yet.
     - `tests`, `runs`, `claims`, `reports`: names of functions, folders and files.
     """
 
@@ -57,8 +57,8 @@ class TraceRow(NamedTuple):
 class TraceMatrix(Tabular):
     """The chain requirement, formula, problem, tests, runs, claims, report.
 
-    **Fields:** `rows`, one for each requirement and problem; `gaps`; `asked`, the links that were
-    asked for, of `LINKS`. `str()` writes the summary.
+    **Fields:** `rows`, one for each requirement and problem; `gaps`; `asked`, the requested kinds
+    of links, from `LINKS`. `str()` writes the summary.
     """
 
     rows: tuple[TraceRow, ...]
@@ -67,12 +67,12 @@ class TraceMatrix(Tabular):
 
     @property
     def missing(self) -> tuple[Gap, ...]:
-        """The links that are not there."""
+        """The missing links."""
         return tuple(gap for gap in self.gaps if gap.kind == "missing")
 
     @property
     def suspect(self) -> tuple[Gap, ...]:
-        """The links whose ends do not fit each other any more."""
+        """The links whose ends do not agree any more."""
         return tuple(gap for gap in self.gaps if gap.kind == "suspect")
 
     @property
@@ -82,7 +82,7 @@ class TraceMatrix(Tabular):
 
     @property
     def table(self) -> "pd.DataFrame":
-        """A row for each requirement and problem, texts alone; `gaps` is its last column."""
+        """A row for each requirement and problem, as texts; `gaps` is its last column."""
         import pandas as pd
 
         names = ("requirement", "text", "formula", "problem", *self.asked, "gaps")

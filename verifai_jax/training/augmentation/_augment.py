@@ -61,46 +61,45 @@ def augment(
     progress: bool | None = None,
     even_if_changed: bool = False,
 ) -> Augmentation:
-    """Compare ways of adding training data, over seeds with paired data, weights and tests.
+    """Compare ways to add training data over several seeds, with paired data, weights and tests.
 
-    The arms, all with the same number of further training steps from the same base network:
+    All arms train the same base network further, with the same number of steps:
 
     - `none`: nothing is added.
     - `random`: new inputs from the prior.
     - `standard`: initial inputs, transformed by the task's `transform`.
-    - `counterexamples`: those of the error table, as the search found them.
-    - `table_random`, `table_closest`: counterexamples drawn at random, or the closest to each
-      other.
+    - `counterexamples`: rows of the error table, in the order in which the search found them.
+    - `table_random`, `table_closest`: counterexamples at random, or those closest to each other.
     - `table_pca`, `rules`: new inputs along the principal components of the counterexamples, or
-      within the rules of the table, whether the network errs on them or not.
-    - `pca_kept`, `rules_kept`: the same, of which only those are added on which the network errs.
+      inside the rules of the table, even if the network is right on them.
+    - `pca_kept`, `rules_kept`: the same, but only inputs on which the network errs are added.
 
     **Arguments:**
-    - `task`: what is trained, and how its inputs are rendered.
+    - `task`: the task to train, with the renderer of its inputs.
     - `arms`: names of arms, or `"all"`; by default `none`, `random`, `counterexamples`, and
-      `standard` where the task has a transformation.
-    - `initial`: inputs of the initial set.
-    - `added`: inputs that an arm adds.
-    - `steps`, `further_steps`: training steps of the base, and of each arm after it.
-    - `search`: the search of the error table: a name, or a search with its options.
-    - `budget`: simulations of the error table; ten times `added` when left out.
-    - `seeds`: repetitions, each with data, weights and tests of its own.
-    - `seed`: the seed of all repetitions.
-    - `test`: inputs of the uniform test.
-    - `hard`: inputs of the hard test, on which an independently trained network errs; 0 for none.
-      It is the same for all seeds.
-    - `confidence`: the confidence of each interval by itself.
-    - `folder`: keeps finished work: the same call goes on where
-      it was interrupted, and one with more seeds or arms computes only these.
+      `standard` if the task has a transformation.
+    - `initial`: number of inputs in the initial set.
+    - `added`: number of inputs that an arm adds.
+    - `steps`, `further_steps`: training steps of the base network, and of each arm afterwards.
+    - `search`: the search that fills the error table: a name, or a search with its options.
+    - `budget`: number of simulations for the error table; ten times `added` when left out.
+    - `seeds`: number of repetitions, each with its own data, weights and tests.
+    - `seed`: the seed from which all repetitions are derived.
+    - `test`: number of inputs in the uniform test.
+    - `hard`: number of inputs in the hard test, on which an independently trained network errs; 0
+      for none. It is the same for all seeds.
+    - `confidence`: the confidence of each single interval.
+    - `folder`: the folder that stores finished work: the same call resumes after an interruption,
+      and one with more seeds or arms computes only the new ones.
     - `progress`: show a progress bar; by default on a terminal or in a notebook.
-    - `even_if_changed`: whether to go on with finished work of a folder although files of the task
-      are others than those that were recorded when it began.
-    **Returns:** the result: a table with a row for each arm and seed, and what follows from it. One
-    that was interrupted (Ctrl-C) has the finished rows; its `complete` is False.
+    - `even_if_changed`: whether to continue with finished work of a folder although files of the
+      task have changed since it began.
+    **Returns:** the result: a table with a row for each arm and seed, and comparisons. After an
+    interruption (Ctrl-C) it has the finished rows, and `complete` is False.
     **Raises:** before anything is trained, `UnknownNameError` for unknown arms, searches and
-    options; `ValueError` for numbers out of range, and for a search that needs gradients that the
-    task has not; `TaskError` for a task whose parts do not fit; `CacheError` for a folder that is
-    damaged, or of another augmentation; `FolderInUse` where another process writes it.
+    options; `ValueError` for numbers out of range, and for a search that needs gradients if the
+    task has none; `TaskError` for a task whose parts do not fit; `CacheError` for a folder that is
+    damaged, or of another augmentation; `FolderInUse` if another process writes there.
     """
     if not isinstance(task, SupervisedTask):
         raise TypeError(f"augment needs a SupervisedTask; got {type(task).__name__}")

@@ -28,13 +28,13 @@ GENERATED = 20
 
 @dataclass(frozen=True, eq=False)
 class Base:
-    """A trained network, and all that an arm may draw from.
+    """A trained network, and all data from which an arm may choose.
 
     - `task`, `workshop`: the task, and its compiled functions.
     - `weights`: the weights of the network.
-    - `initial`: the examples that it was trained on.
+    - `initial`: the examples on which it was trained.
     - `table`: the error table of the search: features, `rho`, `violated`, `status`.
-    - `added`: how many inputs are to be added.
+    - `added`: number of inputs to add.
     - `key`: the key of random choices.
     """
 
@@ -54,7 +54,7 @@ class Base:
         return self.table.iloc[np.flatnonzero(rows)]
 
     def features(self, table: pd.DataFrame) -> pd.DataFrame:
-        """Return the columns of features of rows."""
+        """Return the feature columns of rows."""
         return table.loc[:, list(self.task.space.columns)].reset_index(drop=True)
 
 
@@ -62,10 +62,9 @@ class Base:
 class Addition:
     """Features of the inputs that an arm adds.
 
-    - `rows`: a DataFrame with the columns of the space; for transformed inputs, of those that they
-      were made from.
-    - `rendered`: inputs that had to be rendered to choose these, themselves included.
-    - `why`: the reason why they are fewer than asked for; empty if they are not.
+    - `rows`: a DataFrame with the columns of the space; of the originals for transformed inputs.
+    - `rendered`: number of inputs rendered for the choice, including the chosen ones.
+    - `why`: the reason if there are fewer than requested; otherwise empty.
     - `transformed`: True for inputs of the initial set that are to be transformed.
     """
 
@@ -79,7 +78,7 @@ Arm = Callable[[Base], Addition]
 
 
 def none(base: Base) -> Addition:
-    """Add nothing: what the further training steps do by themselves."""
+    """Add nothing, to measure the effect of the further training steps alone."""
     return Addition(base.features(base.table.iloc[:0]))
 
 
@@ -132,7 +131,7 @@ def table_pca(base: Base) -> Addition:
 
 
 def rules_(base: Base) -> Addition:
-    """Add new inputs, drawn from the prior within the rules of the table."""
+    """Add new inputs, drawn from the prior inside the rules of the table."""
     generate = _rules_generator(base)
     if isinstance(generate, str):
         return _nothing(base, generate)
@@ -147,7 +146,7 @@ def pca_kept(base: Base) -> Addition:
 
 
 def rules_kept(base: Base) -> Addition:
-    """Generate inputs within the rules, and add those on which the network errs."""
+    """Generate inputs inside the rules, and add those on which the network errs."""
     return _kept(base, _rules_generator(base))
 
 
@@ -169,7 +168,7 @@ FROM_TABLE = tuple(name for name in ARMS if name not in ("none", "random", "stan
 
 
 def check_arms(arms: tuple[str, ...], task: SupervisedTask) -> None:
-    """Check the names of arms, and that the task has what they need.
+    """Check the names of arms, and that the task has the parts that they need.
 
     **Raises:** `UnknownNameError` with the nearest names; `ValueError` for no arms, or a name
     given twice; `TaskError` for the arm `standard` of a task without a transformation.

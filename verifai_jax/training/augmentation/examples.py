@@ -61,11 +61,11 @@ class Examples:
 
 @dataclass(frozen=True, eq=False)
 class Judgement:
-    """The judgement of a network's predictions.
+    """A judgement of a network's predictions.
 
-    - `wrongness` `[n]`: positive where a prediction is wrong.
-    - `present`, `detected` `[n]`: what there is to be found, and what is found; None if the task
-      does not say.
+    - `wrongness` `[n]`: positive for a wrong prediction.
+    - `present`, `detected` `[n]`: whether there is something to find, and whether it was found;
+      None if the task does not define them.
     """
 
     wrongness: Float[np.ndarray, " n"]
@@ -79,12 +79,12 @@ class Judgement:
 
     @property
     def finite(self) -> bool:
-        """True where every wrongness is a number."""
+        """True if every wrongness is a finite number."""
         return bool(np.isfinite(self.wrongness).all())
 
 
 class Workshop:
-    """Draws, renders and judges examples of one task, with functions that compile once.
+    """Functions that draw, render and judge examples of one task, compiled once.
 
     **Arguments:**
     - `task`: the task.
@@ -116,10 +116,9 @@ class Workshop:
         return pd.concat(parts, ignore_index=True).iloc[:count][list(space.columns)]
 
     def render(self, rows: pd.DataFrame) -> Examples:
-        """Render the inputs of features, and their labels.
+        """Render the inputs of features, and compute their labels.
 
-        The rows of the examples are those that were rendered: with the types, and the precision, of
-        features.
+        The rows are those that were rendered: with the types and precision of features.
         """
         # One row too many where there is none: it tells the shapes.
         some = rows if len(rows) else self.draw(self.task.space, jax.random.key(0), 1)
@@ -192,7 +191,7 @@ class Workshop:
 
 
 def transformed(task: SupervisedTask, examples: Examples, key: Key[Array, ""]) -> Examples:
-    """Return the examples as the task's transformation changes them."""
+    """Return the examples transformed by the task's transformation."""
     transform = task.transform
     if transform is None:
         raise TaskError(f"task {task.name!r} has no transformation")
@@ -222,7 +221,7 @@ def _draw(space: FeatureSpace, key: Key[Array, ""]) -> tuple[PyTree, Bool[Array,
 
 
 def in_blocks(function: Any, tree: PyTree, n: int) -> PyTree:
-    """Apply a function of rows to `n > 0` of them, in blocks of one shape; return NumPy arrays."""
+    """Apply a function of rows to `n > 0` rows, in blocks of one shape; return NumPy arrays."""
     parts = []
     for first in range(0, n, BLOCK):
         count = min(BLOCK, n - first)

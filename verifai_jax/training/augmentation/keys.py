@@ -12,7 +12,7 @@ INDEPENDENT = 2**31 - 1
 
 
 def purpose_key(seed: int, number: int, purpose: int) -> Key[Array, ""]:
-    """Return the random key of a purpose, the same for all arms of a repetition.
+    """Return the random key for a purpose, which is the same for all arms of a repetition.
 
     **Arguments:**
     - `purpose`: one of the constants of this file.

@@ -17,9 +17,9 @@ SHARES = ("error", "precision", "recall", "hard_error")
 
 
 class Outcome(NamedTuple):
-    """The numbers that a summary is written from.
+    """The numbers for a summary.
 
-    Fields as those of `Augmentation`; `name` is that of the task.
+    The fields are those of `Augmentation`; `name` is the name of the task.
     """
 
     name: str
@@ -43,7 +43,7 @@ class Outcome(NamedTuple):
 
     @property
     def means(self) -> pd.DataFrame:
-        """Means over the seeds that ended with finite predictions, a row for each arm."""
+        """Means over the seeds whose predictions are finite, a row for each arm."""
         finite = self.table.loc[self.table["status"] == TRAINED]
         columns = ["added", "wrong_added", "rendered", *self.metrics]
         groups: Any = finite.groupby("arm")
@@ -51,12 +51,12 @@ class Outcome(NamedTuple):
         return found.assign(seeds=groups.size().reindex([*self.rows], fill_value=0))
 
     def values(self, arm: str, metric: str) -> np.ndarray:
-        """Return a metric of an arm, seed by seed; NaN where it is not known."""
+        """Return a metric of an arm for each seed; NaN if unknown."""
         table: Any = self.table.pivot(index="seed", columns="arm", values=metric)
         return table[arm].to_numpy(np.float64)
 
     def compare(self, metric: str, reference: str) -> dict[str, PairedDifference]:
-        """Compare all arms with one of them, seed by seed.
+        """Compare all arms with one of them, paired by seed.
 
         **Arguments:**
         - `metric`: the column to compare.

@@ -36,22 +36,22 @@ TABLE, ADDED, SUMMARY = "table.parquet", "added.parquet", "summary.txt"
 class Augmentation(InNotebook):
     """The result of `augment`.
 
-    - `task`: what was trained.
+    - `task`: the name of the task.
     - `arms`: names of the arms, in the order given.
     - `table`: a row for each arm and seed, and for the base networks: `status` (`"trained"`, or
-      `"not finite"` where predictions are not), `added` inputs, `wrong_added` (the share of them
-      on which the base errs), `rendered` (inputs rendered to choose them), `error` (share of the
-      uniform test that is wrong), `precision` and `recall` where the task has a presence,
-      `hard_error`, the measures of the task, and `why` fewer inputs were added than asked for.
+      `"not finite"` if predictions are not), `added` inputs, `wrong_added` (the share of them on
+      which the base errs), `rendered` (inputs rendered to choose them), `error` (share of the
+      uniform test that is wrong), `precision` and `recall` if the task has a presence,
+      `hard_error`, the measures of the task, and `why` fewer inputs were added than requested.
     - `added`: features of all inputs that were added, with `arm`, `seed`, and the `wrongness` of
       the base network.
-    - `error_tables`: the error tables of each seed, where an arm needs one: features, `rho`,
+    - `error_tables`: the error table of each seed, if an arm needs one: features, `rho`,
       `violated`, `status`.
-    - `weights`: the weights of each arm and seed, and of the base networks; of a resumed study only
-      those in dictionaries, lists and tuples, since others are not stored.
-    - `options`: numbers and search that it was called with; `hard` is the size of the hard test.
-    - `confidence`: the confidence of each interval by itself.
-    - `complete`: False where it was interrupted.
+    - `weights`: the weights of each arm and seed, and of the base networks. A resumed study only
+      has those stored in dictionaries, lists and tuples.
+    - `options`: the numbers and the search of the call; `hard` is the size of the hard test.
+    - `confidence`: the confidence of each single interval.
+    - `complete`: False if it was interrupted.
     - `version`: the version of verifai_jax.
     """
 
@@ -86,18 +86,18 @@ class Augmentation(InNotebook):
     def compare(
         self, metric: str = "error", reference: str = "none"
     ) -> dict[str, PairedDifference]:
-        """Compare the arms with one of them, seed by seed.
+        """Compare the arms with one of them, paired by seed.
 
-        Intervals are Student's t of paired differences, and hold each by itself: of twenty arms
-        that change nothing, one is expected to look as if it did. The base, which was trained less,
-        is not compared.
+        Intervals are Student's t intervals of paired differences, and each holds on its own: of
+        twenty arms without any effect, one is expected to appear to have one. The base network,
+        which was trained less, is not compared.
 
         **Arguments:**
         - `metric`: name of a column that measures a network.
         - `reference`: the arm that is subtracted, or `"base"`.
         **Returns:** the mean difference of each other arm, over the seeds in which both are finite;
-        without an interval where that is one seed.
-        **Raises:** `UnknownNameError` for an arm or a metric that the table has not.
+        with only one such seed there is no interval.
+        **Raises:** `UnknownNameError` for an arm or a metric that the table does not have.
         """
         check_names("metric", [metric], self.metrics)
         check_names("arm", [reference], self._outcome.rows)
@@ -105,11 +105,11 @@ class Augmentation(InNotebook):
 
     @property
     def means(self) -> pd.DataFrame:
-        """Means over the seeds that ended with finite predictions, a row for each arm."""
+        """Means over the seeds whose predictions are finite, a row for each arm."""
         return self._outcome.means
 
     def summary(self) -> str:
-        """Write in words what helps and what does not, every number of it from the table."""
+        """Write which arms help and which do not; every number comes from the table."""
         return summarize(self._outcome)
 
     @reproducible_settings()
@@ -119,7 +119,8 @@ class Augmentation(InNotebook):
         **Arguments:**
         - `arm`: name of the arm.
         - `seed`: number of the seed.
-        **Raises:** `UnknownNameError` for an arm that the table has not; `ValueError` for a seed.
+        **Raises:** `UnknownNameError` for an arm that is not in the table; `ValueError` for such a
+        seed.
         """
         check_names("arm", [arm], self.arms)
         known = sorted({int(number) for number in self.table["seed"]})
@@ -142,10 +143,10 @@ class Augmentation(InNotebook):
         """Draw a metric of each arm and its paired difference with intervals.
 
         **Arguments:**
-        - `path`: file that the picture is written to, if given.
+        - `path`: file to which the picture is written, if given.
         - `metric`, `reference`: as in `compare`.
         **Returns:** the figure.
-        **Raises:** as `compare`.
+        **Raises:** the errors of `compare`.
         """
         draw = lazy_import("verifai_jax.reports.plotting.augmentation", "plot_arms")
         return draw(self, path, metric, reference)
@@ -160,12 +161,12 @@ class Augmentation(InNotebook):
         """Draw inputs that an arm added, for tasks whose inputs are images.
 
         **Arguments:**
-        - `path`: file that the picture is written to, if given.
+        - `path`: file to which the picture is written, if given.
         - `arm`, `seed`: as in `examples`.
-        - `count`: images at most.
+        - `count`: maximum number of images.
         **Returns:** the figure.
-        **Raises:** as `examples`; `ValueError` for inputs that are no images, or an arm that added
-        nothing.
+        **Raises:** the errors of `examples`; `ValueError` for inputs that are not images, or an arm
+        that added nothing.
         """
         draw = lazy_import("verifai_jax.reports.plotting.augmentation", "plot_montage")
         return draw(self, path, arm, seed, count)
@@ -173,8 +174,8 @@ class Augmentation(InNotebook):
     def save(self, folder: str | Path) -> Path:
         """Write table, added inputs and summary to a folder.
 
-        **Raises:** `FolderInUse` where another process writes it; `OSError` for what the file
-        system refuses, which leaves what was there.
+        **Raises:** `FolderInUse` if another process writes there; `OSError` if the file system
+        refuses, in which case the old content stays.
         """
         path = Path(folder)
         with write_lock(path), replacing_all(path, (ADDED, SUMMARY, TABLE)) as made:

@@ -18,10 +18,10 @@ from verifai_jax.training.augmentation.task import MARGIN, Features, SupervisedT
 def searched_problem(
     task: SupervisedTask, weights: Weights | None, search: Search, workshop: Workshop | None
 ) -> Problem:
-    """Return the problem that a search works on.
+    """Return the problem in which a search looks for inputs on which a network errs.
 
     Without gradients one program serves the networks of all seeds, with their weights as arguments;
-    with gradients each network has its own.
+    with gradients each network has its own program.
     """
     if workshop is None or (search.wants.derivatives and not task.black_box):
         return task.problem(weights)

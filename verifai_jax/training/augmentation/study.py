@@ -42,7 +42,7 @@ _PER_HARD = 40
 
 @dataclass(frozen=True, eq=False)
 class Plan:
-    """The options that decide the numbers of every arm and seed."""
+    """The options that determine the numbers of every arm and seed."""
 
     initial: int
     added: int
@@ -56,7 +56,7 @@ class Plan:
 
 
 class Study:
-    """The finished work of a study, and what computes the rest."""
+    """The finished work of a study, and methods to compute the rest."""
 
     def __init__(self, task: SupervisedTask, plan: Plan, cache: Cache, bar: ProgressBar) -> None:
         self.task, self.plan, self.cache, self.bar = task, plan, cache, bar
@@ -67,7 +67,7 @@ class Study:
         self.weights: dict[tuple[str, int], Weights] = {}
 
     def run(self, number: int, arms: Sequence[str]) -> None:
-        """Train the base of a seed and all arms, or read what is finished."""
+        """Train the base of a seed and all arms, or read finished ones."""
         seed = Seed(self, number)
         self._finish(number, BASE, seed.base_entry)
         if any(arm in FROM_TABLE for arm in arms) and self.status(number) == TRAINED:
@@ -103,7 +103,7 @@ class Study:
         self.bar.advance(1, f"seed {number}, {arm}: error {100 * row['error']:z.3g} %")
 
     def result(self, arms: Sequence[str], confidence: float, complete: bool) -> Augmentation:
-        """Return what is finished."""
+        """Return all finished results."""
         plan, hard = self.plan, self.cache.get("hard")
         added = [rows for rows in self.added if len(rows)] or self.added[:1]
         options = {field.name: getattr(plan, field.name) for field in fields(plan)}
@@ -124,7 +124,7 @@ class Study:
 
     @property
     def metrics(self) -> tuple[str, ...]:
-        """Names of the numbers that are measured."""
+        """Names of the measured numbers."""
         presence = ("precision", "recall") if self.task.has_presence else ()
         hard = ("hard_error",) if self.plan.hard else ()
         return ("error", *presence, *hard, *self.task.measures)
@@ -151,7 +151,7 @@ class Study:
     def measure(
         self, weights: Weights, test: Examples, key: Key[Array, ""]
     ) -> dict[str, float] | None:
-        """Measure a network; None for one whose predictions are not finite."""
+        """Measure a network; None if its predictions are not finite."""
         judged = self.workshop.judge(weights, test)
         if not judged.finite:
             return None
@@ -165,14 +165,14 @@ class Study:
 
 
 class Seed:
-    """One repetition: its data, base network, error table and test, each made when needed."""
+    """One repetition: its data, base network, error table and test, made when needed."""
 
     def __init__(self, study: Study, number: int) -> None:
         self.study, self.number = study, number
         self.task, self.plan, self.workshop = study.task, study.plan, study.workshop
 
     def key(self, purpose: int) -> Key[Array, ""]:
-        """Return the random key of a purpose, the same for all arms."""
+        """Return the random key for a purpose, which is the same for all arms."""
         return keys.purpose_key(self.plan.seed, self.number, purpose)
 
     @cached_property
@@ -225,7 +225,7 @@ class Seed:
         return self._finished(numbers, addition, np.zeros(0), self.base)
 
     def arm_entry(self, arm: str) -> "Finished":
-        """Choose what an arm adds, train and measure it."""
+        """Choose the inputs that an arm adds, then train and measure it."""
         if self.study.status(self.number) != TRAINED:
             why = "the base network is not finite"
             return self._finished(None, Addition(_no_rows(self.task), 0, why), np.zeros(0), None)
@@ -272,7 +272,7 @@ class Seed:
 
 
 class Finished(NamedTuple):
-    """A trained network: its row of the table, what was added, its weights."""
+    """A trained network: its row of the table, the added inputs, its weights."""
 
     entry: Arrays
     rows: pd.DataFrame

@@ -20,7 +20,7 @@ REFERENCES = ("none", "random")
 
 
 def summarize(outcome: Outcome) -> str:
-    """Write the summary of an augmentation, every number of it from its tables."""
+    """Write the summary of an augmentation; every number comes from its tables."""
     table, options = outcome.table, outcome.options
     if not len(table):
         return f"{outcome.name}: interrupted before a network was trained"
@@ -43,7 +43,7 @@ def summarize(outcome: Outcome) -> str:
 def findings(outcome: Outcome, metric: str = "error") -> list[str]:
     """Write which arms lower a metric (lower is better), and which raise it.
 
-    An arm counts as better or worse where its interval of paired differences excludes zero.
+    An arm counts as better or worse if its interval of paired differences excludes zero.
 
     **Arguments:**
     - `outcome`: the numbers.

@@ -51,30 +51,31 @@ class SupervisedTask:
     """A network to train, and labelled inputs that are rendered from features.
 
     **Arguments:**
-    - `name`: how results call it.
-    - `space`: a `FeatureSpace`, or a dictionary of domains, of all inputs that the network is for.
-    - `render`: features -> one input.
-    - `label`: features -> its label, which the renderer knows without anybody's work.
-    - `train`: `(inputs, labels, weights, steps, key) -> weights`: so many training steps from
-      these weights, or from initial ones where they are None. A plain Python function, which
-      compiles what it likes; inputs and labels are NumPy arrays with a leading axis `[n]`.
+    - `name`: the name in results.
+    - `space`: a `FeatureSpace` or dictionary of domains of all inputs that the network should
+      handle.
+    - `render`: a function from features to one input.
+    - `label`: a function from features to the input's label, which needs no manual labelling.
+    - `train`: `(inputs, labels, weights, steps, key) -> weights`: performs this many training steps
+      from these weights, or from initial ones if they are None. A plain Python function, which may
+      compile its own code; inputs and labels are NumPy arrays with a leading axis `[n]`.
     - `predict`: `(weights, inputs) -> predictions`, all with a leading axis `[n]`.
-    - `wrongness`: `(prediction, label) -> number` for one input: positive where the prediction is
-      wrong, and the more so the greater it is. A number instead of a verdict is what lets a search
-      learn, and follow gradients: minus a margin, for instance.
-    - `present`, `detected`: label -> whether there is something to be found, prediction -> whether
-      it is found; with both, precision and recall are measured.
-    - `transform`: `(inputs, labels, key) -> (inputs, labels)`, the usual augmentation of inputs
-      that are there already; for images, `verifai_jax.training.augmentation` has some.
-    - `training_space`: where the initial set comes from, if not from all of `space`: a space with
-      the same features, in narrower domains or under a constraint.
-    - `measures`: further numbers of a trained network by name, `(weights, key) -> number`: the
-      failure rate of a closed loop, for instance.
-    - `lanes`: inputs that are rendered together.
-    - `black_box`: True where render, label, predict, wrongness, present and detected are plain
-      Python that JAX cannot trace; they get NumPy arrays, and searches do without gradients.
-    **Raises:** `TaskError` for an empty name, a function that is none, spaces that do not fit, or a
-    feature with the name of a column of results.
+    - `wrongness`: `(prediction, label) -> number` for one input: positive if the prediction is
+      wrong, and larger for worse errors, for example minus a margin. A number instead of a verdict
+      lets a search learn and follow gradients.
+    - `present`, `detected`: label -> whether there is something to find, prediction -> whether it
+      was found; with both, precision and recall are measured.
+    - `transform`: `(inputs, labels, key) -> (inputs, labels)`, the usual augmentation of existing
+      inputs; `verifai_jax.training.augmentation` has some for images.
+    - `training_space`: the space of the initial set, if it is not `space`: with the same features,
+      in narrower domains or under a constraint.
+    - `measures`: further numbers of a trained network by name, `(weights, key) -> number`, such as
+      the failure rate of a closed loop.
+    - `lanes`: number of inputs that are rendered together.
+    - `black_box`: True if render, label, predict, wrongness, present and detected are plain Python
+      that JAX cannot trace; they then receive NumPy arrays, and searches work without gradients.
+    **Raises:** `TaskError` for an empty name, a part that is not a function, spaces that do not
+    fit, or a feature with the name of a column of results.
     """
 
     name: str
@@ -161,8 +162,8 @@ class SupervisedTask:
     def problem(self, weights: Weights) -> Problem:
         """Return the problem of finding inputs on which a network errs.
 
-        Its robustness is minus the wrongness; every search applies, those with gradients too unless
-        the task is a black box.
+        Its robustness is minus the wrongness. Every search applies, including those with gradients
+        unless the task is a black box.
 
         **Arguments:**
         - `weights`: the weights of the network.
@@ -175,7 +176,7 @@ class SupervisedTask:
 
     @truncate_silently()
     def check(self) -> None:
-        """Trace renderer and label abstractly: nothing compiles. A black box is not looked into.
+        """Trace renderer and label abstractly, without compiling; black boxes are not traced.
 
         **Raises:** `TaskError` for a function that raises; `ValueError` for a constraint that
         refuses every sample.
@@ -197,7 +198,7 @@ class SupervisedTask:
     def check_network(self, weights: Weights, inputs: Inputs, labels: Labels) -> None:
         """Trace predictions and wrongness of a trained network abstractly.
 
-        **Raises:** `TaskError` for a function that raises or returns something else.
+        **Raises:** `TaskError` for a function that raises or returns a wrong type.
         """
         if self.black_box:
             return
@@ -210,8 +211,8 @@ class SupervisedTask:
         except Exception as error:
             why = explain_user_error(error, system=False)
             raise TaskError(
-                f"predict or wrongness of task {self.name!r} fails: {why}. predict gets a batch "
-                "of inputs, wrongness one prediction and one label"
+                f"predict or wrongness of task {self.name!r} fails: {why}. predict receives a "
+                "batch of inputs, wrongness one prediction and one label"
             ) from error
         shape = getattr(form, "shape", None)
         if shape is None or len(shape) != 1:

@@ -22,7 +22,7 @@ from verifai_jax.training.augmentation.task import Inputs, Labels, Transformatio
 
 
 def combine(*transformations: Transformation) -> Transformation:
-    """Return the transformation that applies these, one after the other.
+    """Return the transformation that applies these one after the other.
 
     **Raises:** `TypeError` for anything that is not a function.
     """
@@ -56,12 +56,12 @@ def flip(share: float = 0.5) -> Transformation:
 
 
 def shift(pixels: int) -> Transformation:
-    """Return a transformation that moves images, each by a number of pixels of its own.
+    """Return a transformation that shifts images, each by its own number of pixels.
 
-    What comes in from beyond an edge repeats the edge.
+    Pixels that enter at an edge repeat the edge.
 
     **Arguments:**
-    - `pixels`: by which an image moves at most, in each direction.
+    - `pixels`: maximum shift in each direction.
     **Raises:** `ValueError` unless it is a positive integer.
     """
     check_count("pixels", pixels)
@@ -83,20 +83,20 @@ def shift(pixels: int) -> Transformation:
 
 
 def brightness(max_change: float) -> Transformation:
-    """Return a transformation that multiplies images by factors of `1 - most` to `1 + most`.
+    """Return a transformation that multiplies images by a factor of `1 +- max_change` at most.
 
     **Arguments:**
-    - `max_change`: change of brightness at most, a share.
+    - `max_change`: maximum change of brightness, as a share.
     **Raises:** `ValueError` for a share out of range.
     """
     return _scaled(max_change, jnp.zeros_like)
 
 
 def contrast(max_change: float) -> Transformation:
-    """Return a transformation that scales images around their mean by `1 - most` to `1 + most`.
+    """Return a transformation that scales images around their mean by `1 +- max_change` at most.
 
     **Arguments:**
-    - `max_change`: change of contrast at most, a share.
+    - `max_change`: maximum change of contrast, as a share.
     **Raises:** `ValueError` for a share out of range.
     """
 

@@ -61,36 +61,35 @@ def sweep(
 
     **Arguments:**
     - `study`: hyper-parameters, trainer and specification.
-    - `search`: over the hyper-parameters: a name, a `Search`, `"optuna:tpe"`, or an
-      `OptunaSampler`. One that learns proposes in rounds and minimises the failure rate, then the
-      worst robustness, then the return.
-    - `configurations`: number of configurations at most; each is trained once for each of the
-      study's seeds.
-    - `seed`: the seed of the search and of the samples; training seeds are the study's.
-    - `samples`: samples of each policy in its certification, at least.
+    - `search`: the search over the hyper-parameters: a name, a `Search`, `"optuna:tpe"`, or an
+      `OptunaSampler`. A search that learns proposes in rounds and minimises the failure rate, then
+      the worst robustness, then the return.
+    - `configurations`: maximum number of configurations; each is trained with each of the study's
+      seeds.
+    - `seed`: the seed of the search and of the samples; training seeds belong to the study.
+    - `samples`: minimum number of samples of each policy in its certification.
     - `confidence`: the confidence of all verdicts together, between 0 and 1.
-    - `budget`: samples of the certification in all; see `certify`.
-    - `attack`, `attack_simulations`: the search that tries to make each policy fail first, and its
-      simulations of each policy; the failures that it finds enter no rate.
-    - `halving`: stop all but the best configurations at each checkpoint.
+    - `budget`: number of samples of the whole certification; see `certify`.
+    - `attack`, `attack_simulations`: the search that looks for failures of each policy first, and
+      its number of simulations for each; its failures enter no rate.
+    - `halving`: how to stop all but the best configurations at each checkpoint.
     - `batch`: configurations in a round of a search that learns.
-    - `episodes`: episodes whose mean is the nominal return.
-    - `folder`: caches finished work; the folder of an
-      interrupted sweep resumes it.
+    - `episodes`: number of episodes over which the nominal return is averaged.
+    - `folder`: the folder that caches finished work; passing it again resumes an interrupted sweep.
     - `max_seconds`: wall-clock limit; no training begins after two thirds of it.
-    - `progress`: True draws progress bars, False none; None draws them on a terminal and in a
-      notebook.
+    - `progress`: True draws bars, False none; None draws them on a terminal and in a notebook.
     - `note`: plain data that is stored in the folder next to the work.
     - `callbacks`: functions called for each policy when its return is known, and again when its
-      safety is, with the number of calls so far and a dictionary of plain numbers; work that is
-      read from the folder counts too.
-    - `executor`: whose workers train and simulate, as in `falsify`; the table is the same. With
-      `halving`, what goes on beyond a checkpoint is trained from its beginning, wherever it goes.
-    - `even_if_changed`: whether to go on with finished work of a folder although files of the study
-      are others than those that were recorded when it began; the record then says so.
+      safety is, with the number of calls so far and a dictionary of plain numbers; cached work
+      counts too.
+    - `executor`: an executor whose workers train and simulate, as in `falsify`; the table is the
+      same. With `halving`, configurations that continue after a checkpoint are trained from the
+      start.
+    - `even_if_changed`: whether to continue with finished work of a folder although files of the
+      study have changed since it began; the record then says so.
     **Returns:** the policies with their returns and certificates. An interrupted sweep (Ctrl-C, out
     of time) returns its finished part; `record.complete` is False.
-    **Raises:** before anything trains, `StudyError` and `UnknownNameError` as `Study.check`;
+    **Raises:** before anything trains, the `StudyError` and `UnknownNameError` of `Study.check`;
     `ValueError` for options out of range and for a search that needs gradients; `UnknownNameError`
     for an unknown search or option; `CacheError` for a folder that is damaged, foreign, of another
     format, or of another sweep.
@@ -155,11 +154,11 @@ def check_options(
     episodes: int,
     max_seconds: float | None,
 ) -> None:
-    """Check the options of a sweep, alone and with its study.
+    """Check the options of a sweep, separately and against its study.
 
-    **Raises:** `TypeError` for something that is not a study or a `Halving`; `ValueError` for a
+    **Raises:** `TypeError` for an argument that is not a study or a `Halving`; `ValueError` for a
     number out of range, or a budget that cannot sample all policies; `StudyError` for halving
-    without checkpoints or of trainings of several lengths.
+    without checkpoints or with trainings of different lengths.
     """
     if not isinstance(study, Study):
         raise TypeError(f"sweep needs a Study; got {study!r}")
@@ -187,7 +186,7 @@ def check_options(
 
 
 def count_policies(study: Study, configurations: int, halving: Halving | None) -> int:
-    """Return the greatest number of rows that a sweep can have."""
+    """Return the maximum number of rows of a sweep."""
     several_lengths = STEPS in study.space.domains
     checkpoints = 1 + sum(several_lengths or at < study.trainer.steps for at in study.checkpoints)
     left, total = configurations, 0

@@ -18,7 +18,7 @@ TRAINING, COMPILING, CERTIFYING = "training", "compiling", "certifying"
 
 
 class OutOfTime(Exception):
-    """An error for a stage whose seconds are over."""
+    """An error for a stage that has exceeded its time."""
 
 
 class Clock:
@@ -27,8 +27,8 @@ class Clock:
     `seconds` are the seconds spent in each stage; compilation is not counted in training.
 
     **Arguments:**
-    - `name`: the name of the sweep, before the progress bar.
-    - `max_seconds`: after which `check` raises `OutOfTime`; None for no limit.
+    - `name`: the name of the sweep, shown before the progress bar.
+    - `max_seconds`: time limit, after which `check` raises `OutOfTime`; None for no limit.
     - `show`: whether to draw a bar; None draws one on a terminal and in a notebook.
     """
 
@@ -52,8 +52,8 @@ class Clock:
 
         **Arguments:**
         - `name`: the name of the stage.
-        - `total`: units of work in it, and `unit`, their name.
-        - `share`: the share of `max_seconds`, after which the stage is out of time.
+        - `total`: number of units of work in it, and `unit`, their name.
+        - `share`: the share of `max_seconds` after which the stage is out of time.
         """
         began, compiling = time.perf_counter(), self.seconds[COMPILING]
         if self._until is not None:
@@ -71,7 +71,7 @@ class Clock:
         self._bar.advance(amount, figures)
 
     def show(self, done: float, total: float, figures: str) -> None:
-        """Set the units that are done and their total, which may have changed."""
+        """Set the number of finished units and their total, which may have changed."""
         self._bar.update(done, total, figures)
 
     def count_compilation(self, seconds: float) -> None:
@@ -79,6 +79,6 @@ class Clock:
         self.seconds[COMPILING] += max(0.0, seconds)
 
     def check(self) -> None:
-        """Raise `OutOfTime` where the seconds of this stage are over."""
+        """Raise `OutOfTime` if the time of this stage is over."""
         if self._limit is not None and time.perf_counter() >= self._limit:
             raise OutOfTime

@@ -27,11 +27,11 @@ _SHORTEST = 64
 
 
 def check_curve(formula: Formula | str) -> Formula:
-    """Parse a formula and check that its signals are those of a learning curve.
+    """Parse a formula and check that its only signal is that of a learning curve.
 
     **Returns:** the formula.
     **Raises:** `FormulaSyntaxError` for text that does not parse; `UnknownNameError` for another
-    signal, with the nearest; `TypeError` for something that is not a formula.
+    signal, with the nearest name; `TypeError` for anything that is not a formula.
     """
     if isinstance(formula, str):
         formula = parse(formula)
@@ -46,20 +46,20 @@ def curve_trace(
 ) -> Trace:
     """Make a trace of a learning curve, with the signal `return`, from step 0 on.
 
-    An update in which no episode ended keeps the previous value. Until the first episode ends the
-    value is that of the first: those episodes began with the training.
+    An update in which no episode ended keeps the previous value. Before the first episode ends, its
+    value is used, since that episode began with the training.
 
     **Arguments:**
     - `steps`: environment steps taken by the end of each update.
-    - `mean_return`: the mean return of the episodes that ended in each update; NaN where none did.
+    - `mean_return`: the mean return of the episodes that ended in each update; NaN if none did.
     **Returns:** the trace, whose time is environment steps.
-    **Raises:** `ValueError` where no episode ended at all, or for steps that do not increase.
+    **Raises:** `ValueError` if no episode ended at all, or for steps that do not increase.
     """
     steps, known = np.asarray(steps, np.float64), np.asarray(mean_return, np.float64)
     if steps.shape != known.shape or steps.ndim != 1:
         raise ValueError(
-            "steps and mean_return must have one entry an update; "
-            f"got shapes {list(steps.shape)} and {list(known.shape)}"
+            "steps and mean_return must have one entry for each update; got shapes "
+            f"{list(steps.shape)} and {list(known.shape)}"
         )
     present = np.isfinite(known)
     if not present.any():
@@ -83,11 +83,11 @@ def curve_robustness(
     """Return the robustness of a formula on a learning curve.
 
     **Arguments:**
-    - `formula`: over the signal `return`, bounds in environment steps from 0 on, rounded down to
-      whole updates. After the end of the curve its last value stays.
+    - `formula`: a formula over the signal `return`; its time bounds are environment steps from 0
+      on, rounded down to whole updates. After the end of the curve its last value is held.
     - `steps`, `mean_return`: the curve, as in `curve_trace`.
-    **Returns:** the robustness in units of the return; NaN where no episode ended.
-    **Raises:** as `check_curve`.
+    **Returns:** the robustness in units of the return; NaN if no episode ended.
+    **Raises:** the errors of `check_curve`.
     """
     formula = check_curve(formula)
     if not np.isfinite(np.asarray(mean_return, np.float64)).any():

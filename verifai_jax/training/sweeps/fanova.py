@@ -18,7 +18,7 @@ _MAX_ENTRIES = 2**22
 
 
 class Boxes(NamedTuple):
-    """A function on the unit cube: the sum of constants on boxes.
+    """A function on the unit cube: a sum of functions that are constant on a box and 0 elsewhere.
 
     - `low`, `high`: corners of the boxes.
     - `value`: constants on them.
@@ -32,8 +32,8 @@ class Boxes(NamedTuple):
 class Shares(NamedTuple):
     """Shares of a function's variance; NaN for a constant function.
 
-    - `first`: of each input, the share that goes away when the input is known.
-    - `total`: for each input, the share that stays when all other inputs are known.
+    - `first`: for each input, the share that vanishes when the input is known.
+    - `total`: for each input, the share that remains when all other inputs are known.
     - `variance`: the variance of the function.
     """
 
@@ -48,9 +48,9 @@ def leaf_boxes(
     """Return the leaves of a forest of regression trees over the unit cube.
 
     **Arguments:**
-    - `forest`: the forest of scikit-learn, fitted.
-    - `edges`: borders of the cells of each input, to the nearest of which thresholds move; None for
-      a continuous input.
+    - `forest`: a fitted forest of scikit-learn.
+    - `edges`: borders of the cells of each input, to which thresholds are rounded; None for a
+      continuous input.
     """
     dimensions = len(edges)
     low, high, value = [], [], []

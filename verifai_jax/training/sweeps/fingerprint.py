@@ -17,7 +17,7 @@ from verifai_jax.training.sweeps.study import Study
 
 
 def fingerprint(study: Study, options: Mapping[str, Any]) -> dict[str, Any]:
-    """Describe everything that decides the table of a sweep, as far as data can.
+    """Describe everything that determines the table of a sweep, as far as data can.
 
     Code is described by its name only.
 

@@ -45,7 +45,7 @@ log = logging.getLogger("verifai_jax.sweeps")
 
 
 class FunctionRuns(TrainingRuns):
-    """All trainings of a sweep by a function; arguments as of `TrainingRuns`."""
+    """All trainings of a sweep by a function; arguments as in `TrainingRuns`."""
 
     def __init__(
         self, study: Study, cache: Cache, clock: Clock, executor: Executor | None = None
@@ -76,7 +76,7 @@ class FunctionRuns(TrainingRuns):
         return len(self.runs) - 1
 
     def train(self, numbers: Sequence[int], rung: int, *, further: bool = False) -> None:
-        """Train up to a checkpoint, and store each on the way; see `TrainingRuns.train`."""
+        """Train up to a checkpoint, storing those on the way; see `TrainingRuns.train`."""
         for at in range(rung + 1):
             waiting = []
             for number in numbers:
@@ -175,15 +175,15 @@ ARRAY = "array/"
 def train_once(
     train: Callable[..., Any], observation: Any, call: Mapping[str, Any], seed: int
 ) -> Trace:
-    """Call the function of a trainer, and turn its policy into arrays; a process runs this.
+    """Call the training function, and convert its policy to arrays; runs in a process.
 
     **Arguments:**
-    - `train`: see `Trainer`.
-    - `observation`: an example for policies that do not say what they observe, or None.
-    - `call`: the hyper-parameters `values`, the `steps` in all, the `folder` to resume from, and
-      `starts` if it gets them.
+    - `train`: the training function, see `Trainer`.
+    - `observation`: an example observation for policies that do not define their input, or None.
+    - `call`: the hyper-parameters `values`, the total `steps`, the `folder` to resume from, and
+      `starts`, whether the function receives it.
     - `seed`: training seed.
-    **Returns:** the arrays, which the pool hands on as they are.
+    **Returns:** the arrays, which the pool passes on unchanged.
     """
     random.seed(seed)
     np.random.seed(seed)  # noqa: NPY002 - what other frameworks draw from.
@@ -213,7 +213,7 @@ def train_once(
 def attempt(
     train: Callable[[Mapping[str, Any], int], Trace], call: Mapping[str, Any], seed: int
 ) -> "Arrays | str":
-    """Return what `train_once` does, or what it raises as text; a worker of an executor runs it."""
+    """Return the result of `train_once`, or its error as text; runs on a worker."""
     try:
         return cast("Arrays", train(call, seed))
     except Exception as error:

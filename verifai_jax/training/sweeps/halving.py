@@ -22,7 +22,8 @@ class Halving:
     """Successive halving: keep the best 1/reduction of the configurations at each checkpoint.
 
     **Arguments:**
-    - `reduction`: greater than 1; of so many configurations one continues, rounded up.
+    - `reduction`: greater than 1; the share 1/reduction of the configurations continues, rounded
+      up.
     - `by`: the criterion. `"return"` is the nominal return at the checkpoint; `"safety"` is the
       failure rate of the closed loop in a few simulations, then the worst robustness, then the
       return.
@@ -46,10 +47,9 @@ class Halving:
         """Choose the configurations that continue.
 
         **Arguments:**
-        - `objective`: the objective of each configuration, by its number; the least is best, and
-          NaN is worst.
-        **Returns:** numbers of the configurations, in ascending order; of equal ones the first
-        continue.
+        - `objective`: objective of each configuration, by number; the smallest is best, NaN is
+          worst.
+        **Returns:** ascending numbers of the configurations; among equal ones the first continue.
         """
         count = self.survivors(len(objective))
         values = {n: math.inf if math.isnan(value) else value for n, value in objective.items()}

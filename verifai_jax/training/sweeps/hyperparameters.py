@@ -27,8 +27,8 @@ _CHUNK = 32
 def values_at(space: FeatureSpace, points: Float[np.ndarray, "n dim"]) -> list[Hyperparameters]:
     """Return the hyper-parameters at points of the unit cube, as plain Python values.
 
-    Strings are strings, numbers of a `Categorical` the choices themselves; real numbers are those
-    of float32, which is what a training sees.
+    Strings stay strings, and choices of a `Categorical` that are numbers stay as given; real
+    numbers are rounded to float32, which a training uses.
     """
     points = np.asarray(points, np.float32)
     values: list[Hyperparameters] = []
@@ -40,7 +40,7 @@ def values_at(space: FeatureSpace, points: Float[np.ndarray, "n dim"]) -> list[H
 
 
 def values_of_features(space: FeatureSpace, features: Mapping[str, Any]) -> list[Hyperparameters]:
-    """Return the hyper-parameters of features, whose leaves are `[n]`, as plain Python values."""
+    """Return the hyper-parameters in features with leaves `[n]`, as plain Python values."""
     columns = space.rows(jax.tree.map(np.asarray, features))
     count = len(np.ravel(next(iter(jax.tree.leaves(features)))))
     values: list[Hyperparameters] = [{} for _ in range(count)]
@@ -55,7 +55,7 @@ def values_of_features(space: FeatureSpace, features: Mapping[str, Any]) -> list
 
 
 def probe_values(domain: Domain) -> list[tuple[Any, str]]:
-    """Return choices or ends of a domain to check, and the place of each in words."""
+    """Return choices or ends of a domain to check, each with a description of its position."""
     if not domain.columns("value"):
         return [(domain.held_at, "the value")]
     if (tuning := domain.tuning) is not None:
@@ -74,7 +74,7 @@ def probe_values(domain: Domain) -> list[tuple[Any, str]]:
 
 
 def companions(space: FeatureSpace) -> list[Hyperparameters]:
-    """Return hyper-parameters all over the space, the middle first, to check one value among."""
+    """Return hyper-parameters from all over the space, the middle first, to check one value."""
     rng = np.random.default_rng(0)
     # A constraint may make values possible that are rare without it.
     count = _COMPANIONS if space.where is None else 16 * _COMPANIONS

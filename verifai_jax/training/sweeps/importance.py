@@ -61,18 +61,20 @@ MAX_CELLS = 8
 
 @dataclass(frozen=True, eq=False)
 class HyperparameterImportance(InNotebook):
-    """The importance of each hyper-parameter for failing and for the return.
+    """The importance of each hyper-parameter for safety and for the return.
 
     **Fields:**
     - `table`: one row for each hyper-parameter, the most important first. For each of
       `failure_rate` and `nominal_return` it has the loss in R^2 on held-out configurations when the
       column is shuffled, with `_low` and `_high` two standard deviations of the repetitions away;
-      `_first` and `_total`, the shares of the model's variance that it explains alone and with all
-      interactions; `_trend`, its rank correlation alone (NaN for choices). NaN without a model.
+      `_first` and `_total`, the shares of the model's variance that it explains alone and including
+      interactions; `_trend`, its rank correlation (NaN for choices). NaN without a model.
     - `scores`: R^2 of the models, by target.
-    - `chance`: limit below which the greatest trend of unrelated ones stays in 95 %, by target.
+    - `chance`: limit that the largest trend of unrelated hyper-parameters stays below in 95 % of
+      cases, by target.
     - `missing`: reasons for a missing model, by target.
-    - `unsafe`, `safe`: principal components of these configurations; None for fewer than five.
+    - `unsafe`, `safe`: principal components of unsafe and safe configurations; None for fewer than
+      five.
     - `configurations`: their number.
     - `name`: the name of the study.
     """
@@ -87,21 +89,21 @@ class HyperparameterImportance(InNotebook):
     name: str
 
     def is_reliable(self, target: str) -> bool:
-        """Check that the model of `"failure_rate"` or `"nominal_return"` predicts at all."""
+        """Return whether the model of one of the targets predicts held-out configurations."""
         return self.scores.get(target, -np.inf) >= MIN_SCORE
 
     @property
     def ranking(self) -> list[str]:
-        """Hyper-parameters from the most to the least important, for safety if that is known."""
+        """Hyper-parameters by decreasing importance, for safety if that is known."""
         return [str(name) for name in self.table.index]
 
     def plot(self, path: str | Path | None = None) -> "Figure":
-        """Draw the shares of the variance, or the trends where no model is reliable.
+        """Draw the shares of the variance, or the trends if no model is reliable.
 
         **Arguments:**
-        - `path`: file that the picture is written to, if given.
+        - `path`: file to which the picture is written, if given.
         **Returns:** the Matplotlib figure.
-        **Raises:** `ValueError` with too few configurations.
+        **Raises:** `ValueError` if there are too few configurations.
         """
         if not self.scores:
             raise ValueError(f"there is nothing to draw: {'; '.join(self._lines())}")
@@ -194,12 +196,12 @@ def hyperparameter_importance(
     Nothing is trained or simulated.
 
     **Arguments:**
-    - `table`: with columns `configuration`, `steps`, `verdict`, `failure_rate`, `nominal_return`
-      and the hyper-parameters.
-    - `hyperparameters`: names of their columns; those that do not vary are left out. `steps` is
-      one of them where it varies.
-    - `space`: the space of the study; None scales columns between their least and greatest entries.
-    - `repeats`: number of times that the folds are drawn and each column is shuffled.
+    - `table`: a table with columns `configuration`, `steps`, `verdict`, `failure_rate`,
+      `nominal_return` and the hyper-parameters.
+    - `hyperparameters`: names of their columns, without constant ones, and with `steps` if it
+      varies.
+    - `space`: the space of the study; if None, columns are scaled by their minimum and maximum.
+    - `repeats`: how often folds are drawn and each column is shuffled.
     - `seed`: the seed of folds, shuffles and forests.
     """
     import pandas as pd
@@ -367,9 +369,9 @@ SHUFFLES = 1000
 class Trends(NamedTuple):
     """Rank correlations of inputs with an outcome.
 
-    - `correlation`: Spearman's, of each input; NaN for one that is constant.
-    - `chance`: limit below which the greatest of all correlations stays in 95 % of shuffled
-      outcomes; one beyond it is significant, however many inputs there are.
+    - `correlation`: Spearman's correlation of each input; NaN for a constant one.
+    - `chance`: limit that the largest correlation stays below in 95 % of shuffled outcomes;
+      correlations beyond it are significant, however many inputs there are.
     """
 
     correlation: Float[np.ndarray, " d"]
@@ -382,7 +384,7 @@ def trends(
     groups: Int[np.ndarray, " n"],
     seed: int = 0,
 ) -> Trends:
-    """Correlate inputs with an outcome over groups of rows, each of which counts by its mean."""
+    """Correlate inputs with an outcome over groups of rows, using the mean of each group."""
     distinct, member = np.unique(groups, return_inverse=True)
     counts = np.bincount(member)
     means = np.stack(

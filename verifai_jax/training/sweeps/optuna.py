@@ -41,11 +41,11 @@ _MAX_REFUSED = 1000
 
 @dataclass(frozen=True)
 class OptunaSampler:
-    """A sampler of Optuna with its options, such as `OptunaSampler("tpe", {"multivariate": 1})`.
+    """An Optuna sampler with its options, such as `OptunaSampler("tpe", {"multivariate": 1})`.
 
     **Arguments:**
     - `name`: `tpe`, `random`, `cmaes`, `gp`, `nsgaii` or `qmc`.
-    - `options`: keyword arguments of the sampler's class; the seed is the sweep's.
+    - `options`: keyword arguments of the sampler's class; the sweep sets the seed.
     **Raises:** `UnknownNameError` for another name; `ValueError` for a seed among the options.
     """
 

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 
 
 def optuna_distribution(domain: Domain | None) -> "BaseDistribution | None":
-    """Return Optuna's distribution for a domain; None if Optuna has no such distribution.
+    """Return Optuna's distribution for a domain; None if there is none.
 
     **Raises:** `MissingExtra` without Optuna.
     """
@@ -29,5 +29,5 @@ def optuna_distribution(domain: Domain | None) -> "BaseDistribution | None":
 
 
 def plain_choice(choice: object) -> bool | int | float | str | None:
-    """Return a choice as Optuna stores it: numbers, texts and None as they are, others as text."""
+    """Return a choice as Optuna stores it: numbers, texts and None unchanged, others as text."""
     return choice if isinstance(choice, bool | int | float | str | None) else str(choice)

@@ -49,14 +49,14 @@ def export_to_optuna(
 ) -> "optuna.Study":
     """Make an Optuna study with one trial for each configuration; see `Sweep.to_optuna`.
 
-    A configuration without a certificate is a failed trial, one that halving stopped is a pruned
-    one. A domain that Optuna lacks becomes the range of the values that were tried.
+    A configuration without a certificate becomes a failed trial, one stopped by halving a pruned
+    one. A domain that Optuna lacks becomes the range of the tried values.
 
     **Arguments:**
-    - `configurations`: one row for each, as `Sweep.configurations`.
+    - `configurations`: one row for each, as in `Sweep.configurations`.
     - `hyperparameters`: names of their columns.
-    - `space`: the space of the hyper-parameters, where it is known.
-    - `used`: names of the hyper-parameters of each algorithm; empty if all have all.
+    - `space`: the space of the hyper-parameters, if known.
+    - `used`: hyper-parameters of each algorithm, by name; empty if all algorithms have all.
     - `storage`: the storage of the study; in memory when left out.
     **Raises:** `MissingExtra` without Optuna.
     """

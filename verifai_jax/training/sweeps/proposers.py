@@ -34,7 +34,7 @@ More rounds learn more; fewer keep the cores busy."""
 class Proposer(Protocol):
     """A source of configurations.
 
-    - `learns`: True where proposals depend on observed objectives.
+    - `learns`: True if proposals depend on observed objectives.
     - `batch`: configurations in a round.
     """
 
@@ -46,7 +46,7 @@ class Proposer(Protocol):
         ...
 
     def observe(self, objectives: Sequence[float | None]) -> None:
-        """Record the objectives of the last proposals, one by one; None if one is unknown."""
+        """Record the objectives of the last proposals, in order; None for an unknown one."""
         ...
 
     def to_json(self) -> object:
@@ -63,9 +63,9 @@ def make_proposer(
     - `search`: a name, `"optuna:NAME"`, a `Search`, or an `OptunaSampler`.
     - `configurations`: number of proposals in all.
     - `batch`: configurations in a round.
-    **Raises:** `UnknownNameError` for another name; `ValueError` for a search that needs gradients
-    or does not fit this space; `TypeError` for something that is not a search; `MissingExtra`
-    without Optuna.
+    **Raises:** `UnknownNameError` for an unknown name; `ValueError` for a search that needs
+    gradients or does not fit this space; `TypeError` for anything that is not a search;
+    `MissingExtra` without Optuna.
     """
     rounds = max(available_cores(), -(-configurations // ROUNDS))
     if isinstance(search, str) and search.startswith("optuna:"):
@@ -92,7 +92,7 @@ def make_proposer(
 
 
 class SearchProposer:
-    """A search of this package, on the unit cube of the space."""
+    """A search of this package on the unit cube of the space."""
 
     def __init__(self, search: Search, space: FeatureSpace, batch: int, seed: int) -> None:
         self.search, self.space, self.batch = search, space, batch
@@ -129,15 +129,15 @@ def objective(
 ) -> float | None:
     """Return the objective of a policy, between 0 and 1.11, which searches minimise.
 
-    The failure rate counts most; among equal rates the worst robustness, squeezed into a tenth;
-    among equal ones of these the return, squeezed into a hundredth.
+    The failure rate counts most; the worst robustness, scaled to a tenth, decides between equal
+    rates; the return, scaled to a hundredth, decides between policies that are still equal.
 
     **Arguments:**
-    - `failure_rate`: between 0 and 1.
+    - `failure_rate`: the failure rate, between 0 and 1.
     - `worst_robustness`: the least robustness of all simulations.
     - `nominal_return`: mean return on the nominal task.
-    - `return_range`: least and greatest nominal return of the first round.
-    **Returns:** the objective; None if the failure rate is not known.
+    - `return_range`: minimum and maximum nominal return of the first round.
+    **Returns:** the objective; None if the failure rate is unknown.
     """
     if not math.isfinite(failure_rate):
         return None

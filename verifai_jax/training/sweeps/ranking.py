@@ -22,10 +22,10 @@ def is_safe(table: "pd.DataFrame") -> Bool[np.ndarray, " rows"]:
 
 
 def preference_order(table: "pd.DataFrame") -> Int[np.ndarray, " certified"]:
-    """Return the indices of the rows with a certificate, the most preferable first.
+    """Return the indices of the rows with a certificate, ordered by preference.
 
-    Safe ones come before others, by their nominal return; the others by the upper end of their
-    failure probability. Then the lower failure rate, then fewer environment steps.
+    Safe policies come first, by their nominal return; the others by the upper end of their failure
+    probability. Ties are broken by the lower failure rate, then by fewer environment steps.
     """
     safe, high = is_safe(table), table["failure_high"].to_numpy(np.float64)
     returned = np.nan_to_num(table["nominal_return"].to_numpy(np.float64), nan=-np.inf)
@@ -44,16 +44,16 @@ def pareto_fronts(table: "pd.DataFrame") -> Int[np.ndarray, " rows"]:
     """Return the number of each row's Pareto front, 0 for the first.
 
     Rows are compared by nominal return, the upper end of the failure probability, and environment
-    steps. -1 for a row without a return or a certificate.
+    steps. A row without a return or a certificate gets -1.
     """
     columns = (-table["nominal_return"], table["failure_high"], table["steps"])
     return fronts(np.stack([np.asarray(column, np.float64) for column in columns], axis=1))
 
 
 def full_return_threshold(table: "pd.DataFrame") -> float:
-    """Return the nominal return from which on a policy has learnt the task.
+    """Return the nominal return from which on a policy is considered to have learnt the task.
 
-    It is the best of the table less one hundredth of the span of all; NaN for a table without any.
+    It is the best return of the table minus one hundredth of the range; NaN without any return.
     """
     returned = table["nominal_return"].to_numpy(np.float64)
     returned = returned[np.isfinite(returned)]
@@ -69,7 +69,7 @@ def last_checkpoints(table: "pd.DataFrame") -> "pd.DataFrame":
 
 
 def group_by_configuration(table: "pd.DataFrame", hyperparameters: Sequence[str]) -> "pd.DataFrame":
-    """Return one row for each configuration: its trainings at their last checkpoints, together."""
+    """Return one row for each configuration, combining its trainings at their last checkpoints."""
     import pandas as pd
 
     names = [name for name in hyperparameters if name != "steps"]
@@ -102,9 +102,9 @@ def group_by_configuration(table: "pd.DataFrame", hyperparameters: Sequence[str]
 
 
 def return_safety_correlation(table: "pd.DataFrame") -> float:
-    """Return Spearman's rank correlation of nominal return and safety, one less the failure rate.
+    """Return Spearman's correlation of nominal return and safety, which is 1 - failure rate.
 
-    NaN for fewer than three rows that have both, or where one of them is the same for all.
+    NaN for fewer than three rows that have both, or if one of them is constant.
     """
     pairs = table.loc[:, ["nominal_return", "failure_rate"]].dropna()
     if len(pairs) < 3 or (pairs.nunique() < 2).any():

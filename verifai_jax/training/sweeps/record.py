@@ -38,12 +38,12 @@ AFTER = (
 
 
 def error_status(message: str) -> str:
-    """Write the status of a training that raised."""
+    """Return the status of a training that raised."""
     return f"error: {message}"
 
 
 def error_message(status: str) -> str | None:
-    """Return what a training of this status raised; None if it did not raise."""
+    """Return the error of a training with this status; None if it did not raise."""
     kind, colon, message = status.partition(": ")
     return message if kind == "error" and colon else None
 
@@ -52,7 +52,7 @@ class Curve(NamedTuple):
     """A learning curve.
 
     - `steps`: environment steps taken by the end of each update.
-    - `mean_return`: mean return of the episodes that ended in the update; NaN where none did.
+    - `mean_return`: mean return of the episodes that ended in the update; NaN if none did.
     """
 
     steps: Int[np.ndarray, " updates"]
@@ -61,25 +61,25 @@ class Curve(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class SweepRecord:
-    """The table of a sweep and everything that belongs to its rows. A row is one policy.
+    """The table of a sweep with all data of its rows. A row is one policy.
 
     - `study`: name of the study.
     - `seed`: the seed of the sweep.
     - `columns`: the table, name -> column `[rows]`, in order: `BEFORE`, the hyper-parameters,
-      `AFTER`. Unknown numbers are NaN, unknown texts empty. `steps` are the wanted ones.
-    - `hyperparameters`: columns that the space of the study gave; `steps` is that of `BEFORE`.
-    - `policies`: the policies of each row, on the host; None without policies.
-    - `worst`: features of each row with the least robustness, as `space.rows` writes them; None
-      where nothing was simulated.
+      `AFTER`. Unknown numbers are NaN, unknown texts empty. `steps` are the requested ones.
+    - `hyperparameters`: columns from the space of the study; `steps` is that of `BEFORE`.
+    - `policies`: the policy of each row, on the host; None without policies.
+    - `worst`: features with the least robustness for each row, in the form of `space.rows`; None if
+      nothing was simulated.
     - `curves`: learning curve of each training run, by `(configuration, seed)`.
     - `certificates`: result of the certification; None if nothing was certified.
-    - `certified`: rows of the certified policies, in the order of the certification.
+    - `certified`: indices of the certified policies, in the order of the certification.
     - `options`: options of the sweep, plain data.
     - `version`: the version of verifai_jax.
     - `seconds`: wall-clock time of each stage, such as `training` and `certifying`.
-    - `complete`: False where the sweep was interrupted or out of time.
-    - `sources`: what the study was made of when the sweep began, and again where it went on with
-      another one, as a run records it; empty if that is not recorded.
+    - `complete`: False if the sweep was interrupted or out of time.
+    - `sources`: the files of the study when the sweep began, and again when it continued with
+      changed ones, as a run records them; empty if not recorded.
     """
 
     study: str
@@ -107,7 +107,7 @@ def algorithm_uses(used: Mapping[str, Sequence[str]], algorithm: object, name: s
     """Return whether an algorithm has a hyper-parameter.
 
     **Arguments:**
-    - `used`: names of the hyper-parameters of each algorithm; one that is missing has all.
+    - `used`: names of the hyper-parameters of each algorithm; an algorithm that is missing has all.
     - `algorithm`: name of the algorithm; None has all.
     - `name`: the name of the hyper-parameter.
     """

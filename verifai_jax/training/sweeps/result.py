@@ -62,15 +62,15 @@ class Sweep(Drawn, Reported):
     """The policies of a sweep with their returns and certificates, as `sweep` returns them.
 
     **Fields:**
-    - `record`: everything that was trained and certified, as plain data.
-    - `study`: the study that was swept; None for a loaded sweep without it.
-    - `space`: the space of the hyper-parameters; the study's if left out, None if it is not known.
-    - `folder`: place on disk of a loaded sweep.
-    - `failing`: counterexamples of each row of a loaded sweep, by its number; others have
-      certificates.
-    - `used`: names of the hyper-parameters of each algorithm; empty if all have all.
-    - `reuse`: how much was cached before: by kind of work (`"train"`, `"return"`, `"certify"`) the
-      number of entries that were, and of all; empty for a loaded sweep.
+    - `record`: all that was trained and certified, as plain data.
+    - `study`: the study; None for a sweep that was loaded without it.
+    - `space`: the space of the hyper-parameters; by default the study's, None if unknown.
+    - `folder`: the folder of a loaded sweep.
+    - `failing`: counterexamples of each row of a loaded sweep, by its number; otherwise the
+      certificates have them.
+    - `used`: hyper-parameters of each algorithm, by name; empty if all algorithms have all.
+    - `reuse`: by kind of work (`"train"`, `"return"`, `"certify"`), the number of entries that were
+      cached before, and of all; empty for a loaded sweep.
     """
 
     _picture = "sweep", "plot_sweep"
@@ -97,24 +97,24 @@ class Sweep(Drawn, Reported):
 
     @property
     def hyperparameters(self) -> tuple[str, ...]:
-        """Names of the columns that were swept."""
+        """Names of the hyper-parameter columns."""
         return self.record.hyperparameters
 
     @property
     def p(self) -> float | None:
-        """Failure probability below which a policy is safe, where it is known."""
+        """Failure probability below which a policy is called safe, if known."""
         p = self.record.options.get("p", None if self.study is None else self.study.p)
         return None if p is None else float(p)
 
     @cached_property
     def table(self) -> "pd.DataFrame":
-        """One row for each policy: a configuration, trained with a seed up to a checkpoint.
+        """One row for each policy: a configuration, trained with one seed up to a checkpoint.
 
-        `steps` are environment steps; `training_return` is the mean return of the last episodes
-        with exploration, `nominal_return` that of the policy's likeliest actions on the nominal
-        task; `failures` of `simulations` fresh samples of the problem's features, and the
-        `failure_rate` with the ends of its interval; `worst_robustness` of all simulations;
-        `curve_robustness` of the formula over the learning curve.
+        `steps` are environment steps. `training_return` is the mean return of the last episodes,
+        with exploration; `nominal_return` that of the policy's most likely actions on the nominal
+        task. `failures` is counted in `simulations` fresh samples of the problem's features;
+        `failure_rate` comes with the ends of its interval. `worst_robustness` is the least of all
+        simulations, `curve_robustness` that of the formula over the learning curve.
         """
         import pandas as pd
 
@@ -123,18 +123,18 @@ class Sweep(Drawn, Reported):
 
     @property
     def safe(self) -> "pd.DataFrame":
-        """Rows whose verdict is `safe@p`, the best nominal return first."""
+        """Rows with the verdict `safe@p`, by decreasing nominal return."""
         order = preference_order(self.table)
         return self.table.iloc[order[is_safe(self.table)[order]]]
 
     @property
     def best(self) -> "pd.Series":
-        """Row to choose: the best nominal return among the safe ones.
+        """The recommended row: the best nominal return among the safe ones.
 
-        Where none is safe it is the one whose failure probability has the lowest upper end; its
+        If none is safe it is the one whose failure probability has the lowest upper end; its
         `verdict` says so.
 
-        **Raises:** `ValueError` where no policy was certified at all.
+        **Raises:** `ValueError` if no policy was certified.
         """
         order = preference_order(self.table)
         if not len(order):
@@ -150,19 +150,20 @@ class Sweep(Drawn, Reported):
 
     @cached_property
     def configurations(self) -> "pd.DataFrame":
-        """One row for each configuration, over its training seeds at their last checkpoint.
+        """One row for each configuration, combining its training seeds at their last checkpoint.
 
         `nominal_return` and `failure_rate` are means over the seeds, `failure_rate_worst` and
-        `failure_high` the greatest, `verdict` the worst of them, `seeds_safe` the number of safe
-        ones. `best_row` is the row of the table to choose among all seeds and checkpoints, or -1.
+        `failure_high` the maxima, `verdict` the worst verdict, `seeds_safe` the number of safe
+        seeds. `best_row` is the recommended row of the table among all seeds and checkpoints, or
+        -1.
         """
         return group_by_configuration(self.table, self.hyperparameters)
 
     def changes(self) -> tuple[Change, ...]:
-        """Return the files of the study's model that are others by now, with both hashes.
+        """Return the files of the study's model that have changed since, with both hashes.
 
-        What the study is made of now counts; for a sweep without it, what lies on the disk. None
-        for a sweep that does not know what it was made of.
+        They are compared with the study's present files; for a sweep without its study, with those
+        on disk. None if the sweep did not record its files.
         """
         if not self.record.sources:
             return ()
@@ -173,8 +174,8 @@ class Sweep(Drawn, Reported):
     def policy(self, i: int | np.integer) -> TrainedPolicy:
         """Return the policy of row `i` of the table: `sweep.policy(i).act(observation)`.
 
-        **Raises:** `IndexError` for a row that is not in the table; `ValueError` for one without a
-        policy, with the reason.
+        **Raises:** `IndexError` for a row that is not in the table; `ValueError` with the reason
+        for a row without a policy.
         """
         policy = self.record.policies[i := self._row(i)]
         if policy is None:
@@ -184,10 +185,10 @@ class Sweep(Drawn, Reported):
     def problem(self, i: int | np.integer) -> Problem:
         """Return the verification problem with the policy of row `i` in the loop.
 
-        Ready for `falsify`, `estimate`, `synthesize`. Each call returns the same object, so that it
-        keeps its compiled programs.
+        It can be passed to `falsify`, `estimate`, `synthesize`. Each call returns the same object,
+        so that its compiled programs are reused.
 
-        **Raises:** as `policy`; `ValueError` for a sweep that was loaded without its study.
+        **Raises:** the errors of `policy`; `ValueError` for a sweep loaded without its study.
         """
         policy = self.policy(i)
         if self.study is None:
@@ -210,7 +211,7 @@ class Sweep(Drawn, Reported):
         return int(i)
 
     def pareto(self) -> "pd.DataFrame":
-        """Return the rows on the Pareto front, the lowest failure probability first.
+        """Return the rows on the Pareto front, by increasing failure probability.
 
         Rows are compared by nominal return, the upper end of the failure probability, and
         environment steps.
@@ -224,10 +225,10 @@ class Sweep(Drawn, Reported):
     def importance(self, *, repeats: int = 5, seed: int = 0) -> HyperparameterImportance:
         """Measure the importance of the hyper-parameters for safety and for return.
 
-        Nothing is trained or simulated. With too few configurations the result says so.
+        Nothing is trained or simulated. If there are too few configurations the result says so.
 
         **Arguments:**
-        - `repeats`: number of times that the folds are drawn and each column is shuffled.
+        - `repeats`: how often folds are drawn and each column is shuffled.
         - `seed`: the seed of folds, shuffles and forests.
         """
         table = self.table
@@ -251,15 +252,15 @@ class Sweep(Drawn, Reported):
     ) -> "pd.DataFrame":
         """Return features with which the policy of a row fails, the worst first.
 
-        An empty table does not mean that there is no failure: the certificate bounds that.
+        An empty table does not prove the absence of failures; see the certificate.
 
         **Arguments:**
-        - `i`: number of the row; the best when left out.
-        - `simulations`: budget of a search for more than those of the sweep; needs the study.
-        - `search`, `seed`: of these simulations.
+        - `i`: number of the row; the best one when left out.
+        - `simulations`: budget of a search for further failures; needs the study.
+        - `search`, `seed`: the search and seed for these simulations.
         **Returns:** columns of the problem's features, and `rho`, the robustness.
-        **Raises:** as `problem` and `best`; `ValueError` where more are looked for and the model
-        has changed since the sweep.
+        **Raises:** the errors of `problem` and `best`; `ValueError` if further failures are
+        searched for and the model has changed since the sweep.
         """
         import pandas as pd
 
@@ -270,9 +271,9 @@ class Sweep(Drawn, Reported):
             if changes := self.changes():
                 raise ValueError(
                     f"the model has changed since the sweep of {self.name!r}: "
-                    f"{list_changes(changes)}. Failures of two models are not put into one table: "
+                    f"{list_changes(changes)}. Failures of two models are not mixed in one table: "
                     f"counterexamples({i}) has those of the sweep, falsify(sweep.problem({i})) "
-                    "looks for those of the model of now"
+                    "searches the present model"
                 )
             run = falsify(problem, search, budget=simulations, seed=seed, progress=False)
             parts.append(run.table.counterexamples.loc[:, [*problem.space.columns, "rho"]])
@@ -294,19 +295,19 @@ class Sweep(Drawn, Reported):
         return row if rho < 0 and worst is not None else row.iloc[:0]
 
     def curve(self, i: int | np.integer) -> Trace:
-        """Return the learning curve up to the policy of row `i`, a trace over environment steps.
+        """Return the learning curve up to the policy of row `i`, as a trace over environment steps.
 
-        Signal `return`: the mean return of the episodes that ended in each update, exploration
-        included; an update in which none did keeps the previous value.
+        Its signal `return` is the mean return of the episodes that ended in each update, with
+        exploration; an update in which none ended keeps the previous value.
 
-        **Raises:** `IndexError` as `policy`; `ValueError` where no episode ended.
+        **Raises:** the `IndexError` of `policy`; `ValueError` if no episode ended.
         """
         return curve_trace(*self.curve_points(self._row(i)))
 
     def curve_robustness(self, formula: Formula | str) -> "pd.Series":
         """Return the robustness of a formula on the learning curve up to each row.
 
-        **Raises:** as `sweeps.curve_robustness`.
+        **Raises:** the errors of `sweeps.curve_robustness`.
         """
         import pandas as pd
 
@@ -317,7 +318,7 @@ class Sweep(Drawn, Reported):
     def curve_points(
         self, i: int | np.integer
     ) -> tuple[Int[np.ndarray, " updates"], Float[np.ndarray, " updates"]]:
-        """Return steps and mean returns of the updates up to row `i`; empty without training."""
+        """Return steps and mean returns of the updates up to row `i`; empty without a training."""
         row = self.table.loc[i]
         curve = self.record.curves.get((int(row["configuration"]), int(row["seed"])))
         if curve is None:
@@ -327,7 +328,7 @@ class Sweep(Drawn, Reported):
 
     @property
     def findings(self) -> Findings:
-        """Data that the summary is written from."""
+        """The data for the summary."""
         return Findings(self.record, self.table, self.configurations, self.used, self.p, self.reuse)
 
     @property
@@ -338,7 +339,7 @@ class Sweep(Drawn, Reported):
     def summary(self) -> str:
         """Write the findings of the sweep, the most important first.
 
-        A loaded sweep says on its first line if the model of its study has changed since.
+        The summary of a loaded sweep begins with a note if its study's model has changed.
         """
         text = format_summary(self.findings)
         if self.study is None or self.folder is None:
@@ -358,8 +359,7 @@ class Sweep(Drawn, Reported):
     def save(self, folder: str | Path) -> Path:
         """Write the sweep to a folder: table, policies, curves, record.
 
-        The files hold numbers and text only; `load_sweep` reads them, and `rl.load_policy` the
-        policies.
+        The files contain numbers and text; `load_sweep` reads them, `rl.load_policy` the policies.
 
         **Returns:** the folder.
         """
@@ -380,9 +380,8 @@ class Sweep(Drawn, Reported):
         return, to maximise.
 
         **Arguments:**
-        - `storage`: place where Optuna stores it, such as `"sqlite:///sweep.db"`; memory when left
-          out.
-        - `name`: the name of the study there; the sweep's own when left out.
+        - `storage`: Optuna's storage, such as `"sqlite:///sweep.db"`; in memory when left out.
+        - `name`: the name of the Optuna study; by default the sweep's.
         **Raises:** `MissingExtra` without the package.
         """
         return export_to_optuna(
@@ -396,13 +395,13 @@ class Sweep(Drawn, Reported):
 
 
 def load_sweep(folder: str | Path, study: Study | str | None = None) -> Sweep:
-    """Read a sweep back from the folder that `Sweep.save` wrote.
+    """Read a sweep from the folder written by `Sweep.save`.
 
-    The certificates are those of the table, and the recorded counterexamples.
+    Certificates are restored from the table and the recorded counterexamples.
 
     **Arguments:**
     - `folder`: the folder.
-    - `study`: the study or its name, such as `"specs/cartpole.py:safe_training"`; needed for
+    - `study`: the study or its target, such as `"specs/cartpole.py:safe_training"`; needed for
       `.problem(i)` and further counterexamples. The files never name code to run.
     **Raises:** `FileNotFoundError` for a folder without a sweep; `SweepFileError` for a damaged
     one, one of another format, or a study of another name or with other hyper-parameters.

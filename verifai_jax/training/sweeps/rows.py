@@ -22,11 +22,11 @@ class Row:
     """One policy, or one training run without a policy.
 
     - `configuration`, `seed`, `steps`: number of the configuration, training seed, checkpoint.
-    - `values`: hyper-parameters.
+    - `values`: the hyper-parameters.
     - `status`: see `record`.
-    - `entry`: numbers of the training run and of its checkpoint.
-    - `checkpoint`: the run there; None if it did not train.
-    - `nominal_return`: mean return on the nominal task; NaN where it is not known.
+    - `entry`: the number of the training run and that of its checkpoint.
+    - `checkpoint`: the run at that checkpoint; None if it did not train.
+    - `nominal_return`: mean return on the nominal task; NaN if unknown.
     - `safety`: the safety of the policy; None if it was not certified.
     """
 
@@ -51,7 +51,7 @@ class Table(NamedTuple):
 
 
 def tabulate(rows: Sequence[Row], study: Study) -> Table:
-    """Turn rows into columns, policies, worst features and learning curves."""
+    """Convert rows to columns, policies, worst features and learning curves."""
     names = [n for n in study.space.columns if n not in BEFORE]
     cells = [_cells(row, study) for row in rows]
     columns: dict[str, np.ndarray] = {}
@@ -101,7 +101,7 @@ def _cells(row: Row, study: Study) -> dict[str, object]:
 
 
 def columns_of(certificate: Certificate | None) -> dict[str, Any]:
-    """Return the columns of a certificate; `failures` counts samples without a verdict too."""
+    """Return the columns of a certificate; `failures` includes samples without a verdict."""
     nan, rate = float("nan"), None if certificate is None else certificate.rate
     if certificate is None or rate is None:
         # An interruption leaves policies without a sample, and so without a verdict.

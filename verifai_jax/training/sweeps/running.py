@@ -53,7 +53,7 @@ class _Configuration:
 class RunningSweep:
     """The state of a sweep: its configurations, training runs, returns and safety.
 
-    An entry is a training run and one of its checkpoints, both by number.
+    An entry is a pair of numbers: a training run, and one of its checkpoints.
     """
 
     study: Study
@@ -79,7 +79,7 @@ class RunningSweep:
         self.runs = kind(self.study, self.cache, self.clock, self.executor)
 
     def run(self, proposer: Proposer) -> record.SweepRecord:
-        """Train and certify, or as much of it as there is time for."""
+        """Train and certify, or as much of it as time allows."""
         complete, certificates = True, None
         try:
             try:

@@ -46,15 +46,15 @@ _PLAIN = ("study", "seed", "hyperparameters", "certified", "options", "version",
 
 
 class SweepFileError(ValueError):
-    """An error for a folder that holds no sweep, or the sweep of another study."""
+    """An error for a folder without a sweep, or with that of another study."""
 
 
 class StoredSweep(NamedTuple):
     """The contents of a sweep's folder.
 
-    - `record`: table, policies, curves and options; without certificates once it was read.
-    - `space`: the space of the hyper-parameters, where it is known.
-    - `used`: names of the hyper-parameters of each algorithm; empty if all have all.
+    - `record`: table, policies, curves and options; without certificates after reading.
+    - `space`: the space of the hyper-parameters, if known.
+    - `used`: hyper-parameters of each algorithm, by name; empty if all algorithms have all.
     - `failing`: counterexamples of all rows, with a column `row`.
     """
 
@@ -65,13 +65,13 @@ class StoredSweep(NamedTuple):
 
 
 def write_sweep(stored: StoredSweep, table: "pd.DataFrame", folder: Path) -> Path:
-    """Write a sweep to a folder, in place of one that it may hold.
+    """Write a sweep to a folder, replacing one there.
 
     **Arguments:**
-    - `table`: its table, the columns of the record.
+    - `table`: the table with the columns of the record.
     - `folder`: the folder; it is created.
-    **Raises:** `FolderInUse` where another process writes it; `OSError` for what the file system
-    refuses, which leaves what was there.
+    **Raises:** `FolderInUse` if another process writes there; `OSError` if the file system refuses,
+    in which case the old content stays.
     """
     # The record comes last: a folder without it holds no sweep.
     names = (TABLE, FAILING, CURVES, POLICIES, RECORD)
@@ -125,10 +125,9 @@ def _files(folder: Path, rows: int) -> list[Path]:
 
 
 def read_description(folder: Path) -> dict[str, Any]:
-    """Read the record's file of a folder.
+    """Read the file that describes the sweep in a folder.
 
-    **Raises:** `FileNotFoundError` for a folder without a sweep; `SweepFileError` for a damaged
-    file.
+    **Raises:** `FileNotFoundError` for a folder without one; `SweepFileError` for a damaged file.
     """
     file = folder / RECORD
     if not file.exists():
@@ -142,7 +141,7 @@ def read_description(folder: Path) -> dict[str, Any]:
 def check_study(
     description: Mapping[str, Any], folder: Path, name: str, columns: Sequence[str]
 ) -> None:
-    """Check that a folder holds the sweep of this study.
+    """Check that the sweep in a folder belongs to this study.
 
     **Raises:** `SweepFileError` for another name or other hyper-parameters.
     """
@@ -161,8 +160,8 @@ def read_sweep(description: Mapping[str, Any], folder: Path) -> StoredSweep:
     """Read a sweep from a folder.
 
     **Arguments:**
-    - `description`: the description of the folder, as `read_description` returns it.
-    **Raises:** `SweepFileError` where a file is missing or damaged.
+    - `description`: the description of the folder, from `read_description`.
+    **Raises:** `SweepFileError` if a file is missing or damaged.
     """
     import pandas as pd
 
@@ -172,7 +171,7 @@ def read_sweep(description: Mapping[str, Any], folder: Path) -> StoredSweep:
         record, space = _read_record(folder, description), _space_from_json(description["space"])
         return StoredSweep(record, space, used, pd.read_parquet(folder / FAILING))
     except FileNotFoundError as error:
-        raise SweepFileError(f"the sweep in {folder} is not whole: {error}") from error
+        raise SweepFileError(f"the sweep in {folder} is incomplete: {error}") from error
     except (KeyError, TypeError, ValueError, OSError, zipfile.BadZipFile) as error:
         reason = one_line(str(error))
         raise SweepFileError(f"the sweep in {folder} is damaged: {reason}") from error

@@ -32,28 +32,28 @@ from verifai_jax.training.sweeps.trainer import STEPS, StudyError, Trainer
 
 @dataclass(frozen=True, eq=False, init=False)
 class Study(InNotebook):
-    """A sweep to be made: hyper-parameters, their trainer, and the safety of a policy.
+    """A sweep to perform: hyper-parameters, a trainer, and a problem that tests a policy's safety.
 
     **Arguments:**
-    - `name`: name on the command line and in results.
+    - `name`: the name on the command line and in results.
     - `space`: the space of the hyper-parameters; a `FeatureSpace`, or a dictionary of domains.
     - `trainer`: the task and the algorithms.
-    - `problem`: from a policy to the problem of its closed loop. JAX may trace the policy's
-      weights.
-    - `checkpoints`: environment steps at which a training's policy is a row of the table, next to
-      the end of the training.
+    - `problem`: a function from a policy to the problem of its closed loop. JAX may trace the
+      policy's weights.
+    - `checkpoints`: environment steps at which the policy of a training becomes a row of the table,
+      in addition to the end of the training.
     - `seeds`: training seeds of each configuration: their number (0, 1, ...), or the seeds.
-    - `p`: the failure probability below which a policy is safe, between 0 and 1.
-    - `curve`: a formula over the learning curve, whose time is environment steps; None for none.
-    - `description`: one line.
+    - `p`: the failure probability below which a policy is called safe, between 0 and 1.
+    - `curve`: a formula over the learning curve, whose time is environment steps; None without one.
+    - `description`: a description in one line.
     - `made_in`: as in `Problem`.
 
-    **Fields** in addition to these:
+    **Fields** in addition:
 
-    - `training_seeds`: the seeds.
+    - `training_seeds`: the seeds as a tuple.
     - `curve_formula`: the parsed formula.
 
-    **Raises:** `StudyError` for parts of a wrong kind or out of range; `FormulaSyntaxError` and
+    **Raises:** `StudyError` for parts of a wrong type or out of range; `FormulaSyntaxError` and
     `UnknownNameError` for the formula of the curve.
     """
 
@@ -119,15 +119,16 @@ class Study(InNotebook):
             object.__setattr__(self, attribute, value)
 
     def checkpoints_of(self, steps: int) -> tuple[int, ...]:
-        """Return the environment steps of the rows of a training that takes `steps` in all."""
+        """Return the environment steps of the rows of a training with `steps` in all."""
         return (*(at for at in self.checkpoints if at < steps), steps)
 
     def check(self) -> None:
         """Check that the study can be swept, before anything compiles or trains.
 
-        **Raises:** `StudyError` and `UnknownNameError` as `Trainer.check`; `StudyError` for
-        checkpoints after the end of every training, and for a problem that raises for an untrained
-        policy, is no `Problem`, or has a specification over signals that its closed loop lacks.
+        **Raises:** the `StudyError` and `UnknownNameError` of `Trainer.check`; `StudyError` for
+        checkpoints after the end of every training, and for a function `problem` that raises for an
+        untrained policy, returns no `Problem`, or one with a specification over signals that its
+        closed loop lacks.
         """
         self.trainer.check(self.space)
         self.space.check_where()
@@ -155,7 +156,7 @@ class Study(InNotebook):
         return self.trainer.algorithms_in(self.space)
 
     def sources(self) -> Sources:
-        """Return the files that make the study and its problem, and versions."""
+        """Return the files that define the study and its problem, and the versions of libraries."""
         problem = self.untrained_problem()
         return sources_of(self, problem, made=(*(self.made_in or ()), *(problem.made_in or ())))
 
@@ -164,12 +165,12 @@ class Study(InNotebook):
         return self._problem_of(self.algorithms[0])
 
     def only(self, *names: str, nominal: Mapping[str, Any] | None = None) -> "Study":
-        """Return the study with these hyper-parameters varied alone; see `FeatureSpace.only`.
+        """Return the study with only these hyper-parameters varied; see `FeatureSpace.only`.
 
         **Arguments:**
         - `names`: hyper-parameters to vary.
         - `nominal`: values of the others.
-        **Raises:** `UnknownNameError` for another name; `ValueError` for a missing value.
+        **Raises:** `UnknownNameError` for an unknown name; `ValueError` for a missing value.
         """
         return replace(self, space=self.space.only(*names, nominal=nominal))
 

@@ -34,14 +34,14 @@ _CSS = {"safe": "#3a9e7d", "unsafe": "#d1495b"}
 
 
 class Findings(NamedTuple):
-    """The data that the summary of a sweep is written from.
+    """The data for the summary of a sweep.
 
     - `record`: the record of the sweep.
     - `table`: one row for each policy.
     - `configurations`: one row for each configuration.
-    - `used`: names of the hyper-parameters of each algorithm; empty if all have all.
-    - `p`: failure probability below which a policy is safe, where it is known.
-    - `reuse`: entries that were cached before, and all, by kind of work.
+    - `used`: hyper-parameters of each algorithm, by name; empty if all algorithms have all.
+    - `p`: failure probability below which a policy is called safe, if known.
+    - `reuse`: number of entries cached before, and of all, by kind of work.
     """
 
     record: SweepRecord
@@ -59,7 +59,7 @@ def format_summary(findings: Findings) -> str:
     margins: Any = table.get("curve_robustness")
     lines = [f"{record.study}: {format_headline(findings)}"]
     if len(record.sources) > 1:
-        lines.append("  OF SEVERAL MODELS: it went on although the study had changed")
+        lines.append("  SEVERAL MODELS: the sweep went on although the study had changed")
     if not record.complete:
         lines.append("  NOT FINISHED: interrupted or out of time; the finished part is here")
     if len(groups):
@@ -99,7 +99,7 @@ def format_summary(findings: Findings) -> str:
 
 
 def format_headline(findings: Findings) -> str:
-    """Write how many configurations reach full return, and how many of those are safe."""
+    """Write how many configurations reach full return, and how many of these are safe."""
     groups: Any = findings.configurations
     if not len(groups):
         return "no configuration was trained"
@@ -119,7 +119,7 @@ def format_headline(findings: Findings) -> str:
 
 
 def format_verdicts(rows: "pd.DataFrame") -> str:
-    """Write the number of rows of each verdict."""
+    """Write how many rows have each verdict."""
     verdicts: Any = rows["verdict"].astype(str)
     parts = [f"{int(ranking.is_safe(rows).sum())} safe"]
     for verdict in ("unsafe", "undecided"):
@@ -131,13 +131,13 @@ def format_verdicts(rows: "pd.DataFrame") -> str:
 
 
 def format_failures(row: Mapping[str, Any]) -> str:
-    """Write the number of failing samples of a row; one without a verdict counts as failing."""
+    """Write the number of failing samples of a row, including those without a verdict."""
     failed = round(float(row["failure_rate"]) * float(row["simulations"]))
     return f"{failed:,} of {int(row['simulations']):,} simulations fail"
 
 
 def format_hyperparameters(findings: Findings, row: Mapping[str, Any]) -> str:
-    """Write the hyper-parameters of a row that its algorithm has."""
+    """Write those hyper-parameters of a row that its algorithm has."""
     names = [name for name in findings.record.hyperparameters if name != "steps"]
     algorithm = row.get("algorithm")
     values = {n: row[n] for n in names if algorithm_uses(findings.used, algorithm, n)}

@@ -47,31 +47,31 @@ Train: TypeAlias = Callable[..., Any]
 
 @dataclass(frozen=True, eq=False)
 class Trainer:
-    """A task and the algorithms that may learn it, or a function that trains.
+    """A task and the algorithms that may learn it, or a training function.
 
-    A function `train(key, hyperparameters, steps=..., resume=...) -> policy` trains with any
-    framework, in a process of its own, so it is defined by `def` in a module or a script. It gets
-    the random key of the training seed, a dictionary of plain values, and the environment steps of
-    the training in all. `resume` is a folder: what the function leaves there at one checkpoint, it
-    finds there when it is called for the next; the folder is empty at first. A function without
-    this argument trains anew up to each checkpoint. It returns anything that `vj.policy` takes, or
-    `(policy, {"steps": [...], "mean_return": [...]})` with its learning curve.
+    A training function `train(key, hyperparameters, steps=..., resume=...) -> policy` can use any
+    framework. It runs in its own process, so define it by `def` in a module or a script. It
+    receives the random key of the training seed, a dictionary of plain values, and the total number
+    of environment steps. `resume` is a folder, empty at first: files written there at one
+    checkpoint are there again when the function is called for the next. A function without this
+    argument trains from the start up to each checkpoint. It returns anything that `vj.policy`
+    accepts, or `(policy, {"steps": [...], "mean_return": [...]})` with its learning curve.
 
     **Arguments:**
-    - `task`: the task to learn, see `rl.Task`. If it is a dataclass its fields may be swept. Or a
-      function that trains, whose `algorithms` is left out.
-    - `algorithms`: an algorithm, or several by name; their fields are the values of the
+    - `task`: the task to learn, see `rl.Task`; if it is a dataclass its fields may be swept. Or a
+      training function; `algorithms` is then left out.
+    - `algorithms`: an algorithm, or several by name; their fields are the values of
       hyper-parameters that are not swept.
-    - `steps`: environment steps of a training, rounded up to whole updates.
-    - `nominal`: the task that nominal returns are measured on, such as the same one without
-      randomisation and shaping; `task` itself when left out, and for a function the mean return of
-      its learning curve.
-    - `example`: for a function, a policy with actions of the same form, such as
-      `lambda observation: jnp.zeros(2)`: the study is checked with it before anything trains.
-    - `observation`: for a function, an example of an observation where its policies do not say what
-      they observe, as functions and modules of flax.
-    - `workers`: for a function, processes at a time; as many as there are cores when left out.
-    **Raises:** `StudyError` without an algorithm, for something that is not an algorithm or
+    - `steps`: number of environment steps of a training, rounded up to whole updates.
+    - `nominal`: the task on which nominal returns are measured, for example without randomisation
+      and shaping; by default `task` itself, and for a training function the mean return of its
+      learning curve.
+    - `example`: for a training function, a policy with actions of the same form, such as `lambda
+      observation: jnp.zeros(2)`, with which the study is checked before anything trains.
+    - `observation`: for a training function, an example observation if its policies do not define
+      their input, such as functions and flax modules.
+    - `workers`: for a training function, number of processes; by default the number of cores.
+    **Raises:** `StudyError` if there is no algorithm, for anything that is not an algorithm or
     task, a number of steps that is not positive, or a nominal task with other actions or
     observations.
     """
@@ -124,7 +124,7 @@ class Trainer:
 
     @property
     def evaluation_task(self) -> Task | None:
-        """Task on which nominal returns are measured; None for those of the learning curve."""
+        """Task on which nominal returns are measured; None if they come from the learning curve."""
         return self.task if self.nominal is None else self.nominal
 
     @property
@@ -135,7 +135,7 @@ class Trainer:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of all hyper-parameters, `algorithm`, `steps` and `width` first."""
+        """Names of all hyper-parameters, with `algorithm`, `steps` and `width` first."""
         known: dict[str, None] = dict.fromkeys((ALGORITHM, STEPS))
         for algorithm in self.by_name.values():
             if _layers(algorithm):
@@ -148,7 +148,7 @@ class Trainer:
         """Return the training with these hyper-parameters.
 
         **Arguments:**
-        - `values`: plain Python values; the fields of algorithm and task decide the others.
+        - `values`: plain Python values; others come from the fields of algorithm and task.
         - `seed`: training seed.
         **Raises:** `ValueError` for a value that the algorithm or the task refuses.
         """
@@ -172,11 +172,11 @@ class Trainer:
         return Configuration(task, algorithm, steps, seed)
 
     def algorithm_name(self, values: Mapping[str, Any]) -> str:
-        """Return the name of the algorithm that these hyper-parameters choose."""
+        """Return the name of the algorithm chosen by these hyper-parameters."""
         return str(values[ALGORITHM]) if ALGORITHM in values else next(iter(self.by_name))
 
     def used_hyperparameters(self, values: Mapping[str, Any]) -> tuple[str, ...]:
-        """Return the names of those hyper-parameters that the chosen algorithm or the task has."""
+        """Return the names of the hyper-parameters that the chosen algorithm or the task has."""
         algorithm = self.by_name[self.algorithm_name(values)]
         own = {ALGORITHM, STEPS, *_fields(algorithm), *_fields(self.task)}
         if _layers(algorithm):
@@ -204,15 +204,15 @@ class Trainer:
 
     @property
     def name(self) -> str:
-        """Kind of the task, or name of the function that trains."""
+        """Class of the task, or name of the training function."""
         return type(self.task).__name__
 
     def check(self, space: FeatureSpace) -> None:
         """Check that a space of hyper-parameters can be trained; nothing compiles.
 
         **Raises:** `UnknownNameError` for an unknown hyper-parameter; `StudyError` for one that is
-        not a single value, a value that an algorithm or the task refuses whatever the others are,
-        an algorithm that does not fit the task's actions, or a space that chooses no algorithm.
+        not a single value, a value that an algorithm or the task always refuses, an algorithm that
+        does not fit the task's actions, or a space that chooses no algorithm.
         """
         for name, domain in space.domains.items():
             if name not in self.names:
@@ -228,7 +228,7 @@ class Trainer:
             owners = [o for o in self.by_name.values() if name in _fields(o)]
             if owners and name in _fields(self.task):
                 raise StudyError(
-                    f"both {type(owners[0]).__name__} and the task have a {name}: it is not clear "
+                    f"both {type(owners[0]).__name__} and the task have a {name}: it is unclear "
                     "which one to sweep"
                 )
         for name in self._checked_algorithms(space):
@@ -295,7 +295,7 @@ class Trainer:
 
 
 class FunctionTrainer(Trainer):
-    """The trainer of a function; see `Trainer`, which makes it."""
+    """The trainer of a training function; made by `Trainer`."""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "steps", whole_number(self.steps, STEPS))
@@ -303,8 +303,8 @@ class FunctionTrainer(Trainer):
             raise StudyError(f"steps must be at least 1; got {self.steps}")
         if self.example is None:
             raise StudyError(
-                f"{self.name} trains by itself: give example=, a policy with actions of the form "
-                "that it returns, such as lambda observation: jnp.zeros(2)"
+                f"{self.name} is a training function: give example=, a policy with actions of the "
+                "form that it returns, such as lambda observation: jnp.zeros(2)"
             )
         if self.nominal is not None and not isinstance(self.nominal, Task):
             raise StudyError(f"nominal must be a task; got {type(self.nominal).__name__}")
@@ -320,7 +320,7 @@ class FunctionTrainer(Trainer):
 
     @property
     def train(self) -> Train:
-        """The function."""
+        """The training function."""
         return cast(Train, self.task)
 
     @property
@@ -333,14 +333,14 @@ class FunctionTrainer(Trainer):
 
     @property
     def by_name(self) -> dict[str, Any]:
-        """The function by its name."""
+        """The training function by its name."""
         return {self.name: self.train}
 
     def algorithms_in(self, space: FeatureSpace) -> tuple[str, ...]:
         return (self.name,)
 
     def used_hyperparameters(self, values: Mapping[str, Any]) -> tuple[str, ...]:
-        """Return all names: the function gets all values."""
+        """Return all names, since the function receives all values."""
         return tuple(values)
 
     def untrained_policy(self, name: str) -> Any:
@@ -364,7 +364,7 @@ class FunctionTrainer(Trainer):
 
 
 def resumes(train: Train) -> bool:
-    """Return whether a function that trains takes the folder of its last checkpoint."""
+    """Return whether a training function accepts the folder of its last checkpoint."""
     return "resume" in inspect.signature(train).parameters
 
 
@@ -411,7 +411,7 @@ def _cast(present: object, value: object, name: str) -> object:
 
 
 def whole_number(value: object, name: str) -> int:
-    """Return a whole number that a hyper-parameter must be."""
+    """Return a hyper-parameter as an integer, or raise if it is not one."""
     if not is_number(value) or int(value) != value:
         raise ValueError(f"{name} must be a whole number (DiscreteBox, Categorical); got {value!r}")
     return int(value)

@@ -38,9 +38,9 @@ class RunCheckpoint:
     """A training run at one of its checkpoints.
 
     - `policy`: the policy, on the host.
-    - `finite`: False where one of its numbers is not finite.
-    - `curve`: learning curve from the beginning up to the checkpoint.
-    - `seconds`: the processor time in seconds on one core, without compilation.
+    - `finite`: False if one of its numbers is not finite.
+    - `curve`: learning curve from the start up to the checkpoint.
+    - `seconds`: processor time on one core in seconds, without compilation.
     """
 
     policy: TrainedPolicy
@@ -50,7 +50,7 @@ class RunCheckpoint:
 
     @property
     def training_return(self) -> float:
-        """Mean return of the last tenth of the updates, or else of the last one that has any."""
+        """Mean return of the last tenth of the updates, or else of the last one with a return."""
         returns = np.asarray(self.curve.mean_return, np.float64)
         recent = returns[-max(1, int(np.ceil(RECENT * len(returns)))) :]
         recent = recent[np.isfinite(recent)]
@@ -63,12 +63,12 @@ class RunCheckpoint:
 class TrainingRun:
     """One training run of a sweep.
 
-    - `values`: hyper-parameters, plain values.
+    - `values`: the hyper-parameters, plain values.
     - `seed`: training seed.
-    - `key`: digest of the hyper-parameters that the algorithm uses; part of the cache's names.
+    - `key`: hash of the hyper-parameters that the algorithm uses; part of the names in the cache.
     - `checkpoints`: environment steps of its rows.
-    - `configuration`: task and algorithm with these values; None if they cannot train.
-    - `error`: the reason for that, in one line.
+    - `configuration`: task and algorithm with these values; None if they cannot be trained.
+    - `error`: the reason why not, in one line.
     """
 
     values: Mapping[str, object]
@@ -85,8 +85,8 @@ class TrainingRuns:
     **Arguments:**
     - `study`: the study that is swept.
     - `cache`: stores each run at each checkpoint.
-    - `clock`: times the training, and ends it.
-    - `executor`: whose workers train; this process when left out.
+    - `clock`: times the training, and stops it.
+    - `executor`: an executor whose workers train; this process when left out.
     """
 
     def __init__(
@@ -106,7 +106,7 @@ class TrainingRuns:
         self._batches: dict[int, tuple[BatchedTraining, int]] = {}
 
     def add(self, values: Hyperparameters, seed: int) -> int:
-        """Add a training run; one that cannot train becomes an error of its own.
+        """Add a training run; values that cannot be trained become an error of this run.
 
         **Returns:** its number.
         """
@@ -131,7 +131,7 @@ class TrainingRuns:
         return len(self.runs[number].checkpoints)
 
     def checkpoint(self, number: int, rung: int) -> RunCheckpoint | None:
-        """Return a run at a checkpoint; None if it has not trained so far."""
+        """Return a run at a checkpoint; None if it has not trained that far."""
         return self._checkpoints.get((number, rung))
 
     def structure(self, number: int) -> Hashable:
@@ -141,13 +141,13 @@ class TrainingRuns:
         return policy_structure(configuration)
 
     def train(self, numbers: Sequence[int], rung: int, *, further: bool = False) -> None:
-        """Train runs up to a checkpoint, or up to their last if they have fewer.
+        """Train runs up to a checkpoint, or up to their last one if they have fewer.
 
         **Arguments:**
         - `numbers`: the runs.
         - `rung`: number of the checkpoint, from 0 on.
-        - `further`: keep their states, because some will continue from there.
-        **Raises:** `OutOfTime` where the seconds of the stage are over.
+        - `further`: whether to keep their states, because some will continue from there.
+        **Raises:** `OutOfTime` if the time of the stage is over.
         """
         self._assign_batches()
         waiting: dict[Hashable, list[int]] = {}
@@ -302,12 +302,12 @@ class TrainingRuns:
 def train_block(
     shipment: Shipment[Study], work: Sequence[tuple[Mapping[str, Any], int, tuple[int, ...]]]
 ) -> list[list[Arrays] | str]:
-    """Train runs side by side from their beginning; called by a worker.
+    """Train runs together from the start; called by a worker.
 
     **Arguments:**
-    - `shipment`: with the study.
-    - `work`: of each run its hyper-parameters, its seed, and the steps of its checkpoints.
-    **Returns:** of each run the arrays of its checkpoints, or the error that ended it in one line.
+    - `shipment`: the pickled study.
+    - `work`: for each run its hyper-parameters, its seed, and the steps of its checkpoints.
+    **Returns:** for each run the arrays of its checkpoints, or its error in one line.
     """
     trainer = shipment.thing.trainer
     found: list[list[Arrays] | str] = []

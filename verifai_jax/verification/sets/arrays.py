@@ -91,7 +91,7 @@ def _tile(params: Params, array: np.ndarray, lead: int) -> np.ndarray:
 
 
 def together(values: Sequence[Value], join: Callable[[list[np.ndarray], int], np.ndarray]) -> Value:
-    """Return one array of several; `join(arrays, leading)` puts arrays together."""
+    """Combine arrays into one; `join(arrays, leading)` performs the combination."""
 
     def leading(arrays: list[np.ndarray], lead: int) -> np.ndarray:
         front = np.broadcast_shapes(*(array.shape[:lead] for array in arrays))

@@ -135,13 +135,13 @@ def _select(t: Interpreter, step: Equation, inputs: list[Value]) -> list[Value]:
 
 
 def of_rank(which: Whole, like: Value) -> Whole:
-    """Return one number for each box in the rank of an array."""
+    """Return one number for each box, with the rank of an array."""
     rank = (1,) * len(like.shape)
     return which.moved(lambda array, lead: array.reshape(*array.shape[:lead], *rank))
 
 
 def select(which: Whole, cases: list[Value]) -> Value:
-    """Return one of several cases, by a number that may be open."""
+    """Select one of several cases by an index that may be undecided."""
     result = cases[0]
     for number, case in enumerate(cases[1:], 1):
         truth = which.low >= number

@@ -63,11 +63,11 @@ _solution.multiple_results = True
 def flow(
     derivative: Callable[[Any, PyTree], PyTree], time: Any, state: PyTree, seconds: Any
 ) -> tuple[PyTree, PyTree]:
-    """Return what solutions are after some seconds, and at all times until then.
+    """Return enclosures of solutions after some seconds, and at all times until then.
 
     **Arguments:**
     - `derivative(time, state)`: d state / d time; smooth in both.
-    - `seconds`: the same in all boxes.
+    - `seconds`: the duration, equal for all boxes.
     **Raises:** `MissingRule` for dynamics that are not smooth, with the operation and its line.
     """
     leaves, tree = jax.tree.flatten(state)
@@ -116,7 +116,7 @@ def _varying(program: Program, inputs: Sequence[bool]) -> list[bool]:
             raise MissingRule(
                 f"the dynamics apply {name} to the state or the time{f' ({line})' * bool(line)}, "
                 "which is not smooth, or has no Taylor series here: continuous=True needs smooth "
-                "dynamics; put what switches or saturates into the controller"
+                "dynamics; move switching and saturation into the controller"
             )
         return [any(operands)] * len(each.outvars)
 
@@ -171,8 +171,7 @@ class _Step:
     """One step of a differential equation, on sets.
 
     **Arguments:**
-    - `program`: the derivatives of all orders of a state, of the shared operands, a time and a
-      state.
+    - `program`: derivatives of all orders of a state, from shared operands, a time and a state.
     - `shared`: operands that do not change during the step.
     - `count`: arrays of the state.
     """
@@ -218,7 +217,7 @@ class _Step:
         return [*now, *during]
 
     def unbounded(self, state: list[Form]) -> np.ndarray:
-        """Return in which boxes of the batch nothing is known any more."""
+        """Return for which boxes of the batch the state is unbounded."""
         lost = np.zeros(self.boxes, bool)
         for form in state:
             low, high = form.bounds()
@@ -226,7 +225,7 @@ class _Step:
         return lost
 
     def box(self, span: Form, state: list[Form], length: float) -> tuple[list[Form], np.ndarray]:
-        """Return a box that no solution leaves, and in which boxes of the batch it is one."""
+        """Return a box that no solution leaves, and for which boxes of the batch it is valid."""
         begins = [form.bounds() for form in state]
         ends, lost, stays = begins, self.unbounded(state), np.zeros(self.boxes, bool)
         for _ in range(TRIES):

@@ -34,7 +34,7 @@ SLACK = 2.0**-45
 
 
 class Rounding(NamedTuple):
-    """The rounding of a type of real numbers: its unit, its smallest and its greatest number."""
+    """The rounding of a floating-point type: its unit, its smallest and its greatest number."""
 
     unit: float
     smallest: float
@@ -43,19 +43,19 @@ class Rounding(NamedTuple):
 
 @cache
 def rounding(dtype: DTypeLike) -> Rounding:
-    """Return the rounding of a type, with a margin for that of the bounds themselves."""
+    """Return the rounding of a type, with a margin for the rounding of the bounds themselves."""
     info = jnp.finfo(dtype)
     unit = float(info.eps) / 2 * 1.01
     return Rounding(max(unit, 2 * SLACK), float(info.tiny), float(info.max))
 
 
 class Frame(NamedTuple):
-    """Symbols after those of the features: of a step of a loop, or of a layer of a network.
+    """Symbols in addition to those of the features: of a step of a loop, or of a network layer.
 
-    - `number`: greater than those of frames made before.
-    - `first`, `stop`: its symbols among all.
-    - `outer`: the frame of the symbols before them that are not features either; None without.
-    - `of_layer`: whether it is that of a layer.
+    - `number`: a number greater than those of earlier frames.
+    - `first`, `stop`: the range of its symbols among all.
+    - `outer`: the enclosing frame, whose symbols come before; None if only features do.
+    - `of_layer`: whether it belongs to a layer.
     """
 
     number: int
@@ -70,9 +70,9 @@ class Form:
 
     - `centre`, `radius`: `[boxes, *shape]`.
     - `slopes`: `[symbols, boxes, *shape]`; None for a set that depends on no symbol.
-    - `size`: a bound of the absolute value.
-    - `low`, `high`: an interval of its own; None without one.
-    - `frame`: the frame of the symbols that are not features; None without them.
+    - `size`: a bound on the absolute value.
+    - `low`, `high`: an additional interval; None without one.
+    - `frame`: the frame of the symbols that are not features; None if there are none.
     - `dtype`: the type in which the simulation computes it.
     """
 
@@ -99,13 +99,13 @@ class Form:
 
     @classmethod
     def constant(cls, value: np.ndarray, dtype: np.dtype) -> "Form":
-        """Return one array that all boxes share."""
+        """Return an array that is equal for all boxes."""
         exact = np.asarray(value).astype(dtype).astype(np.float64)[None]
         return cls.between(exact, exact, dtype)
 
     @classmethod
     def between(cls, low: Reals, high: Reals, dtype: np.dtype) -> "Form":
-        """Return intervals; ends that are NaN stand for everything."""
+        """Return intervals; NaN as an end means an unbounded interval."""
         kind = rounding(dtype)
         low, high = overflown(low, high, kind.highest)
         # What is below the smallest normal number may be taken for zero.
@@ -120,11 +120,11 @@ class Form:
 
     @classmethod
     def leaf(cls, low: Reals, high: Reals, symbols: Reals, dtype: np.dtype) -> "Form":
-        """Return numbers between ends, each of which is the value of one symbol, or of none.
+        """Return numbers between ends, each the value of one symbol, or of none.
 
         **Arguments:**
         - `low`, `high`: `[boxes, *shape]`.
-        - `symbols`: `[symbols, *shape]`, 1 where a number is that symbol's, 0 elsewhere.
+        - `symbols`: `[symbols, *shape]`, 1 if a number is that symbol's, 0 otherwise.
         """
         whole = cls.between(low, high, dtype)
         slopes = symbols[:, None] * np.where(np.isfinite(whole.radius), whole.radius, 0.0)
@@ -149,7 +149,7 @@ class Form:
         return spread
 
     def bounds(self) -> tuple[Reals, Reals]:
-        """Return the ends of the set: what the affine form and the interval have in common."""
+        """Return the ends of the set: the intersection of affine form and interval."""
         if self._bounds is None:
             if self.slopes is None and self.low is not None and self.high is not None:
                 self._bounds = self.low, self.high
@@ -163,7 +163,7 @@ class Form:
         return self._bounds
 
     def moved(self, move: Callable[[np.ndarray, int], np.ndarray]) -> "Form":
-        """Return the same numbers elsewhere; `move(array, leading)` moves arrays."""
+        """Return the numbers rearranged by `move(array, leading)`."""
         return Form(
             move(self.centre, 1), None if self.slopes is None else move(self.slopes, 2),
             move(self.radius, 1), move(self.size, 1), self.dtype,
@@ -172,12 +172,12 @@ class Form:
         )  # fmt: skip
 
     def of_type(self, dtype: np.dtype) -> "Form":
-        """Return the same numbers as those of another type, in which they are exact."""
+        """Return the same numbers in another type that represents them exactly."""
         ends = self.low, self.high
         return Form(self.centre, self.slopes, self.radius, self.size, dtype, *ends, self.frame)
 
     def forget(self, where: np.ndarray) -> None:
-        """Let it be everything at some numbers."""
+        """Make the set unbounded at some numbers."""
         if not np.any(where):
             return
         self._bounds = self._spread = None
@@ -189,10 +189,10 @@ class Form:
                 setattr(self, name, np.where(where, value, getattr(self, name)))
 
     def unframed(self, keep: Callable[[Frame], bool] = lambda frame: False) -> "Form":
-        """Return a set without the symbols of inner frames, which become part of the radius.
+        """Return a set without the symbols of inner frames, which are added to the radius.
 
         **Arguments:**
-        - `keep`: whether to keep a frame, with all outside of it; none of them when left out.
+        - `keep`: a frame to keep, with all frames outside of it; none when left out.
         """
         frame, count = self.frame, None
         while frame is not None and not keep(frame):
@@ -205,7 +205,7 @@ class Form:
 
 
 def overflown(low: Reals, high: Reals, highest: float) -> tuple[Reals, Reals]:
-    """Return an interval that is unbounded where its numbers may be beyond the greatest one."""
+    """Return an interval that is unbounded if its numbers may overflow."""
     low = np.where(np.isnan(low) | (low < -highest), -np.inf, low)
     high = np.where(np.isnan(high) | (high > highest), np.inf, high)
     # What is beyond it for certain is an infinity to the machine, and a number in real arithmetic.
@@ -214,7 +214,7 @@ def overflown(low: Reals, high: Reals, highest: float) -> tuple[Reals, Reals]:
 
 
 def unknown(low: Reals, high: Reals) -> Reals:
-    """Return where a set is everything, NaN included."""
+    """Return where a set is unbounded, including NaN."""
     return (low == -np.inf) & (high == np.inf)
 
 
@@ -229,12 +229,12 @@ def rounded(
     units: float = 1.0,
     exact: bool = False,
 ) -> Form:
-    """Return the result of an operation, widened by its rounding.
+    """Return the result of an operation, widened by its rounding error.
 
     **Arguments:**
-    - `ends`: an interval of the result, not widened yet.
-    - `units`: error of the operation in units of rounding.
-    - `exact`: whether the result is never rounded, such as that of a maximum.
+    - `ends`: an interval of the result, not yet widened.
+    - `units`: error of the operation in rounding units.
+    - `exact`: whether the result is never rounded, such as a maximum.
     """
     kind = rounding(dtype)
     share, absolute = (SLACK, 0.0) if exact else (kind.unit * units, kind.smallest)
@@ -256,7 +256,7 @@ def rounded(
 
 
 def alike(forms: Sequence[Form]) -> tuple[list[Form], Frame | None, int]:
-    """Return forms without frames that the newest among them is not within; and its symbols."""
+    """Return forms converted to a common frame, and the number of its symbols."""
     frame = max((f.frame for f in forms if f.frame is not None), default=None)
     around, known = frame, set[int]()
     while around is not None:
@@ -267,7 +267,7 @@ def alike(forms: Sequence[Form]) -> tuple[list[Form], Frame | None, int]:
 
 
 def padded(form: Form, count: int) -> Reals:
-    """Return slopes along so many symbols, zero along those that a form does not depend on."""
+    """Return slopes padded with zeros to this many symbols."""
     if form.slopes is None:
         return np.zeros((count, *(1,) * form.centre.ndim))
     missing = count - len(form.slopes)
@@ -277,7 +277,7 @@ def padded(form: Form, count: int) -> Reals:
 
 
 def joint_slopes(a: Form, b: Form, first: Reals | float, second: Reals | float) -> Reals | None:
-    """Return the slopes of `first * a + second * b`, of forms of one frame."""
+    """Return the slopes of `first * a + second * b`, for forms of one frame."""
     if a.slopes is None:
         return None if b.slopes is None else b.slopes * second
     if b.slopes is None:
@@ -287,7 +287,7 @@ def joint_slopes(a: Form, b: Form, first: Reals | float, second: Reals | float) 
 
 
 def add(a: Form, b: Form, sign: float = 1.0) -> Form:
-    """Return `a + b`, or `a - b` for the sign -1."""
+    """Return `a + b`, or `a - b` for sign -1."""
     (a, b), frame, _ = alike([a, b])
     slopes = joint_slopes(a, b, 1.0, sign)
     centre = a.centre + b.centre if sign > 0 else a.centre - b.centre
@@ -327,7 +327,7 @@ def negative(a: Form) -> Form:
 
 
 def is_point(a: Form) -> bool:
-    """Return whether a set is one array of exact numbers."""
+    """Return whether a set is a single array of exact numbers."""
     return a.slopes is None and not a.radius.any()
 
 
@@ -347,7 +347,7 @@ def scaled(a: Form, by: Reals) -> Form:
 
 
 def interval_product(a: Form, b: Form) -> tuple[Reals, Reals]:
-    """Return the interval of a product; everything where zero may meet an infinity."""
+    """Return the interval of a product; unbounded if zero may meet infinity."""
     (low, high), (first, last) = a.bounds(), b.bounds()
     ends = low * first, low * last, high * first, high * last
     lowest = np.minimum(np.minimum(ends[0], ends[1]), np.minimum(ends[2], ends[3]))
@@ -360,7 +360,7 @@ def interval_product(a: Form, b: Form) -> tuple[Reals, Reals]:
 
 
 def product(a: Form, b: Form) -> Form:
-    """Return `a * b` of different forms."""
+    """Return `a * b` for two different forms."""
     for one, other in ((a, b), (b, a)):
         if is_point(one) and np.isfinite(one.centre).all():
             return scaled(other, one.centre)
@@ -381,7 +381,7 @@ def product(a: Form, b: Form) -> Form:
 
 
 def total(a: Form, axes: Sequence[int]) -> Form:
-    """Return the sum over axes, whatever the order in which it is computed."""
+    """Return the sum over axes, valid for any order of summation."""
     lead = tuple(axis + 1 for axis in axes)
     count = max(int(np.prod([a.centre.shape[axis] for axis in lead], dtype=np.int64)), 1)
     slopes = None if a.slopes is None else a.slopes.sum(tuple(axis + 2 for axis in axes))
@@ -399,7 +399,7 @@ def total(a: Form, axes: Sequence[int]) -> Form:
 
 
 def joined(one: Form, other: Form) -> Form:
-    """Return a set that contains two: their hull, with the mean of their slopes."""
+    """Return a set that contains two sets: their hull, with the mean of their slopes."""
     (a, b), frame, _ = alike([one, other])
     gap = joint_slopes(a, b, 0.5, -0.5)
     apart = np.abs(a.centre - b.centre) / 2

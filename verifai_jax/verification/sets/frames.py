@@ -36,12 +36,12 @@ _NUMBERS = itertools.count(1)
 
 
 def framed(carry: Sequence[Form | Whole], boxes: int, features: int) -> list[Form | Whole]:
-    """Return what a loop carries, its uncertainties as those of one frame of new symbols.
+    """Return what a loop carries, with its uncertainties as symbols of a new frame.
 
     **Arguments:**
-    - `carry`: values of any shapes; whole numbers, and what all boxes share, stay as they are.
+    - `carry`: values of any shapes; integers, and values equal for all boxes, stay unchanged.
     - `boxes`: size of the batch.
-    - `features`: symbols of the features.
+    - `features`: number of symbols of the features.
     """
     kept = {i: v for i, v in enumerate(carry)
             if isinstance(v, Form) and (v.slopes is not None or len(v.centre) > 1)}  # fmt: skip
@@ -92,11 +92,11 @@ def framed(carry: Sequence[Form | Whole], boxes: int, features: int) -> list[For
 
 
 def of_layer(units: Form, features: int) -> Form:
-    """Return the numbers of a layer, the radius of each as a symbol of its own.
+    """Return the numbers of a layer, with the radius of each as its own symbol.
 
     **Arguments:**
-    - `units`: an array of one axis.
-    - `features`: symbols of the features.
+    - `units`: an array with one axis.
+    - `features`: number of symbols of the features.
     """
     outer, bounded = units.frame, np.isfinite(units.radius)
     first = features if outer is None else outer.stop

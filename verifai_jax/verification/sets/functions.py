@@ -47,12 +47,12 @@ the argument itself has a rounding of a hundredth."""
 class Function(NamedTuple):
     """A function of one number.
 
-    - `value`: in double precision.
-    - `criticals`: where its derivative is a slope.
-    - `domain`: outside which it is NaN.
-    - `units`: its error in units of rounding.
-    - `tiny`: its absolute error in smallest normal numbers.
-    - `range`: no result lies outside, whatever the rounding.
+    - `value`: the function in double precision.
+    - `criticals`: where its derivative equals a slope.
+    - `domain`: the interval outside of which it is NaN.
+    - `units`: its error in rounding units.
+    - `tiny`: its absolute error in units of the smallest normal number.
+    - `range`: an interval that contains all results, including rounding.
     """
 
     value: Callable[[Reals], Reals]
@@ -250,7 +250,7 @@ _RAMP = Function(
 
 
 def nearest(x: Form, to_even: bool) -> Form:
-    """Return numbers rounded to whole ones, halves to even ones or away from zero."""
+    """Return numbers rounded to integers, halves to even integers or away from zero."""
     if to_even:
         return _whole(np.round)(x)
     return _whole(lambda a: np.sign(a) * np.floor(np.abs(a) + 0.5))(x)
@@ -266,7 +266,7 @@ def integer_power(x: Form, n: int) -> Form:
 
 
 def quotient(a: Form, b: Form) -> Form:
-    """Return `a / b`; everything where `b` may be zero."""
+    """Return `a / b`; unbounded if `b` may be zero."""
     if is_point(b) and np.all((b.centre != 0) & np.isfinite(b.centre)):
         inverse = 1 / b.centre
         if np.isfinite(inverse).all():
@@ -284,7 +284,7 @@ def _widened(x: Form, units: float) -> Form:
 
 
 def greater(a: Form, b: Form) -> Form:
-    """Return the maximum: `b + max(a - b, 0)`, which keeps what both depend on."""
+    """Return the maximum: `b + max(a - b, 0)`, which preserves common dependencies."""
     (low, high), (first, last) = a.bounds(), b.bounds()
     nothing = unknown(low, high) | unknown(first, last)
     ours, theirs = (low >= last) & ~nothing, (first >= high) & ~nothing
@@ -310,13 +310,13 @@ def lesser(a: Form, b: Form) -> Form:
 
 
 def difference(a: Form, b: Form) -> Form:
-    """Return `a - b` of numbers as they are, not rounded: what a comparison sees."""
+    """Return the exact difference `a - b`, which decides a comparison."""
     a, b = a.of_type(np.dtype(np.float64)), b.of_type(np.dtype(np.float64))
     return _but(add(a, b, -1.0), ~(unknown(*a.bounds()) | unknown(*b.bounds())))
 
 
 def remainder(a: Form, b: Form) -> Form:
-    """Return what a division leaves, with the sign of `a`."""
+    """Return the remainder of a division, with the sign of `a`."""
     (low, high), (first, last) = a.bounds(), b.bounds()
     nothing = ~np.isfinite(low) | ~np.isfinite(high) | ~np.isfinite(first) | ~np.isfinite(last)
     nothing = nothing | ~((first > 0) | (last < 0))
@@ -340,7 +340,7 @@ def remainder(a: Form, b: Form) -> Form:
 
 
 def power(a: Form, b: Form) -> Form:
-    """Return `a ** b`: of positive numbers, or with a whole exponent."""
+    """Return `a ** b` for positive numbers, or for an integer exponent."""
     if is_point(b) and b.centre.size and (b.centre == b.centre.flat[0]).all():
         exponent = float(b.centre.flat[0])
         if exponent.is_integer() and abs(exponent) <= 64:
@@ -351,7 +351,7 @@ def power(a: Form, b: Form) -> Form:
 
 
 def angle(y: Form, x: Form) -> Form:
-    """Return the angle of a point `(x, y)`; the whole circle where it may cross the negative x."""
+    """Return the angle of a point `(x, y)`; the full circle if it may cross the negative x axis."""
     (low, high), (left, right) = y.bounds(), x.bounds()
     nothing = unknown(low, high) | unknown(left, right)
     masks = [left > 0, low > 0, high < 0]
@@ -379,10 +379,10 @@ def angle(y: Form, x: Form) -> Form:
 
 
 def selected(truth: np.ndarray, maybe: np.ndarray, no: Form, yes: Form) -> Form:
-    """Return a case by a truth value that may be open: their hull where it is.
+    """Select one of two cases by a truth value; their hull if it is undecided.
 
     **Arguments:**
-    - `truth`, `maybe`: where it is true for certain, and where it is open.
+    - `truth`, `maybe`: where it is certainly true, and where it is undecided.
     """
     if not np.any(maybe):
         if np.all(truth):

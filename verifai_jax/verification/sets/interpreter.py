@@ -31,11 +31,11 @@ RULES: dict[str, Rule] = {}
 
 
 class MissingRule(NotImplementedError):
-    """An operation of a program that sets cannot go through."""
+    """An error for an operation of a program that has no rule for sets."""
 
 
 def rule(*names: str) -> Callable[[Rule], Rule]:
-    """Register a function for primitives of these names."""
+    """Register a rule for primitives with these names."""
 
     def register(function: Rule) -> Rule:
         RULES.update(dict.fromkeys(names, function))
@@ -50,7 +50,7 @@ class Interpreter:
     **Arguments:**
     - `boxes`: size of the batch.
     - `features`: number of symbols that stand for features.
-    - `known`: a rule for a function with a derivative of its own, by its program; or None.
+    - `known`: returns the rule for a custom-derivative function, given its program, or None.
     """
 
     def __init__(self, boxes: int, features: int, known: Known | None = None) -> None:
@@ -82,7 +82,7 @@ class Interpreter:
         )
 
     def closed(self, program: Program, inputs: Sequence[Value]) -> list[Value]:
-        """Evaluate a program with its constants, or one without."""
+        """Evaluate a program with its constants, or one without constants."""
         inner = getattr(program, "jaxpr", program)
         return self.program(inner, getattr(program, "consts", ()), inputs)
 
@@ -103,9 +103,9 @@ class Interpreter:
             raise MissingRule(f"{error}, by the operation {name}{_where(step)}") from error
 
     def concrete(self, step: Equation, inputs: list[Value]) -> list[Value]:
-        """Evaluate an operation on whole numbers that all boxes share by JAX itself.
+        """Evaluate with JAX an operation on integers that are equal for all boxes.
 
-        **Raises:** `MissingRule` for any other operation that comes here.
+        **Raises:** `MissingRule` for any other operation.
         """
         arrays = [v.common if isinstance(v, Whole) else None for v in inputs]
         forms = [out.aval.dtype for out in step.outvars]
@@ -124,7 +124,7 @@ def constant(value: ArrayLike, dtype: np.dtype) -> Value:
         return Form.constant(np.asarray(value), np.dtype(dtype))
     if jnp.issubdtype(dtype, jnp.integer) or dtype == jnp.bool_:
         return Whole.constant(np.asarray(value), np.dtype(dtype))
-    raise MissingRule(f"sets have no numbers of type {dtype}")
+    raise MissingRule(f"sets do not support numbers of type {dtype}")
 
 
 def _where(step: Equation) -> str:

@@ -12,7 +12,7 @@ Numbers = np.ndarray
 
 
 class Whole:
-    """Whole numbers between `low` and `high`, of one type; truth values are 0 and 1."""
+    """Integers between `low` and `high`, of one type; truth values are 0 and 1."""
 
     __slots__ = ("dtype", "high", "low")
 
@@ -21,13 +21,13 @@ class Whole:
 
     @classmethod
     def constant(cls, value: np.ndarray, dtype: np.dtype) -> "Whole":
-        """Return one array that all boxes share."""
+        """Return an array that is equal for all boxes."""
         exact = np.asarray(value).astype(dtype).astype(np.int64)[None]
         return cls(exact, exact, dtype)
 
     @classmethod
     def truth(cls, true: np.ndarray, false: np.ndarray) -> "Whole":
-        """Return truth values: where they are true for certain, and where false."""
+        """Return truth values, given where they are certainly true and certainly false."""
         return cls(true.astype(np.int64), (~false).astype(np.int64), np.dtype(bool))
 
     @property
@@ -37,28 +37,28 @@ class Whole:
 
     @property
     def is_point(self) -> bool:
-        """True if each is one number."""
+        """True if each interval is a single number."""
         return self.low is self.high or bool((self.low == self.high).all())
 
     @property
     def common(self) -> np.ndarray | None:
-        """The array that all boxes share, in its own type; None unless there is one."""
+        """The array that is equal for all boxes, in its own type; None if there is none."""
         if not self.is_point or (len(self.low) > 1 and (self.low != self.low[:1]).any()):
             return None
         return self.low[0].astype(self.dtype)
 
     @property
     def true(self) -> np.ndarray:
-        """Where a truth value is true for certain."""
+        """Where a truth value is certainly true."""
         return self.low > 0
 
     @property
     def false(self) -> np.ndarray:
-        """Where a truth value is false for certain."""
+        """Where a truth value is certainly false."""
         return self.high <= 0
 
     def moved(self, move: Callable[[np.ndarray, int], np.ndarray]) -> "Whole":
-        """Return the same numbers elsewhere; `move(array, leading)` moves arrays."""
+        """Return the numbers rearranged by `move(array, leading)`."""
         return Whole(move(self.low, 1), move(self.high, 1), self.dtype)
 
 
@@ -163,7 +163,7 @@ COMPARISONS = ("eq", "ne", "lt", "le", "gt", "ge")
 
 
 def compared(name: str, low: np.ndarray, high: np.ndarray) -> Whole:
-    """Return a comparison of two numbers by the ends of their difference."""
+    """Return a comparison of two numbers, decided by the ends of their difference."""
     match name:
         case "lt":
             return Whole.truth(high < 0, low >= 0)
@@ -178,7 +178,7 @@ def compared(name: str, low: np.ndarray, high: np.ndarray) -> Whole:
 
 
 def selected(truth: np.ndarray, maybe: np.ndarray, no: Whole, yes: Whole) -> Whole:
-    """Return a case by a truth value that may be open: an interval around both where it is."""
+    """Select one of two cases by a truth value; an interval around both if it is undecided."""
     low = np.where(truth, yes.low, no.low)
     high = np.where(truth, yes.high, no.high)
     if np.any(maybe):
