@@ -177,7 +177,7 @@ def test_a_full_disk_is_one_error_that_names_the_file_and_hides_no_failure(
 
     monkeypatch.setattr(Path, "write_text", full)
     with pytest.raises(
-        OSError, match=r"\.json cannot be written \(No space left on device\); give"
+        OSError, match=r"\.json cannot be written \(No space left on device\); make room"
     ):
         run.save_counterexamples(tmp_path / "corpus", max_count=1)
     assert list((tmp_path / "corpus").iterdir()) == []

@@ -194,3 +194,12 @@ def test_the_report_on_a_table_without_a_failure(tmp_path):
     assert "No failure by gyro_dropout was found" in page
     assert "given that it happens" in page
     assert "0 of 1 faults and pairs break the property" in page
+
+
+def test_the_headline_counts_failures_that_closer_replays_refute():
+    sure = Effect(("a",), True, 9, 512, verdict="confirmed", row=0, probability=0.02)
+    thin = replace(sure, faults=("b",), verdict="refuted", row=1)
+    whole = FailureTable("balance", (sure, thin), None, None, None, 0.95, True, 1.0)
+    assert "2 of 2 faults and pairs break the property, 1 of them in closer replays" in str(whole)
+    alone = replace(whole, effects=(sure,))
+    assert "1 of 1 faults and pairs break the property; probabilities" in str(alone)

@@ -153,9 +153,11 @@ class FailureTable(Drawn, Reported, Tabular):
     def __str__(self) -> str:
         failing = [each for each in self.effects if each.fails]
         what = "in a mission" if self.rate is not None else "given that it happens"
+        sure = sum(each.confirmed for each in failing)
+        only = f", {sure} of them in closer replays too" if sure < len(failing) else ""
         lines = [
             f"{self.name}: {len(failing)} of {len(self.effects)} faults and pairs break the "
-            f"property; probabilities {what}, {format_percent(self.confidence)} intervals; "
+            f"property{only}; probabilities {what}, {format_percent(self.confidence)} intervals; "
             f"{self.seconds:z.0f} s"
         ]
         width = max((len(each.name) for each in self.effects), default=0)
