@@ -146,7 +146,8 @@ def ode_task(
       one compiled training.
     **Returns:** a task; its states are `OdeState`.
     **Raises:** `ValueError` for a loop with a traced step, discrete actions without `control`,
-    weights that are not numbers or whose names are taken, and functions that do not fit together.
+    weights that are not numbers or have the name of a field, and functions that do not fit
+    together.
     """
     if not isinstance(loop, Ode):
         raise ValueError(f"loop must be made by ode(...); got {outline(loop)}")
@@ -218,7 +219,7 @@ def _check_reward(reward: Reward, weights: Mapping[str, float]) -> None:
 
 @functools.cache
 def _with_weights(names: tuple[str, ...]) -> type[OdeTask]:
-    """Return a kind of task with a field for each weight: its leaves as a pytree."""
+    """Return a task class with a field for each weight; these fields are its pytree leaves."""
     static = [field.name for field in dataclasses.fields(OdeTask)]
     made = dataclasses.make_dataclass(
         "OdeTask",

@@ -1,4 +1,4 @@
-"""From requirement to formula, problem, tests, runs, claims and report, and which links are broken.
+"""The links from requirement to formula, problem, tests, runs, claims and report, and broken ones.
 
     print(vj.trace_matrix("specs/brake.py", tests=["tests"], runs=["runs"]))
 
@@ -116,7 +116,7 @@ def _row(
 def _gaps_of(
     problem: Problem, name: str, about: Requirement | None, row: TraceRow, asked: Sequence[str]
 ) -> Iterator[Gap]:
-    """Yield what is wrong with a formula and its row, evidence that has changed aside."""
+    """Yield the faults of a formula and its row, except changed evidence."""
     where = f"in problem {problem.name!r}"
     if about is None:
         text = f"formula {name!r} {where} stands for no requirement"

@@ -37,7 +37,7 @@ from verifai_jax.training.augmentation.task import SupervisedTask
 KIND = "augmentation"
 """Kind of the cache."""
 DEFAULT_ARMS = ("none", "random", "counterexamples")
-"""Arms where none are named; `standard` too, where the task has a transformation."""
+"""Default arms; `standard` is added if the task has a transformation."""
 
 
 @suggests_options

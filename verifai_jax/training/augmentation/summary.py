@@ -80,7 +80,7 @@ def findings(outcome: Outcome, metric: str = "error") -> list[str]:
 
 
 def _gain(outcome: Outcome, metric: str) -> list[str]:
-    """Compare the gains of counterexamples and random inputs, where the former is no chance."""
+    """Compare the gains of counterexamples and random inputs, if the former is significant."""
     if not {"none", "random", "counterexamples"} <= {*outcome.arms}:
         return []
     differences = _differences(outcome, metric, "none")

@@ -97,7 +97,7 @@ class FunctionRuns(TrainingRuns):
             shutil.rmtree(self._folder_of(number), ignore_errors=True)
 
     def _call(self, numbers: list[int], at: int) -> None:
-        """Call the function for each of these, at most as many at a time as there are workers."""
+        """Call the function for each of these, with at most one call per worker at a time."""
         calls: list[dict[str, Any]] = []
         for number in numbers:
             run = self.runs[number]
@@ -169,7 +169,7 @@ class FunctionRuns(TrainingRuns):
 
 
 ARRAY = "array/"
-"""Beginning of the names of a policy's arrays among those that are stored of a training."""
+"""Prefix of the names of a policy's arrays among the stored arrays of a training."""
 
 
 def train_once(

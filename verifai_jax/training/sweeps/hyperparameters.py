@@ -17,7 +17,7 @@ from verifai_jax.features.domain import Domain
 Hyperparameters: TypeAlias = dict[str, Any]
 """Plain Python values of hyper-parameters, by name."""
 _MAX_PROBES = 64
-"""Choices of a domain up to which each is checked; only the ends of larger ones are."""
+"""Maximum number of choices that are all checked; of larger domains only the ends are."""
 _COMPANIONS = 16
 """Points of the space at which a value is tried before it is refused."""
 _CHUNK = 32
