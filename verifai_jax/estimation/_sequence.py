@@ -3,8 +3,8 @@
     whole = sequence([approach, overtake], {"gap0": "gap", "v0": "v"})
     print(whole); whole.counterexamples
 
-A part begins where the part before it has ended. The whole succeeds if all parts do, so that its
-probability of success is the product of the parts', each given that those before it succeeded.
+A part begins where the previous part ended. The sequence succeeds if all parts do, so its
+probability of success is the product of the parts' conditional probabilities.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -49,19 +49,19 @@ def sequence(
     precision: str = "float32",
     progress: bool | None = None,
 ) -> SequenceEstimate:
-    """Estimate how often a sequence of scenarios fails, part by part.
+    """Estimate the failure probability of a sequence of scenarios, part by part.
 
     Samples of the first part come from its prior. Each sample that does not fail starts one sample
-    of the next part: the features named in `handover` take their values from it, the others are
-    drawn from their own prior. So the samples of a part are independent, its interval is the exact
-    one of Clopper and Pearson, and the product of the intervals covers the whole sequence
+    of the next part: features named in `handover` take their values from it, and all others are
+    drawn from their own prior. So the samples of a part are independent. Each part has the exact
+    interval of Clopper and Pearson, and the product of the intervals covers the whole sequence
     (Bonferroni).
 
     The verdicts of a `Run` are reused. Rows of the first part are already samples of it. Rows of
-    the last part started from other values: each sample takes the verdict of the row with the
-    nearest start, so rows are weighted by how often the sequence reaches them. That interval is
-    approximate, and a note says so. Final states are not stored, so rows of the first part are
-    simulated again to obtain them, and parts in between are always simulated.
+    the last part have other initial values, so each sample that reaches it takes the verdict of the
+    row with the nearest initial values. The interval is then approximate, and a note says so. Rows
+    of the first part are simulated again to obtain their final states, which are not stored; parts
+    in between are always simulated.
 
     **Arguments:**
     - `parts`: problems, or runs with `search="uniform"`, in their order.

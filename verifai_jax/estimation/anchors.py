@@ -1,4 +1,4 @@
-"""Components around the regions that searches found, which every proposal keeps.
+"""Mixture components around the regions found by searches; every proposal keeps them.
 
 anchors = anchors_of(explorations, defensive=0.1)
 anchors.fit()                                   # a mixture, of about equal parts for all regions
@@ -52,9 +52,9 @@ class WeightedFailures(NamedTuple):
 class Anchors:
     """Mixture components around the regions that explorations found, kept in every proposal.
 
-    Regions have about equal shares, so that samples of this mixture tell how probable each region
-    is, whatever earlier samples said. A region keeps its share even if it turns out to be
-    improbable.
+    Regions have about equal shares, so that samples of this mixture estimate the probability of
+    each region independently of earlier samples. A region keeps its share even if it turns out to
+    be improbable.
 
     - `chains`: all explorations together.
     - `regions`: the chains of each region.

@@ -1,13 +1,13 @@
-"""Descents from many places into failing regions, the first part of an independent search.
+"""Descents from many points into failing regions, the first part of an independent search.
 
     ends = descend_from_many(limit_state, rng, simulations=2000)
     ends.points                                     # failures [n, d], one of each that fails
     ends.feet                                       # where their tangent planes are least distant
 
-Starts lie anywhere from the middle of the prior to far outside of it. A region of which little
-leads to it is found only where many descents begin, so they end at the first failure, and those
-that begin at a local minimum of the starts go first. Where there are gradients, starts are near
-one another if their slopes lead to the same place.
+Starts lie anywhere from the middle of the prior to far outside of it. A region with a small basin
+of attraction is only found by many descents. So descents end at their first failure, and starts
+that are local minima among the starts go first. With gradients, starts count as near each other if
+their slopes lead to the same point.
 
 Sources: Breitung, The geometry of limit state functions and subset simulation, Reliability
 Engineering and System Safety 182 (2019), for the regions that a population is led away from;
@@ -170,7 +170,7 @@ def draw_starts(
 
 
 def _planes(feet: Float[np.ndarray, "n d"]) -> Float[np.ndarray, "n coordinates"]:
-    """Return points that tell planes apart: the feet and the directions.
+    """Return points that distinguish planes: the feet and the directions.
 
     Where planes pass near the origin their feet lie together, wherever their regions are.
     """
@@ -179,7 +179,7 @@ def _planes(feet: Float[np.ndarray, "n d"]) -> Float[np.ndarray, "n coordinates"
 
 
 def points_ahead(limit_state: LimitState, descents: Descents) -> Float[np.ndarray, "n d"]:
-    """Return where the slope at each point predicts the limit state; without it, the point itself.
+    """Return the point at which each slope predicts the limit state, or the point itself.
 
     The prediction is limited to the length of one step.
     """

@@ -4,9 +4,10 @@
     z, _ = proposal.sample(rng, 1000)
     ratio = proposal.ratio(z)                       # proposal density over prior density
 
-Components of several kinds are fitted to one half of the failures, and weighed by what they do on
-the other: the weights minimise the second moment of the importance weights, `E[p/q | failure]`,
-which is convex in them. So the kind is not chosen, and a mode that no component covers costs most.
+Components of several kinds are fitted to one half of the failures and weighted on the other half:
+the weights minimise the second moment of the importance weights, `E[p/q | failure]`, which is
+convex in them. So no kind has to be chosen in advance, and leaving a mode uncovered is penalised
+most.
 
 Sources: Rubinstein and Kroese, The cross-entropy method (2004), chapter 8; Papaioannou, Geyer and
 Straub, Improved cross entropy-based importance sampling with a flexible mixture model, Reliability

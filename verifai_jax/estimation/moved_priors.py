@@ -4,10 +4,10 @@
         proposals = [moved_priors(ends) for ends in found]
         fitted = share_out(limit_state, rng, mix(proposals), limit_state.left)
 
-Where a point fails with a probability, failures are distributed as the prior times it. A proposal
-that is fitted to failures, as for other systems, is the worst one then: places that fail seldom get
-the fewest samples, and a failure there weighs as much as thousands of others, or is not seen at all
-and nothing tells. The prior moved by a vector, as wide as it was, has weights without such a tail.
+If points fail with a probability, failures are distributed as the prior times this probability. A
+proposal fitted to failures is then a poor choice: regions that fail seldom get few samples, and a
+failure there weighs as much as thousands of others, or is missed unnoticed. The prior, moved by a
+vector at unchanged width, has weights without such a heavy tail.
 
 Source: Asmussen and Glynn, Stochastic Simulation (2007), chapter VI, for exponential tilting.
 """

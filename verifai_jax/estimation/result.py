@@ -42,7 +42,7 @@ class Estimate(Drawn, Reported, InNotebook):
     - `method`: a name of `METHODS`; None without an estimate.
     - `simulations`: number of all simulations; one with its gradient counts as 2.
     - `budget`: simulations that were allowed.
-    - `failures`, `no_verdict`: how many simulations failed, and how many had no verdict.
+    - `failures`, `no_verdict`: number of failed simulations, and of simulations without a verdict.
     - `upper_bound`: upper bound guaranteed at `confidence` by independent samples of the prior
       alone, whatever a search may have missed.
     - `prior_simulations`, `prior_failures`, `prior_no_verdict`: the samples of the prior on which

@@ -4,10 +4,10 @@ certificates = certify(problem_of, policies, p=0.01)
 print(certificates)
 certificates.safest, certificates[3].verdict, certificates.counterexamples(3)
 
-Failures of policies on the host are simulated once more before a certificate shows them. One that
-does not fail again was caused by state that earlier simulations left, or by random numbers that do
-not come from the key. It counts in the failure rate, which is that of the system as simulated, and
-is not shown as a counterexample.
+Failures of policies on the host are simulated once more before a certificate shows them. A failure
+that does not recur was caused by state left by earlier simulations, or by random numbers that do
+not come from the key. It counts in the failure rate of the system as simulated, but is not shown as
+a counterexample.
 """
 
 import time
@@ -71,8 +71,8 @@ def certify(
 
     **Arguments:**
     - `problem_of`: a function from a policy to its `Problem`. JAX traces it with the policy's
-      numbers as arguments, so that policies of one structure share a program; if that fails, each
-      is compiled by itself.
+      numbers as arguments, so that policies of one structure share a program; if tracing fails,
+      each policy is compiled by itself.
     - `policies`: `rl.Policy` objects, or other pytrees of numbers.
     - `p`: the failure probability below which a policy is called safe.
     - `confidence`: the probability that all intervals hold at once.
@@ -82,10 +82,10 @@ def certify(
       those of a training with this seed.
     - `budget`: samples of all policies together; four times the minimum when left out. Samples
       beyond the minimum go to policies whose verdict is open, and to those that may be the safest.
-    - `attack`: the search that looks for failures first; its failures enter no rate.
+    - `attack`: the search that looks for failures first; its failures are not part of any rate.
     - `attack_simulations`: simulations of each attack, rounded up to whole blocks; 0 for no attack.
-    - `tie`: failure rates that differ by less than this count as equally safe. When left out, `p /
-      10` or less: so small that resolving it takes about as many samples as the minimum of all
+    - `tie`: failure rates that differ by less than this count as equally safe. The default is `p /
+      10` or less, such that resolving it takes about as many samples as the minimum for all
       policies together.
     - `remember(key, compute)`: a memo of simulated blocks; it returns the arrays of `compute`, or
       those stored under this key. A key holds a hash of the model's code, so that blocks of another
@@ -337,8 +337,8 @@ def repeat_failures(
 
     **Arguments:**
     - `blocks`: the blocks that simulate the policies.
-    - `sampled`, `attacked`: its simulations, whose verdicts are replaced.
-    **Returns:** the counts; their text says what they mean for the system.
+    - `sampled`, `attacked`: simulations of the policy, whose verdicts are replaced.
+    **Returns:** the counts, with a text on their meaning for the system.
     """
     rows = [
         (float(verdicts.lowest[index]), record, block, index)

@@ -1,11 +1,11 @@
-"""Blocks of simulations by name: computed together, remembered one by one.
+"""Named blocks of simulations: computed together, stored one by one.
 
     blocks = Blocks(problem_of, policies, seed=0, lanes=64, remember=store.remember)
     for (policy, block), verdicts in blocks.certificate([(0, 0), (0, 1), (5, 0)]):
         ...
 
-A piece is one policy in one block of samples. Its name holds all that its numbers depend on, so
-whatever is chosen for, in whatever order, a memo gives what a simulation would.
+Each block belongs to one policy. Its name identifies everything that its results depend on, so
+stored results can be used in any order.
 """
 
 import hashlib
@@ -195,7 +195,7 @@ class Blocks:
         **Arguments:**
         - `numbers`: the numbers of the simulations, from which their random keys are derived.
         - `of_attack`: whether they are simulations of the attack, or samples.
-        **Returns:** the least robustness of each, NaN without a verdict; and whether it fails.
+        **Returns:** for each row its least robustness, NaN without a verdict, and whether it fails.
         """
 
         def compute() -> dict[str, np.ndarray]:

@@ -1,9 +1,9 @@
-"""The same policy in two engines: where verdicts differ, how far traces part, and what makes them.
+"""The same policy in two engines: differences of verdicts and traces, and their causes.
 
     result = transfer(policy, in_mujoco, in_brax)       # functions policy -> Problem, or Problems
     print(result); result.plot(); result.table
 
-A pair is the same features and the same random key in both. First pairs are sampled, then a search
+A pair simulates both with the same features and random key. First pairs are sampled, then a search
 looks for the greatest difference.
 """
 
@@ -67,8 +67,9 @@ def transfer(
     """Simulate the same policy in two engines, and find where they differ.
 
     Traces are compared in the signals that the formulas of both problems read, each in units of its
-    range. A gap counts if it exceeds `tolerance` and several times the effect of rounding: the gap
-    in one engine when the features move by one rounding error of single precision.
+    range. A gap counts if it exceeds both `tolerance` and several times the effect of rounding,
+    which is the gap in one engine when the features change by one rounding error of single
+    precision.
 
     **Arguments:**
     - `policy`: the policy passed to both problems; None if they contain it already.

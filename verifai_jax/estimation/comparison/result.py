@@ -1,4 +1,4 @@
-"""The result of a comparison: how often each fails, by how much they differ, and where."""
+"""The result of a comparison: failure rates, their difference, and the differing features."""
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
@@ -164,9 +164,9 @@ class Transfer(Drawn, Reported, InNotebook):
     - `names`: the names of the two problems.
     - `table`: a row for each pair: its features; `robustness_a`, `violated_a` and those of b; the
       greatest `gap` of the traces in units of the range of a `signal`; `rounding`, the gap that
-      rounding can make; `parted`, the time in seconds at which the traces first differ by more;
-      `differs`, whether they do; `searched`, whether the search chose the pair; `proper`, whether
-      both simulations ended.
+      rounding can cause; `parted`, the first time in seconds at which the traces differ by more;
+      `differs`, whether they ever do; `searched`, whether the search chose the pair; `proper`,
+      whether both simulations ended.
     - `space`: the space of the common features.
     - `influence`: each coordinate's share of the gap's variance among samples,
       from 0 to 1.

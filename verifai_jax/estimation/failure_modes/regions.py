@@ -3,10 +3,9 @@
     regions.assign(failures)                        # the region [n] of each failure
     regions.design_points                           # [k, d], the likeliest failure of each
 
-A failure belongs to the region of the nearest point. A region that is narrow in a few coordinates
-and wide in many others looks far away from its own failures where distances count all coordinates
-alike; so they are in standard deviations of the region, where these tell the known points apart
-better.
+A failure belongs to the region of the nearest point. Plain distances fail for a region that is
+narrow in a few coordinates and wide in many others. So distances are measured in standard
+deviations of the region if this separates the known points better.
 """
 
 from dataclasses import dataclass
