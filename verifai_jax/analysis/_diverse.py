@@ -1,4 +1,4 @@
-"""A diverse subset: some rows that stand for all, each as far as can be from those before.
+"""A diverse subset: rows that represent all others, each as far as possible from earlier ones.
 
     found = diverse(run, 10)
     found.table                    the rows, the worst first, and how far each was from those before

@@ -38,7 +38,7 @@ Around: TypeAlias = tuple[Gaussian, Gaussian, *tuple[Gaussian | Marginals, ...]]
 
 
 class WeightedFailures(NamedTuple):
-    """Failures `z` `[n, d]`, and the share `[n]` of their distribution that each represents."""
+    """Failures `z` `[n, d]`, and the share `[n]` of all failures that each represents."""
 
     z: Float[np.ndarray, "n d"]
     weight: Float[np.ndarray, " n"]

@@ -79,7 +79,7 @@ class Mixture:
         )
 
     def with_shares(self, shares: Float[np.ndarray, " k"]) -> "Mixture":
-        """Return this mixture with shares in these proportions; the prior keeps its own."""
+        """Return this mixture with new proportions of components; the prior keeps its share."""
         prior = float(self.shares[0])
         rest = shares * (1 - prior) / max(float(shares.sum()), 1e-12)
         return Mixture(self.components, np.append(prior, rest))

@@ -106,7 +106,7 @@ class Estimate(Drawn, Reported, InNotebook):
         return self.rest * self.prior_no_verdict / max(self.prior_simulations, 1)
 
     def simulations_until(self, p0: float, confidence: float | None = None) -> int:
-        """Return how many more samples without a failure show a probability below `p0`.
+        """Return the number of further failure-free samples that show a probability below `p0`.
 
         **Arguments:**
         - `p0`: failure probability to be shown, between 0 and 1.

@@ -1,4 +1,4 @@
-"""Moves from one point to another, of the searches that step from the points that they know."""
+"""Moves from known points to new ones, shared by several searches."""
 
 import jax.numpy as jnp
 import numpy as np

@@ -96,7 +96,7 @@ def explain(
     **Arguments:**
     - `run`: a run of a problem, with a counterexample.
     - `row`: the number of a counterexample, or its row of the table; the worst when left out.
-    - `nominal`: nominal features, if the problem has none or others are meant.
+    - `nominal`: nominal features, instead of those of the problem, if any.
     - `progress`: whether to show one line of progress; see `core.display.progress` for the default.
 
     This takes one simulation for each feature and each unit coordinate, and one gradient. Without

@@ -66,7 +66,7 @@ def shrink(
     - `run`: a run of a problem, with a counterexample.
     - `row`: the number of a counterexample, or its row of the table; by default the worst, or the
       likeliest with `by="likelihood"`.
-    - `nominal`: nominal features, if the problem has none or others are meant.
+    - `nominal`: nominal features, instead of those of the problem, if any.
     - `by`: the measure to minimise. `"count"`: first the difference in the number of items of
       arrays of variable length, such as events; then the number of coordinates that are not exactly
       nominal, among them those of items that nominal does not have; then the distance. The result

@@ -172,7 +172,7 @@ class Blocks:
     def attack(
         self, chosen: Sequence[tuple[int, np.ndarray]], round_: int, search: str
     ) -> Iterator[tuple[int, Verdicts]]:
-        """Yield verdicts of each policy's points that a search chose; `chosen` holds indices."""
+        """Yield verdicts of the points that searches chose; `chosen` holds indices of policies."""
         blocks = [
             Block(
                 policy, points, round_ * self.lanes,

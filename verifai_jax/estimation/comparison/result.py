@@ -50,7 +50,7 @@ class Compared:
         return judge(self.rates, self.margin)
 
     def rules(self, **options: Any) -> Any:
-        """Describe with a few boxes where only the candidate fails; see `analysis.rules`.
+        """Describe the region where only the candidate fails by boxes; see `analysis.rules`.
 
         **Raises:** `ValueError` if there is no such pair.
         """
@@ -208,7 +208,7 @@ class Transfer(Drawn, Reported, InNotebook):
         return simulation_key(run_keys(self.seed)[1], row)
 
     def rules(self, **options: Any) -> Any:
-        """Describe with a few boxes where only one of the two fails; see `analysis.rules`.
+        """Describe the region where only one of the two fails by boxes; see `analysis.rules`.
 
         **Raises:** `ValueError` if there is no such pair.
         """

@@ -72,7 +72,7 @@ class RealTrials(InNotebook):
         return self.table[[verdict is not None for verdict in self.table["failed"]]]
 
     def rules(self, **options: Any) -> "Rules":
-        """Describe with a few boxes where the simulation is wrong; see `analysis.rules`.
+        """Describe the region where the simulation is wrong by boxes; see `analysis.rules`.
 
         **Arguments:**
         - `options`: the options of `analysis.rules`.
