@@ -257,7 +257,8 @@ def read_group(
         elif name in modules:
             if not isinstance(value, bool):
                 raise ValueError(
-                    f"{inside}: a module holds, true, or does not, false; got {value!r}"
+                    f"{inside}: must be true (the module holds) or false (it does not); got "
+                    f"{value!r}"
                 )
             parts.append(Reference(name, value))
         else:

@@ -193,8 +193,8 @@ def _attributes(above: tuple[str, ...], tree: object, where: str) -> Iterator[At
             yield Attribute(name, kind, literals, unit=unit)
         else:
             raise ValueError(
-                f"{where}: {name} is a list of literals, or boolean, integer or float with what it "
-                f'measures, "float velocity"; got {value!r}'
+                f"{where}: {name} must be a list of literals, or boolean, integer or float with a "
+                f'quantity, "float velocity"; got {value!r}'
             )
 
 

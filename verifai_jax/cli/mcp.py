@@ -219,7 +219,7 @@ class Server:
         path = value.rpartition(":")[0] if key == "problem" and ":" in value else value
         whole = (self.folder / path).resolve() if "\0" not in path else Path("/")
         if not whole.is_relative_to(self.folder) or not whole.exists() or path.startswith("-"):
-            raise Refused(f"{key} {value!r} is nothing in the folder of this server")
+            raise Refused(f"{key} {value!r} does not exist in the folder of this server")
         if key == "problem" and whole.suffix != ".py":
             raise Refused(f"problem {value!r} must be FILE.py:NAME")
 

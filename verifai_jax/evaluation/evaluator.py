@@ -3,9 +3,9 @@
     evaluate = Evaluator(problem, batch=512, seed=0)
     verdicts = evaluate(u)                              # u [n, d], any n: Verdicts
 
-Every verb that simulates points stands on this: it says which points, and gets verdicts. The
-evaluator takes the engine that suits the problem, compiled or on the host, or sends points to the
-workers of an executor. Each simulation has a random key of its own, by its number.
+Every function that simulates points uses an evaluator, which returns verdicts. It chooses the
+engine that suits the problem, compiled or on the host, or sends points to the workers of an
+executor. The random key of a simulation follows from its number.
 """
 
 from collections.abc import Callable

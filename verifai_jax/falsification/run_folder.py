@@ -199,14 +199,14 @@ def check_not_continued(run: Run, folder: Path) -> None:
     record = read_record(folder)
     remedy = "load it, vj.load(folder, problem), or save this one elsewhere, run.save(folder)"
     if deciding_checksum(record) != deciding_checksum(_as_record(run)):
-        raise ValueError(f"{folder} holds another run by now, of {record.get('name')!r}; {remedy}")
+        raise ValueError(f"{folder} now holds another run, of {record.get('name')!r}; {remedy}")
     rows = 0
     if ErrorTable.exists(folder):
         rows = len(ErrorTable.load(folder, run.table.features))
     if rows > run.simulations:
         raise ValueError(
-            f"somebody has gone on with the run in {folder}: it has {rows} simulations by now, "
-            f"this one {run.simulations}; {remedy}"
+            f"the run in {folder} has been continued: it has {rows} simulations now, this one "
+            f"{run.simulations}; {remedy}"
         )
 
 

@@ -187,8 +187,8 @@ def check_objective(problem: Problem, search: Search) -> None:
     other = "a guide" if problem.guide is not None else "a priority"
     if problem.guide is not None or problem.rulebook is not None:
         raise ValueError(
-            f"problem {problem.name!r} has {other}, which says which simulations are better, and "
-            "so does objective='likelihood'; leave out one of them"
+            f"problem {problem.name!r} has {other}, which orders simulations, and "
+            "objective='likelihood' is another order; leave out one of them"
         )
     from verifai_jax.features.improbability import Improbability
 

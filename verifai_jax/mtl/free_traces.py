@@ -1,11 +1,12 @@
-"""Traces of signals that move freely, among which one is sought that makes formulas true or false.
+"""Search among free signals for a trace that makes formulas true or false.
 
     free = FreeTraces.of([formula])
     signals = free.drawn(1024, rng)                       # [time, lanes], piecewise constant
     found = free.search(lambda values: values(formula)[0], rng)     # one that maximizes it
 
 A signal moves between few levels: the numbers that predicates compare it with, and others between
-and beyond. So the corners at which a formula changes its truth are met, equality among them.
+and beyond. So the search reaches all points where the formula changes its truth, including
+equality.
 """
 
 import math

@@ -4,8 +4,8 @@
     print(found)                    # the left side never holds in the recording; ...
     found.table
 
-The formula alone tells what has no effect and what cannot be true; recordings tell what never
-holds, what is never near, and what looks beyond their end.
+The formula alone shows parts without effect and parts that cannot be true; recordings show parts
+that never hold, are never near to a change, or look beyond the end.
 """
 
 import math

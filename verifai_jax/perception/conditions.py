@@ -115,8 +115,8 @@ def taken(
 def _needed(key: Key[Array, ""] | None, effect: str, argument: str) -> Key[Array, ""]:
     if key is None:
         raise ValueError(
-            f"Conditions({effect}=...) is drawn at random: "
-            f"render(..., {argument}=jax.random.key(0)) says from which key"
+            f"Conditions({effect}=...) is drawn at random and needs a key: render(..., "
+            f"{argument}=jax.random.key(0))"
         )
     # Noise and rain, or dirt and dead pixels, have keys of their own.
     return jax.random.fold_in(key, {"noise": 0, "rain": 1, "dirt": 0, "dead": 1}[effect])

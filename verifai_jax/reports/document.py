@@ -93,8 +93,8 @@ def write_report(
         case Run():
             if result.table.changed:
                 raise ValueError(
-                    f"no report is written on the run of {result.name!r}, whose rows would be its "
-                    f"evidence: {result.damage}"
+                    f"no report can be written on the run of {result.name!r}, because its rows "
+                    f"are the evidence: {result.damage}"
                 )
             space = result.problem.space if result.problem else None
             _check(about, space, result.table.features)

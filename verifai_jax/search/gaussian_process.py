@@ -197,7 +197,7 @@ class GaussianProcess:
     def basis(
         self, posterior: Posterior, paths: Paths, x: Float[Array, "m d"]
     ) -> Float[Array, "m terms"]:
-        """Return basis functions at these points; times the paths' weights they give values."""
+        """Return basis functions at these points, to be multiplied by the weights of paths."""
         waves = self._waves(posterior.hyper, paths, x)
         return jnp.concatenate([waves, self.cross(posterior, x)], axis=1)
 

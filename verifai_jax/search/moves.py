@@ -17,7 +17,7 @@ def has_fine_cells(cube: Cube) -> Bool[np.ndarray, " discrete"]:
 
 
 def all_or_some(coin: Float[Array, "n 1"], mask: Float[Array, "n d"]) -> Bool[Array, "n d"]:
-    """Return which coordinates move: all in every second row, else a third, or one on average.
+    """Select the coordinates to move: all in every second row, else a third, or one on average.
 
     **Arguments:**
     - `coin`, `mask`: uniform random numbers.

@@ -101,7 +101,10 @@ def repair(
     whole: Any = problem.problem if isinstance(problem, Run) else problem
     if whole is None:
         assert run is not None
-        raise ValueError(f"the run of {run.name!r} was loaded without its problem; load it with it")
+        raise ValueError(
+            f"the run of {run.name!r} was loaded without its problem; give it: vj.load(path, "
+            "problem)"
+        )
     check_options(budget, batch, seed, max_seconds, None)
     arguments.check_numbers(margin, rounds=rounds, held_out=held_out)
     check_names("aim", [aim], arguments.AIMS)

@@ -1,12 +1,12 @@
-"""The functions, classes and files that an object is made of, found by walking through it.
+"""The functions, classes and files that define an object, found by walking through it.
 
     for part in parts_of(problem):                      # Module, Function or OwnFiles
         ...
 
-A function of a user's file stands for its module. One that no file holds, of a notebook or an
-interpreter, stands for itself: its text, and the plain values that it takes from around it.
-`is_user_file` tells a user's own files from those of Python and of packages. Neither JAX nor
-anything else of this package is imported here, so that it may be asked at any time.
+A function of a user's file represents its module. A function without a file, from a notebook or an
+interpreter, represents itself: its text, and the plain values that it uses from its surroundings.
+`is_user_file` distinguishes a user's own files from those of Python and of packages. This file
+imports neither JAX nor other parts of this package, so it can be used at any time.
 """
 
 import functools

@@ -7,8 +7,8 @@
                                                 # is no feature 'mas'; did you mean 'mass'? ...'
         format_user_error(error)                # the same in one bounded line, with its type
 
-Where an error comes from is read from its traceback: the innermost line that is neither of this
-package, nor of Python, nor of an installed library.
+The origin of an error is the innermost line of its traceback that belongs neither to this package,
+nor to Python, nor to an installed library.
 """
 
 import ast

@@ -163,14 +163,14 @@ def _common(a: Problem, b: Problem) -> tuple[tuple[Problem, Problem], list[str]]
     both = [n for n, d in spaces[0].items() if d.size and n in spaces[1] and spaces[1][n].size]
     if not both:
         raise ProblemError(
-            "the problems vary no feature of one name: "
+            "the problems have no varying feature in common: "
             f"{', '.join(spaces[0])} in a; {', '.join(spaces[1])} in b"
         )
     for name in both:
         if spaces[0][name] != spaces[1][name]:
             raise ProblemError(
-                f"{name} is {spaces[0][name]!r} in a and {spaces[1][name]!r} in b: a pair has the "
-                "same features, so give it one domain"
+                f"{name} is {spaces[0][name]!r} in a and {spaces[1][name]!r} in b: both sides of "
+                "a pair have the same features, so give it the same domain in both"
             )
     notes, held = [], []
     for letter, problem, space in zip("ab", (a, b), spaces, strict=True):
@@ -359,7 +359,7 @@ def _scales(sides: Sequence[Verdicts]) -> dict[str, float]:
     names = [name for name in first[0] if name in first[1]]
     if not names:
         raise ProblemError(
-            "the formulas of both problems read no signal of one name: "
+            "the formulas of both problems have no signal in common: "
             f"{', '.join(first[0])} in a; {', '.join(first[1])} in b"
         )
     scales = {}

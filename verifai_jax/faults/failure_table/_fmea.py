@@ -161,8 +161,8 @@ def _faults_of(problem: Problem) -> dict[str, Fault]:
         if weakest.get("duration") != 0 and weakest.get(fault.severity) != fault.off:
             at = ", ".join(f"{number} {value:zg}" for number, value in weakest.items())
             raise ValueError(
-                f"fault {name!r} cannot be off, at its weakest ({at}) neither: let it be short, "
-                "with duration=vj.Box(0, ...)"
+                f"fault {name!r} cannot be switched off, not even at its weakest ({at}): allow a "
+                "duration of 0, with duration=vj.Box(0, ...)"
             )
         known[name] = fault
     if not known:

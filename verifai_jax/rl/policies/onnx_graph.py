@@ -147,7 +147,8 @@ def run(nodes: Sequence[Node], values: Values) -> None:
 def _check_size(node: Node, count: int) -> None:
     if count > MAX_NUMBERS:
         raise PolicyError(
-            f"with {node} the graph computes {count:z.3g} numbers, and one of a policy may compute "
+            f"with {node} the graph computes {count:z.3g} numbers; the graph of a policy may "
+            "compute at most "
             f"{MAX_NUMBERS:,}"
         )
 

@@ -1,8 +1,8 @@
-"""One trace of one episode: a policy in the loop around any environment that steps.
+"""One trace of one episode: a policy in the loop with any environment.
 
     rollout(Episode(name, start, step, decide, memory, see, steps=200, dt=0.02), key)
 
-An episode that is over stays frozen where it ended: it is never reset within a trace.
+An episode that is over stays in its final state; it is never reset within a trace.
 """
 
 import inspect

@@ -366,10 +366,10 @@ def _as_study(
     p: float | None,
 ) -> Study:
     if isinstance(given, Study | Trainer) and algorithm is not None:
-        raise ValueError(f"a {type(given).__name__} has algorithms; give no other")
+        raise ValueError(f"a {type(given).__name__} has its own algorithms; leave out algorithm=")
     if isinstance(given, Study):
         if problem is not None:
-            raise ValueError("a Study has a problem; give no other")
+            raise ValueError("a Study has its own problem; leave out problem=")
         study = given
     elif problem is None:
         raise HardeningError(
