@@ -164,7 +164,8 @@ def _module(
             verb = word[:7]
             if verb in groups:
                 raise ValueError(
-                    f"{where} has {verb}_AND and {verb}_OR: take one, with a group in it"
+                    f"{where} has both {verb}_AND and {verb}_OR: use only one, and put a group "
+                    "into it"
                 )
             every = word.endswith("AND")
             groups[verb] = read_group(

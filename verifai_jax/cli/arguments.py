@@ -1,4 +1,4 @@
-"""Arguments and options that several commands share, and how their text is read."""
+"""Arguments and options shared by several commands, and the parsing of their texts."""
 
 import contextlib
 import json

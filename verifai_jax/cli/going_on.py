@@ -4,7 +4,7 @@
         found = estimate(problem)
         kept.stopped(found.stopped)
 
-The same command goes on from them, whatever ended it: the folder follows from its arguments.
+The same command continues from them, whatever ended it: its arguments determine the folder.
 """
 
 import contextlib

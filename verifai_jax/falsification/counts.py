@@ -21,7 +21,8 @@ class Counts:
     - `failing_alone`: violating rows that violate only this formula, if there are several.
     - `failed`: number of rows without a verdict by status, the most frequent first.
     - `verdicts`: number of violating rows by verdict of closer replays, the most frequent first.
-    - `repetitions`: how many violating rows of a host system gave the same result again.
+    - `repetitions`: number of violating rows of a host system whose repetition gave the same
+      result.
     - `worst`: number of the claimed row with the least robustness; None without one.
     - `nearest`: number of the row with the least robustness among all rows with a verdict.
     - `lowest`: the least robustness of all rows; NaN if no row has a verdict.

@@ -112,8 +112,8 @@ class Rounds:
     def compile(self, resumed: bool = False) -> None:
         """Compile the engine and the search, concurrently.
 
-        - `resumed`: whether the first round may be of any kind. A new run begins with gradients if
-          the first stage of the search wants those of clauses.
+        - `resumed`: whether the run is resumed, so that its first round may be of any kind. A new
+          run begins with gradients if the first stage of the search wants gradients of clauses.
         """
         cube = self.problem.space.cube
         while_compiling(import_tables, after=0.0)

@@ -67,7 +67,7 @@ class Output(NamedTuple):
 
 
 class Count(NamedTuple):
-    """A duration that leaves use: the plan of its formula, counted over `n` samples, `dt` apart."""
+    """A duration used by leaves: the plan of its formula, and `n` samples with period `dt`."""
 
     duration: Duration
     plan: "Plan"

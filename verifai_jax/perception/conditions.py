@@ -1,11 +1,11 @@
-"""Weather, lens and sensor: what happens between a scene and its image.
+"""Weather, lens and sensor: the effects between a scene and its image.
 
     Conditions(fog=0.02, brightness=0.7, blur=0.8)
     Conditions(rain=0.6, glare=0.5, glare_at=(0.7, 0.2), noise=0.02, dead=0.01, dirt=0.4)
 
-A field that is None costs nothing. Blur is a product with two band matrices, glare, rain and dirt
-are products of rows and columns: XLA fuses sums of shifted images with what makes the image, and
-computes it once for each shift.
+A field that is None costs nothing. Blur is a product with two band matrices; glare, rain and dirt
+are products of rows and columns. Sums of shifted images are avoided, because XLA would fuse them
+with the rendering and compute it once for each shift.
 """
 
 import jax

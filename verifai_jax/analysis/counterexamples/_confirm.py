@@ -4,7 +4,7 @@
     confirm(run).table                                  # all of them, a row each
     confirm(run, engines="all").transferable            # which fail in every engine
 
-`verifai_jax.evaluation.confirmer` says what is checked.
+`verifai_jax.evaluation.confirmer` describes the checks.
 """
 
 from collections.abc import Mapping

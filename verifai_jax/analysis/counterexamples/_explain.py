@@ -4,8 +4,8 @@
     print(why)                                          # a paragraph
     why.plot("why.png")                                 # the signal, and the features next to it
 
-Predicate and instant come from `mtl.explain` on the replayed trace. Features are judged by the
-robustness with each back at its nominal value, all others as they are, and by its gradient.
+Predicate and instant come from `mtl.explain` on the replayed trace. The influence of a feature is
+the robustness after resetting only this feature to nominal, and its gradient.
 """
 
 from collections.abc import Mapping
@@ -196,8 +196,8 @@ def slopes_of(
 ) -> tuple[Float[np.ndarray, " d"], Float[np.ndarray, " d"]]:
     """Return derivatives with respect to the features' real numbers, and the ranges of these.
 
-    Unit coordinates are probabilities, of which a hundredth changes a feature much in the tail of
-    its distribution and little in the middle, so their gradient is converted.
+    Unit coordinates are probabilities: a step of 0.01 changes a feature much in the tail of its
+    distribution and little in the middle, so their gradient is converted.
 
     **Arguments:**
     - `u`: the point at which the gradient was taken.

@@ -1,9 +1,9 @@
-"""The least departure from nominal that still fails: a counterexample made small.
+"""Shrinking of a counterexample to the smallest departure from nominal that still fails.
 
     small = shrink(run, 17, by="distance", budget=5000)
 
-First the count, then the distance, in batches and along gradients (MacIver and Donaldson, Test-case
-reduction via test-case generation, ECOOP 2020).
+It minimises first the number of departures, then the distance, in batches and along gradients
+(MacIver and Donaldson, Test-case reduction via test-case generation, ECOOP 2020).
 """
 
 import math

@@ -1,10 +1,10 @@
-"""Counterexamples kept as small readable files, so that none that was found ever comes back.
+"""Counterexamples as small readable files, for regression tests.
 
     run.save_counterexamples("counterexamples")         # a JSON file each, made for version control
     replay_counterexamples(problem, "counterexamples")  # all in one batch: failing, fixed, invalid
 
-A file holds the features of one simulation, the formulas, what it was worth, how it was found and
-how to see it again. Nothing in it is executed: the problem is given again to replay it.
+A file holds the features of one simulation, the formulas, the robustness, the search that found it
+and the data to replay it. Nothing in it is executed: a replay needs the problem.
 """
 
 import hashlib

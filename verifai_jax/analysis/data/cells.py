@@ -1,6 +1,6 @@
-"""Cells of the feature space, of one feature and of two, that have samples in them.
+"""Cells of one feature and of pairs of features, and the samples in them.
 
-Pairs of discrete values are those of t-wise coverage in combinatorial testing (Kuhn, Kacker and
+Coverage of pairs of discrete values is 2-wise coverage in combinatorial testing (Kuhn, Kacker and
 Lei, Introduction to combinatorial testing, 2013).
 """
 

@@ -67,9 +67,7 @@ class Maker(NamedTuple):
 
 
 class Change(NamedTuple):
-    """A file that is another one by now: its hash then, None for one that had no part in it, and
-    its hash now, None for one that is missing.
-    """
+    """A changed file: its hash then, None if it was not used, and now, None if it is missing."""
 
     name: str
     was: str | None

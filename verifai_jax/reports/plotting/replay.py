@@ -1,4 +1,4 @@
-"""One simulation: its signals, the bounds they must keep, and the instant that decided."""
+"""One simulation: its signals, their bounds, and the deciding instant."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace

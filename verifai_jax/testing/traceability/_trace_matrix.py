@@ -53,7 +53,7 @@ def trace_matrix(
       file of problems without such functions, as in pytest's `vj_specs`, tests all of them.
     - `runs`: folders of runs, and folders of such folders.
     - `reports`: files and folders of reports; those in the folders of the runs are always included.
-      Kinds of links that are None are not required.
+      A kind of link given as None is not required.
     **Returns:** the matrix.
     **Raises:** `TargetError` for a file that cannot be run; `ValueError` for a damaged record,
     claims of another form, and two problems of one name.

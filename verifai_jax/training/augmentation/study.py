@@ -1,4 +1,4 @@
-"""The work of an augmentation: seeds, their networks and what is kept of them.
+"""The work of an augmentation: seeds, their networks, and the stored results.
 
     study = Study(task, plan, cache, bar)
     study.run(0, ("none", "counterexamples"))               # one seed; what is finished is read

@@ -1,11 +1,11 @@
-"""Trainings by anybody's function, each call of it in a process of its own.
+"""Trainings by a user's function, with each call in a separate process.
 
 runs = FunctionRuns(study, cache, clock)
 runs.train([runs.add(values, seed=0)], rung=0)
 
-A process is fresh, and its global random numbers are seeded, so that a policy depends on the
-arguments of the call alone. A function with an argument `resume` gets a folder there: a copy of
-what it left at the checkpoint before, which stays until the call has ended and is stored.
+Each process is new and its global random numbers are seeded, so a policy depends only on the
+arguments of the call. A function with an argument `resume` gets a folder with a copy of the files
+that it left at the previous checkpoint; the original stays until the call has ended and is stored.
 """
 
 import json

@@ -1,4 +1,4 @@
-"""Hyper-parameters as plain Python values: at points of their space, and to check a domain.
+"""Hyper-parameters as plain Python values: conversion from points, and values for checks.
 
 values_at(space, points)                            # [{"learning_rate": 0.001, "width": 64}, ...]
 probe_values(space.domains["width"])                # [(16, "a choice"), (64, "a choice")]

@@ -5,8 +5,8 @@
     runs.train([number, ...], rung=0)                   # to the first checkpoint, or cached
     runs.checkpoint(number, 0).policy
 
-Runs of one structure share a program. As many as there are devices continue together from one
-checkpoint to the next, so that a run that has begun is soon finished and cached.
+Runs of one structure share a program. Only as many runs as there are devices train at a time, from
+one checkpoint to the next, so that started runs are soon finished and cached.
 """
 
 import time
