@@ -83,8 +83,7 @@ def diverse(
     Rows that equal a chosen one come last, with distance 0. Ties go to the first row in the table.
     The time grows with `n k`.
 
-    **Raises:** `ValueError` for a `k` below 1;
-    `IndexError` for a start that is not among the rows.
+    **Raises:** `ValueError` for a `k` below 1; `IndexError` for a start that is not among the rows.
     """
     samples = Samples.of(source, which, columns, space)
     k = min(check_count("k", k), len(samples))

@@ -234,8 +234,7 @@ def pca(
 
     **Arguments:**
     - `source`: a run, its table, a DataFrame with feature columns, or `Samples`.
-    - `columns`, `which`, `space`: as in `Samples.of`.
-      Unordered columns are left out.
+    - `columns`, `which`, `space`: as in `Samples.of`. Unordered columns are left out.
     - `components`: number of components; by default all in which the rows vary, the maximum.
     - `scale`: `"range"` scales features by their range in the space, `"raw"` does not scale (as
       VerifAI), `"standard"` gives the components of the correlation matrix, `"rows"` scales by the

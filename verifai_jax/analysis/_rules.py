@@ -381,7 +381,7 @@ def _supported(
 def _chance_of_more(
     inside: Bool[np.ndarray, " n"], beyond: Bool[np.ndarray, " n"], failing: Bool[np.ndarray, " n"]
 ) -> float:
-    """Return how probable so many failures inside are where they do not depend on the condition."""
+    """Return the probability of this number of failures inside if the condition had no effect."""
     from scipy.stats import hypergeom
 
     both = inside | beyond

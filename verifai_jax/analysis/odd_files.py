@@ -46,8 +46,8 @@ def read_odd(path: str | Path) -> OperationalDomain:
     module that must or must not hold. Values are converted to the unit of the feature.
 
     **Arguments:**
-    - `path`: the file. Without an entry `features` each attribute is a feature, with its last part
-      as name.
+    - `path`: the file. Without an entry `features` each attribute is a feature, named by the last
+      part of its name.
     **Raises:** `FileNotFoundError`; `ValueError` naming the entry, for any other file.
     """
     path = Path(path)

@@ -168,7 +168,7 @@ def _parsed(text: str, constants: tuple[str, ...], definitions: tuple[str, ...])
 
 
 def _signals(recordings: tuple[Path, ...], problem: str | None) -> Any:
-    """Return what the formula is asked about: recordings, a problem, or neither."""
+    """Return the source of signals: recordings, a problem, or neither."""
     if problem is not None:
         if recordings:
             raise click.UsageError("give either recordings or --problem, and not both")

@@ -273,7 +273,7 @@ def _robustness_of(cheap: Problem, precision: str, seed: int) -> answers.Cheap:
 
 
 def _differentiates(problem: Problem) -> bool:
-    """Return whether the searches take gradients: in few dimensions chains do without."""
+    """Return whether the searches use gradients, which chains do not need in few dimensions."""
     many = not problem.black_box and problem.space.levels.count(0) >= GRADIENTS_FROM
     return many and without_derivative(problem) is None
 
@@ -297,9 +297,9 @@ def _nothing_left(
 
 
 def _with_decided(found: Estimate, rest: "Rest", limit_state: LimitState, seed: int) -> Estimate:
-    """Return the estimate for the whole prior, where `found` is for the rest of a proof.
+    """Return the estimate for the whole prior from `found`, which covers the rest of a proof.
 
-    What is decided lies within the constraint; samples say how much of the rest does.
+    Decided boxes satisfy the constraint; samples show the share of the rest that does.
     """
     left, error = rest.mass, 0.0
     if rest.mass + rest.decided < 1 and rest.mass:

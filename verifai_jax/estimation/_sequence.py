@@ -29,11 +29,11 @@ from verifai_jax.statistics.binomial import exact_interval
 Handover = Mapping[str, str]
 """Features of a part, with the signals, or features, of the part before that they come from."""
 TRIES = 32
-"""Draws of a part's own features until its constraint accepts them together with a beginning."""
+"""Maximum draws of a part's own features until its constraint accepts them with a start."""
 CONFIRMED = 16
 """Failures of weighted rows that are simulated from where the part before has ended."""
 FAR = 0.1
-"""Part of a range from which the nearest row of a run is too far to stand for a beginning."""
+"""Distance, as a share of a range, beyond which the nearest row of a run is not used."""
 
 
 @suggests_options
@@ -125,7 +125,7 @@ class _Arrivals:
 
 
 class _Stage:
-    """A part, its number, and what the next one takes from its end."""
+    """A part, its number, and the values that the next part takes from its end."""
 
     def __init__(
         self,
@@ -180,7 +180,7 @@ class _Stage:
     def points(
         self, arrivals: _Arrivals | None, samples: int
     ) -> tuple[Float[np.ndarray, "n d"], Bool[np.ndarray, " n"]]:
-        """Draw points that begin where the part before ended, and say which are in the space."""
+        """Draw points that begin where the previous part ended, and flags of those in the space."""
         space = self.problem.space
         rng = np.random.default_rng([self.seed, self.number])
         count = samples if arrivals is None else len(arrivals.paths)
@@ -201,7 +201,7 @@ class _Stage:
     def weighted(
         self, arrivals: _Arrivals, confidence: float
     ) -> tuple[PartEstimate, list[dict[str, Any]], list[str]]:
-        """Weigh the rows of the run by how often the sequence begins near them."""
+        """Weight the rows of the run by the number of sequence samples that start near them."""
         from scipy.spatial import KDTree
 
         assert self.run is not None
@@ -277,7 +277,7 @@ class _Stage:
 def _estimate(
     name: str, failures: int, without: int, count: int, effective: float, confidence: float
 ) -> PartEstimate:
-    """Return a part with the interval of Clopper and Pearson, of so many effective samples."""
+    """Return a part with the interval of Clopper and Pearson for a number of effective samples."""
     known, share = count - without, effective / count
     low, high = exact_interval(
         share * failures, share * (failures + without), effective, confidence

@@ -20,15 +20,15 @@ from verifai_jax.estimation.exploration import Exploration
 from verifai_jax.estimation.mixture import Mixture
 
 ONE = 0.25
-"""Distance below which two least distant failures of different searches count as one."""
+"""Distance below which the least distant failures of two searches count as the same."""
 MAX_CENTRES = 16
 """Regions that get components of their own, at most."""
 CHAINS_WORTH = 1.5
-"""Independent failures that the states of one chain are worth."""
+"""Effective number of independent failures among the states of one chain."""
 FAR_WIDER = 3.0
-"""Factor on those of a component for what few chains have not seen of a region."""
+"""Factor on a component's deviations, to cover parts of a region that few chains missed."""
 MAX_DIRECTIONS = 8
-"""Directions that decide in a region, at most; with more of them it is bounded on all sides."""
+"""Maximum number of deciding directions; a region with more is bounded on all sides."""
 DIRECTION = 0.3
 """Part of the greatest singular value of the normals from which a direction counts."""
 MIN_WEIGHT = 0.02
@@ -109,7 +109,8 @@ class Anchors:
     def _around(self, number: int, samples: WeightedFailures | None = None) -> Around:
         """Fit components to a region's chains, and to samples where there are any.
 
-        In many dimensions a few chains know no correlations, but how each coordinate is spread.
+        In many dimensions a few chains cannot show correlations, only the spread of each
+        coordinate.
         """
         chains = self.regions[number]
         points = self.chains.points[np.isin(self.chains.chain_ids, chains)]
@@ -159,7 +160,7 @@ def join_explorations(explorations: Sequence[Exploration]) -> Exploration:
 def _regions(exploration: Exploration) -> list[Int[np.ndarray, " chains"]]:
     """Return the chains of each region, the least distant first.
 
-    Regions whose least distant failures are one are one.
+    Regions with the same least distant failure are merged.
     """
     norms = np.linalg.norm(exploration.nearest, axis=1)
     found: list[Int[np.ndarray, " chains"]] = []

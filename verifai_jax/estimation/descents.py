@@ -32,15 +32,15 @@ WHERE_RARE = 0.5
 """Share of the starts that lie no farther out than rare failures do, `FAR` from the middle: little
 of the space farther out leads to a small region among them."""
 FAR = 4.0
-"""Standard deviations from the middle of the prior at which failures are rare."""
+"""Distance of rare failures from the middle of the prior, in standard deviations."""
 DRAWN, DRAWN_WITH_SLOPES = 0.2, 0.33
 """Starts that are drawn together, in parts of the simulations; the most promising descend first."""
 MAX_DRAWN = 2048
 """Starts that are drawn together, at most, since all are compared with one another."""
 HITS = 0.02
-"""Starts that fail themselves and count as ends, at most, in parts of the simulations."""
+"""Maximum share of the simulations used for starts that fail themselves and count as ends."""
 MIN_AT_ONCE, MAX_AT_ONCE = 16, 128
-"""Descents that are side by side."""
+"""Minimum and maximum number of simultaneous descents."""
 STEPS, FURTHER_STEPS = 60, 12
 """Steps of a descent without gradients, at most, and of one that gradients have led nowhere."""
 NEWTON_STEPS, MISSES = 24, 4

@@ -196,7 +196,7 @@ def _without_proposal(
 
 
 def _promised_by(run: SplittingRun, limit_state: LimitState) -> float:
-    """Return the failures that splitting is worth, with as many more runs as what is left."""
+    """Return the effective failures of splitting with the remaining simulations."""
     more = limit_state.left / splitting_cost(run, run.first[0])
     return (1 + more) / max(UNDERSTATED * run.cv, 1e-6) ** 2
 

@@ -45,7 +45,7 @@ the more the draws decide."""
 ENDS = 12
 """Failures towards which the prior is moved, at most."""
 EVEN = 0.5
-"""Share of the proposal in which all moves are alike; the rest is what the failures say is best."""
+"""Share of the proposal with equal weights of all moves; the rest follows the failures."""
 
 
 def notice_own_chance(limit_state: LimitState, rng: np.random.Generator) -> None:

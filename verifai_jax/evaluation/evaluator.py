@@ -36,7 +36,7 @@ NOT_NATIVE = (
     "simulated without native code, which supports only systems that JAX traces, in single "
     "precision and in this process"
 )
-"""Note of a run for which native code was asked for in vain."""
+"""Note of a run for which requested native code was not possible."""
 
 
 class Evaluator:
@@ -215,7 +215,7 @@ class Evaluator:
         temperature: Float[np.ndarray, " n"] | float,
         simulate: Callable[[], Verdicts],
     ) -> Verdicts:
-        """Return the verdicts of work that goes on where an earlier process was killed."""
+        """Return the verdicts of work that continues after an earlier process was killed."""
         kept = self.part()
         if kept is None:
             return simulate()  # Traces are not stored.

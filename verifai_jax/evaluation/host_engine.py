@@ -334,7 +334,7 @@ def _without_verdict(status: Status, message: str) -> RowVerdict:
 
 
 def _trace(outcome: Outcome) -> tuple[Trace | None, RowVerdict]:
-    """Return the trace to evaluate; or none, and what its row says instead."""
+    """Return the trace to evaluate; or None, and the content of its row instead."""
     trace, status, message = outcome
     if not isinstance(trace, Trace) and (trace is not None or status == Status.OK):
         given = type(trace).__name__

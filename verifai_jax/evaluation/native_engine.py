@@ -96,7 +96,7 @@ class NativeEngine:
             self._program.begin()
 
     def compile(self) -> None:
-        """Compile now what the first rows need."""
+        """Compile the programs of the first rows now."""
         self._xla.compile()
 
     def evaluate(

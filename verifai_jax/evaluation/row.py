@@ -43,7 +43,7 @@ class Inputs(abc.ABC):
     row_form: PyTree
     """Shapes and types of one row, as `jax.ShapeDtypeStruct`s."""
     shared_form: PyTree = ()
-    """The same of what all rows share."""
+    """The same for values shared by all rows."""
     dim: int = 0
     """Coordinates by which the robustness may be differentiated."""
     keeps_features: bool = False
@@ -51,7 +51,7 @@ class Inputs(abc.ABC):
     streaming: bool = False
     """Whether the monitor may travel with the rollout, where the system allows it."""
     purpose: str = "the simulation"
-    """What is simulated, for people who wait until it is compiled."""
+    """Description of the simulation, shown while it compiles."""
 
     @abc.abstractmethod
     def coordinates(self, row: PyTree, shared: PyTree, precision: str) -> Float[Array, " dim"]:

@@ -152,7 +152,7 @@ def as_made(run: Run) -> Run:
 
 
 ANEW = "begin anew, from what it has found: vj.falsify(problem, warm_start=run)"
-"""How to go on with a run that cannot be resumed."""
+"""Advice for a run that cannot be resumed."""
 
 
 def _read_state(

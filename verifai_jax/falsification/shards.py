@@ -350,7 +350,7 @@ class _StoredRows:
 
 
 class _OtherPointsError(Exception):
-    """Stored rows are not at the points asked for."""
+    """Stored rows are not at the requested points."""
 
 
 def merge(

@@ -141,7 +141,7 @@ class PointMaps:
         Pure JAX for values of `unflatten`; also takes plain Python values, unchecked.
 
         **Arguments:**
-        - `features`: features by name; constant and fixed ones and events may be left out.
+        - `features`: features by name; constant and fixed features and events may be left out.
         **Returns:** the point, `[dim]`.
         """
         return self.root.to_unit(self.root.coerce(self.completed(features)))

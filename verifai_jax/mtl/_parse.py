@@ -239,7 +239,7 @@ class FormulaBuilder(ExpressionBuilder):
         )
 
     def _operator(self, tree: Tree, part: Part) -> tuple[str, str]:
-        """Return the operators in front of a part, with their intervals, and what they stand for.
+        """Return the operators before a part, with their intervals, and their operand.
 
         The grammar's own tree says where one ends: a text has blanks anywhere, or none.
         """

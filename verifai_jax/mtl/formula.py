@@ -27,7 +27,7 @@ from verifai_jax.mtl.tree import Term as Term
 from verifai_jax.mtl.words import COMPARISONS, OPERATORS, Text, operator_text
 
 Formulaic: TypeAlias = Union["Formula", Term]
-"""What stands for a formula: a formula, or an expression that is its own robustness."""
+"""A formula, or an expression that is its own robustness."""
 
 
 class Formula(Tree):

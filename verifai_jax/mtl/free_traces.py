@@ -39,7 +39,7 @@ BLEND = 0.02
 """Share of the sum of operands that do not decide. Five of `a > 0 & b > 0 & c > 0 & d > 0 & e > 0`
 were made true with it, and not without."""
 KEPT, GENERATIONS = 32, 12
-"""Traces that each generation of a search goes on from, and generations."""
+"""Number of traces kept in each generation of a search, and of generations."""
 MAX_SAMPLES = 20_000
 """Samples of a free trace at most: one of more has a clock much finer than its windows."""
 Signals = dict[str, Values]

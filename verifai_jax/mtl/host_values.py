@@ -262,7 +262,7 @@ def _span(interval: Interval, dt: float, stride: int) -> tuple[int, float]:
 
 
 def _in_order(e: Term) -> tuple[Term, ...]:
-    """Return an expression and what is below it, children first; it remembers them."""
+    """Return an expression and all expressions below it, children first; cached."""
     if "_order" not in e.__dict__:
         object.__setattr__(e, "_order", tuple(postorder(e)))
     return e.__dict__["_order"]

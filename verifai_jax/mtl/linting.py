@@ -96,7 +96,7 @@ class _Linter:
         return self.requirement.formalized
 
     def findings(self) -> list[Finding]:
-        """Return what all checks find, one finding for each kind and part."""
+        """Return the findings of all checks, one for each kind and part."""
         found = [*self._signals(), *self._judged(), *self._dimensions()]
         dt = self.recordings[0].values.dt if self.recordings else 0.0
         spans = self.formula.asked(dt).items()

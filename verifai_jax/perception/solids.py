@@ -291,10 +291,9 @@ def _between_ends(
 ) -> Float[Array, "n height width"]:
     """Return the share of each pixel in the part of the outline between both ends.
 
-    A plane tangent to the mantle at the angle phi contains the eye where
-    `towards . (cos phi, sin phi) = across`. Two such planes and the chords between their points of
-    contact bound the part. With a `sun`, the same for planes parallel to its rays, and for the
-    ground: the shadow.
+    A plane tangent to the mantle at the angle phi contains the eye where `towards . (cos phi, sin
+    phi) = across`. Two such planes and the chords between their points of contact bound the part.
+    With a `sun`, the same for planes parallel to its rays, and for the ground: the shadow.
     """
     norm = jnp.sqrt(dot(towards, towards) + TINY)
     cosine = across / norm

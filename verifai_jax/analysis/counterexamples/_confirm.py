@@ -23,7 +23,7 @@ from verifai_jax.evaluation.confirmer import Confirmer
 from verifai_jax.falsification.run import Run
 
 BLOCK = 128
-"""Rows of a run that are checked at once; what is finished survives Ctrl-C."""
+"""Number of rows that are checked at once; finished blocks survive Ctrl-C."""
 
 
 @overload

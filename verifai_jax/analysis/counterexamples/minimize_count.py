@@ -23,7 +23,7 @@ Results = Float[np.ndarray, "m d"]
 LEVELS = 5
 """Values of one feature alone that growth begins with."""
 BEAM = 6
-"""Sets of features that growth goes on with."""
+"""Number of sets of features with which growth continues."""
 
 
 def revert_features(candidates: Candidates, u: Point) -> Point:

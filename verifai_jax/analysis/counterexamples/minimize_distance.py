@@ -152,8 +152,8 @@ def boundary_steps(
 ) -> Departures:
     """Return departures at the nearest points of the linearised boundary, and on the way there.
 
-    - `costs`: the cost of a minimal departure of a coordinate, over its whole range; 0 for none.
-      Without such a cost a linear model would lead to an end of the range.
+    - `costs`: a small cost of a departure of each coordinate over its whole range, or 0. Without it
+      a linear model would lead to an end of the range.
     """
     nominal = candidates.nominal
     ends = np.zeros((2, len(track.u)))

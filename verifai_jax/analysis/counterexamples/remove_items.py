@@ -18,7 +18,7 @@ from verifai_jax.analysis.counterexamples.candidates import Candidates
 from verifai_jax.core.compute.compilation import power_of_two
 
 EXHAUSTIVE = 8
-"""Items of which all subsets are tried."""
+"""Maximum number of items for which all subsets are tried."""
 
 
 def remove_items(candidates: Candidates, u: Float[np.ndarray, " d"]) -> Float[np.ndarray, " d"]:

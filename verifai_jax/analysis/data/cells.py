@@ -15,7 +15,7 @@ from verifai_jax.analysis.data.marginals import Marginal
 from verifai_jax.analysis.data.samples import Samples
 
 MAX_VALUES = 20
-"""Values up to which each one of a discrete feature is a cell of its own."""
+"""Maximum number of values of a discrete feature that each get a cell."""
 MAX_FEATURES = 60
 """Features up to which all of their pairs are counted."""
 MAX_UNTRIED = 1000

@@ -80,9 +80,8 @@ class Samples:
         - `space`: the feature space, which determines the ordered columns and their ranges; a run
           has its own.
         **Raises:** `TypeError` for another source; `ValueError` for another `which`, rows of a run
-        that have changed since they were written, no rows,
-        row numbers that are not unique integers, unknown columns (with the nearest names), or
-        columns named twice.
+        that have changed since they were written, no rows, row numbers that are not unique
+        integers, unknown columns (with the nearest names), or columns named twice.
         """
         if isinstance(source, Samples):
             if columns is None:

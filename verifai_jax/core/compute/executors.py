@@ -28,7 +28,7 @@ T = TypeVar("T")
 USUAL_WORKERS = 8
 """Workers of an executor that does not say how many it has."""
 KEPT = 8
-"""Objects that a worker keeps, with what is compiled for them; the one unused for longest goes."""
+"""Number of objects that a worker keeps with their programs; the least recently used is dropped."""
 SECONDS = 1.0
 """Seconds of work that a call takes, about, unless the executor says `seconds_per_block`."""
 LOOK = 0.02

@@ -208,7 +208,7 @@ class _Reader:
 
 
 def _check_rule(rule: Any) -> None:
-    """Refuse a batching rule of somebody else's: it may compute something else than the function.
+    """Refuse a foreign batching rule, which may compute something else than the function.
 
     Those of JAX and of this package compute the same for each lane.
     """

@@ -34,7 +34,7 @@ R = TypeVar("R")
 EVERY = 60.0
 """Seconds between two lines where nothing is drawn."""
 MOMENT = 2.0
-"""Seconds after which work is worth going on with: what takes less is as soon done anew."""
+"""Minimum seconds of work that is worth resuming; shorter work is simply repeated."""
 _ongoing: ContextVar["ProgressBar | None"] = ContextVar("ongoing", default=None)
 """The bar of the verb that was called; the others within it show themselves there."""
 
@@ -132,7 +132,7 @@ class ProgressBar:
         from rich.text import Text
 
         class Figures(TextColumn):
-            """The figures of a stage, or what is being compiled and for how long so far."""
+            """The figures of a stage, or the present compilation and its duration."""
 
             def render(self, task: "Task") -> "Text":
                 task.fields["shown"] = _compiling() or task.fields["figures"]

@@ -25,7 +25,7 @@ from verifai_jax.core.user_code.targets import Kind, TargetError, load_target
 
 _AT = re.compile(r"(?P<target>.+?\.py(?::[^@]*)?)@(?P<revision>.+)", re.DOTALL)
 _OWN = "verifai_jax"
-"""This package stays what it is, in its own repository too."""
+"""Files of this package do not count, not even in its own repository."""
 
 
 def split_revision(target: str) -> tuple[str, str | None]:

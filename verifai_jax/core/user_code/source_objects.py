@@ -28,7 +28,7 @@ MAX_ENTRIES = 200
 _OPAQUE = ("numpy", "jax", "jaxlib", "mujoco", "pandas", "scipy", "torch", "builtins")
 """Packages whose objects hold no functions of a user."""
 _COMPILED = ("programs", "_problems")
-"""Attributes that hold what was made of an object, not what it is made of."""
+"""Attributes with values derived from an object, which are not its parts."""
 _PLAIN = (bool, int, float, complex, str, bytes, type(None))
 
 
@@ -152,7 +152,7 @@ def _part_of_class(kind: type) -> Module | str | None:
 
 
 def _around(function: FunctionType, deep: bool) -> list[object]:
-    """Return what a function takes from around it, from global names only where `deep`."""
+    """Return the values that a function uses from its surroundings, global ones only if `deep`."""
     around: list[object] = [function.__defaults__ or (), function.__kwdefaults__ or {}]
     around += _closure(function).values()
     if (wrapped := getattr(function, "__wrapped__", None)) is not None:

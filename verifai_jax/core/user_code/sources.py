@@ -211,7 +211,7 @@ class Sources:
 
 
 def _same_name(name: str, others: Mapping[str, Source]) -> str | None:
-    """Return the one of some names that stands for the same file, seen from another folder."""
+    """Return the name, among some, of the same file as seen from another folder."""
     if name in others:
         return name
     found = [other for other in others if name.endswith(f"/{other}") or other.endswith(f"/{name}")]

@@ -38,11 +38,11 @@ from verifai_jax.search import Search
 from verifai_jax.statistics.confidence_sequences import simultaneous_interval, verdict
 
 LANES = 64
-"""Samples of a policy in one block."""
+"""Number of samples of a policy in one block."""
 SETTLED = 3.0
 """Over `tie`: about as many samples as name a leader that never fails."""
 MAX_KEPT = 1000
-"""Counterexamples of a policy that are kept, the worst ones."""
+"""Maximum number of counterexamples kept for a policy, the worst ones."""
 ROWS = 256
 """Rows whose features are computed at a time, so that one shape compiles."""
 ProgressReport = Callable[[int, int, str], None]
@@ -172,7 +172,7 @@ def certify(
 
 
 def _chance(problem: Problem, rows: Sequence[Certificate]) -> list[str]:
-    """Return what there is to say of counterexamples of a system that draws."""
+    """Return a note on counterexamples of a system that draws random numbers."""
     if not any(row.counterexamples for row in rows) or not depends_on_key(problem):
         return []
     return [
@@ -188,7 +188,7 @@ def _sample(
     margins: np.ndarray,
     report: "_Report",
 ) -> str:
-    """Simulate what the allocation asks for until it asks for nothing; says why it ended."""
+    """Simulate the blocks of the allocation until it is done; return the reason for ending."""
     while True:
         failures, simulations = _counts(sampled)
         wanted = allocation.next(failures, simulations, margins)

@@ -302,7 +302,7 @@ class Blocks:
 
 
 def _shipment(problem_of: Callable[[Any], Problem], executor: Executor) -> Shipment[Any]:
-    """Return what is sent of `problem_of`, once, so that workers keep its programs."""
+    """Return the shipment of `problem_of`, made once, so that workers keep its programs."""
     try:
         return _known_shipment(problem_of, executor)
     except TypeError:  # One of them cannot be hashed.

@@ -153,7 +153,7 @@ def _names(problems: Sequence[Problem]) -> tuple[str, str]:
 
 
 def _common(a: Problem, b: Problem) -> tuple[tuple[Problem, Problem], list[str]]:
-    """Return the problems with their common features alone, and what is to be said.
+    """Return the problems with only their common features, and notes on the others.
 
     **Raises:** `ProblemError` without a common feature, and where domains differ.
     """
@@ -186,7 +186,7 @@ def _common(a: Problem, b: Problem) -> tuple[tuple[Problem, Problem], list[str]]
 
 
 def _other_constants(a: Problem, b: Problem) -> list[str]:
-    """Say in which constants the models of two systems differ, where they can be compared."""
+    """Describe the constants in which the models of two systems differ, if comparable."""
     one, other = (problem.system.constants for problem in (a, b))
     said = []
     for name in one:
@@ -201,7 +201,7 @@ def _other_constants(a: Problem, b: Problem) -> list[str]:
 
 
 class _Pairs:
-    """Pairs of simulations, and what is known of them so far."""
+    """Pairs of simulations, and their results so far."""
 
     def __init__(
         self,
@@ -272,7 +272,7 @@ class _Pairs:
         return np.asarray(u + moves * (np.asarray(self.space.levels) == 0), np.float32)
 
     def _parting(self, a: Trace, b: Trace, again: Sequence[Trace | None]) -> dict[str, Any]:
-        """Return how far two traces part, when, and in which signal."""
+        """Return the largest gap of two traces, its time, and its signal."""
         times, gaps = _gaps(a, b, self._scales)
         grown = np.zeros(len(times))
         for trace, other in zip((a, b), again, strict=True):

@@ -168,8 +168,7 @@ class Transfer(Drawn, Reported, InNotebook):
       `differs`, whether they ever do; `searched`, whether the search chose the pair; `proper`,
       whether both simulations ended.
     - `space`: the space of the common features.
-    - `influence`: each coordinate's share of the gap's variance among samples,
-      from 0 to 1.
+    - `influence`: each coordinate's share of the gap's variance among samples, from 0 to 1.
     - `worst`: the row with the largest gap, with both traces; None if no pair differs.
     - `tolerance`, `seed`: as given to `transfer`.
     - `stopped`: `"budget"` or `"interrupted"`.
@@ -239,7 +238,7 @@ class Transfer(Drawn, Reported, InNotebook):
         return "\n".join(lines + [f"  note: {note}" for note in self.notes])
 
     def _differences(self, sampled: "pd.DataFrame", found: "pd.DataFrame") -> list[str]:
-        """Return what is to be said of pairs that part."""
+        """Return sentences on pairs that differ."""
         lines, flips = [], self.flips
         for rows, kind in ((sampled, "sampled"), (found, "searched")):
             if not len(rows):

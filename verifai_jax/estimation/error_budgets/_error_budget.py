@@ -339,7 +339,7 @@ class _Work:
         return ErrorPart("seeds", min(apart), max(apart), text, False)
 
     def randomness(self) -> ErrorPart:
-        """Return what the model's own random numbers contribute."""
+        """Return the contribution of the model's own random numbers."""
         if not depends_on_key(self.sides[0]):
             return ErrorPart("randomness", 0.0, 0.0, "The model draws no random numbers.", False)
         own, again = self.own[0], self._judge(self.sides[0], self.precision, self.seed + 1)

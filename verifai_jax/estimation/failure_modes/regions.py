@@ -101,9 +101,8 @@ class Regions:
     ) -> tuple[Float[np.ndarray, "n k"], Int[np.ndarray, "n k"]]:
         """Return the distance of each point from each region, and the row of the nearest point.
 
-        These are logarithms of normal densities around the points, up to sign and factor.
-        Where `z` are the points of the regions, `itself` says whether a point counts as its own
-        neighbour.
+        These are logarithms of normal densities around the points, up to sign and factor. Where `z`
+        are the points of the regions, `itself` says whether a point counts as its own neighbour.
         """
         distances = np.full((len(z), self.count), np.inf)
         rows = np.zeros((len(z), self.count), int)

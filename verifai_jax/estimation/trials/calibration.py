@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 POSTERIOR = 1000
 """Samples of the posterior that are returned."""
 TAIL = 1e-3
-"""Posterior probability of what the second stage leaves out, at each end of each feature."""
+"""Posterior probability outside the second stage's range, at each end of each feature."""
 TRUSTED = 9.0
 """Trials that the prior takes for explained, for one that nothing explains."""
 DRAWN = 50

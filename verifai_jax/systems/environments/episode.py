@@ -342,7 +342,7 @@ def step_count(
 
 
 def sampling_period(seconds: object) -> float:
-    """Check a sampling period; one that was float32 becomes the intended decimal number."""
+    """Check a sampling period; a float32 number becomes the decimal number that was meant."""
     value: Any = seconds
     number = isinstance(seconds, int | float | np.number) and not isinstance(seconds, bool)
     if isinstance(seconds, jax.Array | np.ndarray) and np.shape(seconds) == ():

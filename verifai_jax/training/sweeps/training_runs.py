@@ -68,7 +68,7 @@ class TrainingRun:
     - `key`: hash of the hyper-parameters that the algorithm uses; part of the names in the cache.
     - `checkpoints`: environment steps of its rows.
     - `configuration`: task and algorithm with these values; None if they cannot be trained.
-    - `error`: the reason why not, in one line.
+    - `error`: the reason why they cannot be trained, in one line.
     """
 
     values: Mapping[str, object]
