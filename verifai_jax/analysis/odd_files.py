@@ -99,7 +99,7 @@ def _domain(
 ) -> OperationalDomain:
     found = list(_attributes((), tree.get("TAXONOMY") or {}, where))
     if not found:
-        raise ValueError(f"{where} has no attribute: TAXONOMY names them")
+        raise ValueError(f"{where} has no attribute; define one under TAXONOMY")
     resolve = _resolver(found)
     if said:
         mapped = {}

@@ -9,10 +9,9 @@
 It steps through a `Plan` of `streams` in JAX; `watch` does the same on the host.
 
 Source: the interval is from J. Deshmukh et al., "Robust online monitoring of signal temporal
-logic", RV 2015: unknown predicates range from -inf to +inf.
+logic", RV 2015; unknown predicates range from -inf to inf.
 
-The step here, `advance`, reads whole windows, which is fast for batches; the step of `watch`
-updates them.
+The step, `advance`, reads whole windows, fast for batches; the step of `watch` updates them.
 """
 
 import functools

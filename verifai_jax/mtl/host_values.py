@@ -4,9 +4,8 @@
     values(formula)                 # [time], the robustness at every sample
     values.truth(formula)           # [time], +1 where it holds, -1 where not, NaN where unknown
 
-For many formulas on few recordings, as in mining and mutation, since JAX would compile each
-formula. Values equal those of `Evaluator` (tests compare them). Arrays are time-major, `[time,
-*lanes]`.
+For many formulas on few recordings, as in mining: JAX would compile each formula. Values equal
+those of `Evaluator` (tests compare them). Arrays are time-major, `[time, *lanes]`.
 """
 
 import functools

@@ -140,7 +140,7 @@ class ProcessMemory(NamedTuple):
         )
 
     def refitted(self, cube: Cube, initial: int, steps: int) -> "ProcessMemory":
-        """Refit the hyper-parameters from the last ones, if there are a quarter more rows."""
+        """Refit the hyper-parameters, starting from the last ones, if there are 25 % more rows."""
 
         def fit() -> Hyper:
             some = rows_to_keep(self.score, self.luck, min(FIT_POINTS, len(self.score)))

@@ -101,10 +101,7 @@ def repair(
     whole: Any = problem.problem if isinstance(problem, Run) else problem
     if whole is None:
         assert run is not None
-        raise ValueError(
-            f"the run of {run.name!r} was loaded without its problem; give it: vj.load(path, "
-            "problem)"
-        )
+        raise ValueError(f"the run of {run.name!r} has no problem: use vj.load(path, problem)")
     check_options(budget, batch, seed, max_seconds, None)
     arguments.check_numbers(margin, rounds=rounds, held_out=held_out)
     check_names("aim", [aim], arguments.AIMS)

@@ -33,7 +33,7 @@ _MADE = re.compile(r"\b([uvimw])\d+\b")
 
 
 class Piece:
-    """Code without branches: lines that run before, once for each vector, and after."""
+    """Code without branches: lines before the loop over vectors, in it, and after it."""
 
     def __init__(self) -> None:
         self.together: list[str] = []

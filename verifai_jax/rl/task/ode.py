@@ -196,9 +196,7 @@ def _check_weights(weights: Mapping[str, float]) -> None:
         if not name.isidentifier() or keyword.iskeyword(name) or hasattr(OdeTask, name):
             raise ValueError(f"a weight's name must be an identifier of its own; got {name!r}")
         if name in taken:
-            raise ValueError(
-                f"{name!r} cannot be the name of a weight; reserved names are {', '.join(taken)}"
-            )
+            raise ValueError(f"{name!r} cannot be a weight; reserved: {', '.join(taken)}")
         if not is_number(value) or not math.isfinite(value):
             raise ValueError(f"weight {name} must be a finite number; got {value!r}")
 
