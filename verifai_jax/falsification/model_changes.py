@@ -25,7 +25,7 @@ EXACT = 1e-6
 """The same for a black box, which runs the same code; its numbers are stored as float32."""
 NEAR = 1e-3
 """The same for a replay in another precision; above it, the run's own precision is tried."""
-EVEN = "even_if_changed=True (--even-if-changed) continues regardless, and records it in the record"
+EVEN = "even_if_changed=True (--even-if-changed) continues regardless, and notes it in the record"
 """Advice on continuing with another model."""
 
 
