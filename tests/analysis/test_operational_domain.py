@@ -244,7 +244,7 @@ conversion: {length: {fathom: {m: {scale: 1.8288}}}}
         ("      gap:", "      gape:", "unknown attribute or module of module town of .* 'gape'"),
         ("TITLE", "TITEL", "unknown entry of module town of .* 'TITEL'.*TITLE"),
         ("rain: [none", "rain: !!python/name:os.system [none", "is not YAML"),
-        ("ego_speed: float velocity", "ego_speed:", "ego_speed is a list of literals, or"),
+        ("ego_speed: float velocity", "ego_speed:", "ego_speed must be a list of literals, or"),
         ("ego_speed: float velocity", "ego_speed: date", "kind date has no values to compare"),
         ('lanes: ">= 3"', "town: true", "in a circle: town -> town"),
     ],

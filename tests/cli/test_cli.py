@@ -194,7 +194,7 @@ def test_a_run_folder_does_not_choose_what_code_runs(call, tmp_path):
     ):  # fmt: skip
         (tmp_path / "r" / "run.json").write_text(json.dumps(sealed(record | {"target": target})))
         result = CliRunner().invoke(main, ["replay", "r", "0"])
-        assert "does not say which problem of this project" in result.output, target
+        assert "does not record to which problem of this project" in result.output, target
         assert result.exit_code == 2
         assert "ran" not in result.output.split()
     # A pack of folders from elsewhere: the code of one is not for the other.
@@ -203,7 +203,7 @@ def test_a_run_folder_does_not_choose_what_code_runs(call, tmp_path):
     shutil.copytree(tmp_path / "r", tmp_path / "pack" / "one")
     evil_target = json.dumps(sealed(record | {"target": "pack/two/evil.py:ramp"}))
     (tmp_path / "pack" / "one" / "run.json").write_text(evil_target)
-    assert "does not say which" in call("replay", "pack/one", 0, code=2)
+    assert "does not record to which" in call("replay", "pack/one", 0, code=2)
     output = call("replay", "r", 0, "--problem", "specs/ramp.py:ramp", "--no-pictures")
     assert "robustness" in output
 

@@ -181,7 +181,7 @@ def test_a_folder_from_elsewhere_names_no_code(call, tmp_path):
     note = json.dumps(cache.note("command")).replace("specs/", "kept/specs/")
     cache.note("command", json.loads(note))
     output = call("--resume", "kept", code=2)
-    assert "kept does not say which study of this project it is of" in output
+    assert "kept does not record to which study of this project it belongs" in output
 
 
 def test_studies_are_found_as_problems_are(call):

@@ -112,7 +112,7 @@ def test_a_run_that_has_no_room_leaves_the_one_that_was_there(runs, tmp_path):
     small, big = runs
     small.save(tmp_path / "run")
     before = files_of(tmp_path)
-    message = r"run cannot be written \(.*The results are in memory all the same"
+    message = r"run cannot be written \(.*The results are still in memory"
     with full(20_000), pytest.raises(OSError, match=message):
         big.save(tmp_path / "run")
     assert files_of(tmp_path) == before

@@ -227,7 +227,9 @@ def test_a_worker_keeps_what_it_was_sent_and_loads_what_it_was_told_the_name_of(
     assert once.thing is not wide
     assert once.thing.name == "wide"
     other = Shipment(wide, f"{file}:low", identity)
-    with pytest.raises(ValueError, match="on the worker is not the one here: its name is low"):
+    with pytest.raises(
+        ValueError, match="on the worker differs from the one here: its name is low"
+    ):
         pickle.loads(pickle.dumps(other))
     sent = pickle.loads(pickle.dumps(ship(LINE, object())))
     assert sent.thing.name == LINE.name

@@ -245,7 +245,7 @@ def test_a_run_is_not_written_over_what_somebody_has_added(problem, whole, folde
     folder = shutil.copytree(folders / "short", tmp_path / "run")
     run = vj.load(folder, problem)
     vj.resume(folder, problem, budget=160)
-    told = "somebody has gone on with the run in .*run: it has 160 simulations by now, this one 96"
+    told = "the run in .*run has been continued: it has 160 simulations now, this one 96"
     with pytest.raises(ValueError, match=f"{told}; load it, .* or save this one elsewhere"):
         vj.resume(run, budget=128)
     with pytest.raises(ValueError, match=told):
@@ -255,7 +255,7 @@ def test_a_run_is_not_written_over_what_somebody_has_added(problem, whole, folde
     assert vj.resume(run.save(tmp_path / "copy"), problem, budget=160).table.all.equals(whole)
     shutil.rmtree(folder)
     shutil.copytree(folders / "other", folder)
-    with pytest.raises(ValueError, match=r"holds another run by now, of 'ramp'; load it"):
+    with pytest.raises(ValueError, match=r"now holds another run, of 'ramp'; load it"):
         vj.resume(run, budget=128)
     shutil.rmtree(folder)
     assert vj.resume(run, budget=160).table.all.equals(whole)

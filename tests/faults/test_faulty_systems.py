@@ -218,5 +218,5 @@ def test_what_has_no_loop_says_so():
     with pytest.raises(ValueError, match="this system has no controller"):
         problem.with_faults(faults.Dropout("x"))
     black = vj.Problem("b", {"x0": vj.Box(0, 1)}, vj.blackbox(lambda f: None), "always x >= 0")
-    with pytest.raises(ValueError, match="has no loop of which observations and actions are known"):
+    with pytest.raises(ValueError, match="has no loop with known observations and actions"):
         black.with_faults(faults.Dropout("x"))

@@ -246,7 +246,7 @@ def test_several_files_are_one_trace_on_one_calendar(tmp_path):
     (tmp_path / "again.csv").write_text("time,gyro\n0,1\n")
     with pytest.raises(ValueError, match="the files has more than one column 'gyro'"):
         read([tmp_path / "imu.csv", tmp_path / "again.csv"])
-    with pytest.raises(ValueError, match="has 2 clocks, for which one period dt cannot do"):
+    with pytest.raises(ValueError, match="has 2 clocks, so one period dt is not enough"):
         read([tmp_path / "imu.csv", tmp_path / "gps.csv"], dt=0.1)
 
 

@@ -119,7 +119,7 @@ def test_a_formula_is_written_so_that_it_is_read_again(formula, text):
         ("a <-> b <-> c", "a chain of '<->' is ambiguous"),
         (
             "always a and b",
-            "how far 'always' reaches is ambiguous: write always (a and b) or (always a) and b",
+            "the scope of 'always' is ambiguous: write always (a and b) or (always a) and b",
         ),
         ("always x > 1 -> b", "write always (x > 1 -> b) or (always x > 1) -> b"),
         (

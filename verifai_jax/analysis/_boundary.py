@@ -5,10 +5,10 @@ found.probability({"speed": 17.0, "grip": 5.5})     # 0.93
 found.sampled({"speed": 17.0, "grip": 5.5})         # True: rows lie that close
 found.next_points(8)                                # where a simulation would say most
 
-Four learners see the rows: polynomials of the robustness and of the odds, boosted trees, a Gaussian
-process. Each is asked about rows that it has not seen, and a logistic curve of all answers gives
-the probability (Wolpert, Stacked generalization, Neural Networks 5, 1992). How good that is, the
-Brier score on such rows says (Brier, Monthly Weather Review 78, 1950).
+Four models are trained: polynomials of the robustness and of the odds, boosted trees, a Gaussian
+process. A logistic regression on their predictions for held-out rows gives the probability
+(Wolpert, Stacked generalization, Neural Networks 5, 1992). The Brier score on held-out rows
+measures its quality (Brier, Monthly Weather Review 78, 1950).
 """
 
 import warnings
@@ -55,7 +55,7 @@ class Boundary(InNotebook):
     - `brier`: mean squared difference of predicted probability and verdict, on held-out rows.
     - `base`: the same for a constant prediction, the share of failures.
     - `calibration`: for each tenth of the predicted probability, the failed rows and all rows.
-    - `reach`: distance up to which a row tells something about a point (`Samples.points`).
+    - `reach`: maximum distance at which a row is informative about a point (`Samples.points`).
     - `share`: mean probability over the prior; neither a bound nor an estimate with an interval.
     - `unsampled`: share of the prior beyond the reach of all rows. Both are NaN without a space.
     - `samples`: the rows.
@@ -84,7 +84,7 @@ class Boundary(InNotebook):
         return said if isinstance(points, pd.DataFrame) else float(said[0])
 
     def sampled(self, points: Points) -> bool | Bool[np.ndarray, " n"]:
-        """Return whether a row lies within reach of each point; about others nothing is known."""
+        """Return whether a row lies within reach of each point; without one nothing is known."""
         near = self._near(_frame(points, self.samples))
         return near if isinstance(points, pd.DataFrame) else bool(near[0])
 

@@ -1,4 +1,4 @@
-"""Coverage of the feature space: how even samples are, where holes are, what is untried.
+"""Coverage of the feature space: evenness of the samples, holes, and untried values.
 
 found = coverage(run)
 found.hole                  features in the middle of the largest hole

@@ -1,4 +1,4 @@
-"""A diverse subset: some rows that stand for all, each as far as can be from those before.
+"""A diverse subset: rows that represent all others, each as far as possible from earlier ones.
 
     found = diverse(run, 10)
     found.table                    the rows, the worst first, and how far each was from those before
@@ -83,8 +83,7 @@ def diverse(
     Rows that equal a chosen one come last, with distance 0. Ties go to the first row in the table.
     The time grows with `n k`.
 
-    **Raises:** `ValueError` for a `k` below 1;
-    `IndexError` for a start that is not among the rows.
+    **Raises:** `ValueError` for a `k` below 1; `IndexError` for a start that is not among the rows.
     """
     samples = Samples.of(source, which, columns, space)
     k = min(check_count("k", k), len(samples))

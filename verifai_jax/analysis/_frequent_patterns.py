@@ -1,13 +1,13 @@
-"""Frequent patterns: values, and combinations of them, that counterexamples have in common.
+"""Frequent patterns: values and combinations of values common among counterexamples.
 
     found = frequent_patterns(run)
     found.table                        combinations: how many, which share, how often they fail
     found.top                          the most frequent value of each feature
     found.rows(0)                      the row numbers that the first combination covers
 
-A combination is as frequent as its rarest part at most, so that rare parts need not be extended:
-Agrawal and Srikant, Fast algorithms for mining association rules, VLDB 1994; depth first over sets
-of rows: Zaki, Scalable algorithms for association mining, IEEE TKDE 12(3), 2000.
+A combination is at most as frequent as its rarest part, so rare parts need not be extended: Agrawal
+and Srikant, Fast algorithms for mining association rules, VLDB 1994; depth first over sets of rows:
+Zaki, Scalable algorithms for association mining, IEEE TKDE 12(3), 2000.
 """
 
 from collections.abc import Sequence
@@ -71,8 +71,8 @@ class FrequentPatterns(Drawn, InNotebook):
 
         `count` and `share` of the selected rows; `expected`: the share of the combination in the
         prior, or among all rows with a verdict; `lift`: share divided by expected. For
-        counterexamples the lift is how many times as often simulations with these values fail as an
-        average one. NaN without a reference.
+        counterexamples the lift is the failure rate of simulations with these values divided by the
+        average failure rate. NaN without a reference.
         """
         share = self.counts / len(self.samples)
         lift = np.divide(
@@ -183,8 +183,8 @@ def frequent_patterns(
     - `minimum`: minimum share of the rows that have a combination.
     - `bins`: if given, ordered columns are included, cut into this many equally wide cells of their
       range; whole numbers with fewer values are used directly.
-    - `against`: the reference for a share: that among all rows with a verdict (`"table"`), or the
-      prior probability (`"prior"`). By default the table if it has rows with the other verdict,
+    - `against`: the reference for a share: the share among all rows with a verdict (`"table"`), or
+      the prior probability (`"prior"`). By default the table if it has rows with the other verdict,
       else the prior if it is known. After a search that learns both depend on where it searched.
 
     An absent item of an array has no value.

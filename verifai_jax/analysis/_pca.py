@@ -57,10 +57,10 @@ class Components(Drawn, InNotebook):
     **Fields:** `pivot` `[k]`: mean of the rows, in units of the features; `directions` `[m, k]`:
     orthonormal in the scaled coordinates, with the largest entry of each positive; `deviations`
     `[m]`: standard deviation along each, in the scaled coordinates; `shares` `[m]` of the total
-    variance; `offset` and `width` `[k]` of the scaling; `telling`: how many of the first five
-    components explain more variance than chance. A component does if it exceeds the first component
-    of independent features with the same deviations, after the earlier components were removed
-    (Horn's parallel analysis, Psychometrika 30, 1965, at 99 %).
+    variance; `offset` and `width` `[k]` of the scaling; `telling`: number of the first five
+    components that explain more variance than chance: a component does if it exceeds the first
+    component of independent features with the same deviations, after the earlier components were
+    removed (Horn's parallel analysis, Psychometrika 30, 1965, at 99 %).
 
     Only directions in which the rows vary are included: none if all rows are equal.
     """
@@ -234,8 +234,7 @@ def pca(
 
     **Arguments:**
     - `source`: a run, its table, a DataFrame with feature columns, or `Samples`.
-    - `columns`, `which`, `space`: as in `Samples.of`.
-      Unordered columns are left out.
+    - `columns`, `which`, `space`: as in `Samples.of`. Unordered columns are left out.
     - `components`: number of components; by default all in which the rows vary, the maximum.
     - `scale`: `"range"` scales features by their range in the space, `"raw"` does not scale (as
       VerifAI), `"standard"` gives the components of the correlation matrix, `"rows"` scales by the

@@ -1,12 +1,12 @@
-"""Rules that describe in words where a system fails.
+"""Rules: descriptions of the failure region by conditions on features.
 
 >>> print(rules(run))
 masspole > 0.31 and theta0 > 0.04: covers 92 % of the failures, precision 0.95 (38 of 40 ...)
 
-A rule is a box in the feature space. Boxes come from decision trees, are freed of conditions that
-do not help, written in short numbers, and taken one by one until nearly all failures are covered.
-How well they do is measured on rows that were kept aside. Conditions and boxes that these do not
-support are left out.
+A rule is a box in the feature space. Boxes come from decision trees; conditions that do not help
+are removed, and numbers are shortened. Boxes are added one by one until nearly all failures are
+covered. Held-out rows measure their quality; conditions and boxes without support there are left
+out.
 """
 
 from collections.abc import Callable
@@ -84,7 +84,7 @@ class Rule:
 
 @dataclass(frozen=True, eq=False)
 class Rules(Drawn, InNotebook):
-    """Rules that together describe where a system fails, the best one first.
+    """Rules that together describe the failure region of a system, the best one first.
 
     **Fields:** `rules`; `coverage` and `precision` of all of them together, 0 and None without a
     rule; `unsupported`: number of further boxes that the held-out rows do not support; `measured`:
@@ -381,7 +381,7 @@ def _supported(
 def _chance_of_more(
     inside: Bool[np.ndarray, " n"], beyond: Bool[np.ndarray, " n"], failing: Bool[np.ndarray, " n"]
 ) -> float:
-    """Return how probable so many failures inside are where they do not depend on the condition."""
+    """Return the probability of this number of failures inside if the condition had no effect."""
     from scipy.stats import hypergeom
 
     both = inside | beyond

@@ -1,4 +1,4 @@
-"""Conditions on features in words, and the regions of the feature space that they make.
+"""Conditions on features, and the regions of the feature space that they define.
 
 >>> print(Between("masspole", above=0.31))
 masspole > 0.31

@@ -7,9 +7,8 @@
 Distances are those of `Samples.points`.
 
 To find the tightest group, rows with the same choices form a group, searched by a k-d tree
-(Bentley, Multidimensional binary search trees used for associative searching, CACM 18(9), 1975). A
-row of another group is at least 1 away, which bounds what the others can add: nearly always the
-tree alone decides.
+(Bentley, Multidimensional binary search trees used for associative searching, CACM 18(9), 1975).
+Rows of other groups are at least 1 away, so nearly always the tree alone suffices.
 """
 
 from collections.abc import Iterator, Mapping, Sequence

@@ -3,8 +3,8 @@
     INCLUDE_AND: {speed: "[0 .. 50] km/h", road: [street, lane], OR: {rain: no, speed: "< 9 m/s"}}
     EXCLUDE_OR: {lanes: "> 3"}
 
-A test is of one attribute, a group joins tests, a reference asks whether another module holds.
-Numbers are in the unit of the attribute, and literals are their indices.
+A test is a condition on one attribute, a group combines conditions, and a reference is true if
+another module holds. Numbers are in the unit of the attribute; literals are given by index.
 """
 
 import math
@@ -257,7 +257,8 @@ def read_group(
         elif name in modules:
             if not isinstance(value, bool):
                 raise ValueError(
-                    f"{inside}: a module holds, true, or does not, false; got {value!r}"
+                    f"{inside}: must be true (the module holds) or false (it does not); got "
+                    f"{value!r}"
                 )
             parts.append(Reference(name, value))
         else:

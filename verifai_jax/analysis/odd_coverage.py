@@ -26,7 +26,7 @@ from verifai_jax.core.messages.text import format_percent
 DRAWN = 2**15
 """Points of the domain, and of the prior, by which shares are measured: to half a percent."""
 MAX_VALUES = 20
-"""Values of an integer up to which each is a cell of its own."""
+"""Maximum number of values of an integer that each get a cell."""
 MAX_CELLS = 2**30
 """Cells of an attribute at most, for which a pair of cells is one number."""
 CANDIDATES = 4096

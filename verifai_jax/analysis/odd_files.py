@@ -46,8 +46,8 @@ def read_odd(path: str | Path) -> OperationalDomain:
     module that must or must not hold. Values are converted to the unit of the feature.
 
     **Arguments:**
-    - `path`: the file. Without an entry `features` each attribute is a feature, with its last part
-      as name.
+    - `path`: the file. Without an entry `features` each attribute is a feature, named by the last
+      part of its name.
     **Raises:** `FileNotFoundError`; `ValueError` naming the entry, for any other file.
     """
     path = Path(path)
@@ -99,7 +99,7 @@ def _domain(
 ) -> OperationalDomain:
     found = list(_attributes((), tree.get("TAXONOMY") or {}, where))
     if not found:
-        raise ValueError(f"{where} has no attribute: TAXONOMY names them")
+        raise ValueError(f"{where} has no attribute; define one under TAXONOMY")
     resolve = _resolver(found)
     if said:
         mapped = {}
@@ -164,7 +164,8 @@ def _module(
             verb = word[:7]
             if verb in groups:
                 raise ValueError(
-                    f"{where} has {verb}_AND and {verb}_OR: take one, with a group in it"
+                    f"{where} has both {verb}_AND and {verb}_OR: use only one, and put a group "
+                    "into it"
                 )
             every = word.endswith("AND")
             groups[verb] = read_group(
@@ -193,8 +194,8 @@ def _attributes(above: tuple[str, ...], tree: object, where: str) -> Iterator[At
             yield Attribute(name, kind, literals, unit=unit)
         else:
             raise ValueError(
-                f"{where}: {name} is a list of literals, or boolean, integer or float with what it "
-                f'measures, "float velocity"; got {value!r}'
+                f"{where}: {name} must be a list of literals, or boolean, integer or float with a "
+                f'quantity, "float velocity"; got {value!r}'
             )
 
 

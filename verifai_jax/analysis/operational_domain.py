@@ -4,8 +4,8 @@
     problem = vj.Problem("brake", domain.space(), system, formula)
     print(domain.coverage(run))                         # and .next_points(10)
 
-The file is YAML of ASAM OpenODD 1.0, or one that names such files and says by which features a
-problem varies their attributes, in which units, why, and who says so:
+The file is YAML of ASAM OpenODD 1.0, or a file that names such files and maps features of a problem
+to their attributes, with units, reasons and sources:
 
     openodd: [odd.yaml]
     features:

@@ -1,4 +1,4 @@
-"""All analyses of a run that apply to it, in a few words each.
+"""All applicable analyses of a run, each with a short text.
 
 found = analyze(run)
 print(found)

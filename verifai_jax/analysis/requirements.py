@@ -1,4 +1,4 @@
-"""Traces of a problem that answer a question about formulas: from its prior, and by falsification.
+"""Traces of a problem for questions about formulas: samples of its prior, and falsification.
 
 simulated(problem)                                  # 64 traces from the prior
 mine_by_search(read_parametric("always x > ?d"), problem)

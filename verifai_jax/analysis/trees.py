@@ -1,4 +1,4 @@
-"""Boxes that may hold many failures, from decision trees over ordered and unordered columns.
+"""Boxes with many failures, proposed by decision trees over ordered and unordered columns.
 
 Sources: trees and the best subsets of unordered values by Breiman, Friedman, Olshen and Stone,
 Classification and regression trees (1984).

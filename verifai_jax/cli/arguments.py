@@ -1,4 +1,4 @@
-"""Arguments and options that several commands share, and how their text is read."""
+"""Arguments and options shared by several commands, and the parsing of their texts."""
 
 import contextlib
 import json
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from verifai_jax.core.compute.executors import Executor
 Command = TypeVar("Command", bound=Callable[..., object])
 COMMON = ("as_json", "pictures", "progress", "keep_going")
-"""Options about what a command prints and draws, and whether it goes on, not about its result."""
+"""Options for output and resumption, which do not affect the result of a command."""
 PATH = click.Path(path_type=Path)
 """A file or a folder, which need not exist."""
 
@@ -119,7 +119,7 @@ EVEN_IF_CHANGED = option(
     is_flag=True,
     help="Accept that the model was changed, and note the differences.",
 )
-"""For commands that go on with what another model may have simulated."""
+"""Option of commands that continue work of a model that may have changed."""
 SET = option("--set", "options", multiple=True, metavar="NAME=VALUE", help="Option of the search.")
 """Options of a search that is given by name."""
 
@@ -224,7 +224,7 @@ def load_run(folder: Path, target: str | None) -> "Run":
 
 
 def read_run(folder: Path, problem: "Problem | None" = None) -> "Run":
-    """Read the run in a folder; if there is none, the error says what the folder is."""
+    """Read the run in a folder; without one, the error describes the folder."""
     from verifai_jax import load
     from verifai_jax.core.messages.text import printable
 
@@ -248,7 +248,7 @@ def recorded_target(folder: Path, remedy: str = "--problem specs/FILE.py:NAME") 
 
 
 def read_record(folder: Path) -> dict[str, Any]:
-    """Read the record of the run in a folder; if there is none, the error says what it is.
+    """Read the record of the run in a folder; without one, the error describes the folder.
 
     **Raises:** the errors of `verifai_jax.falsification.run_folder.read_record`.
     """
@@ -261,7 +261,7 @@ def read_record(folder: Path) -> dict[str, Any]:
 
 
 def _describe_folder(folder: Path, record: str, missing: str) -> str:
-    """Say what a folder without a run is; `missing` says that its record is."""
+    """Describe a folder without a run; `missing` is true if only its record is missing."""
     if folder.is_file():
         what = "it is a file; give the folder that verifai-jax falsify wrote"
         return f"no run in {folder}: {what}"

@@ -1,4 +1,4 @@
-"""`verifai-jax estimate FILE.py:NAME`: how probable a failure is."""
+"""`verifai-jax estimate FILE.py:NAME`: the probability of a failure."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Any

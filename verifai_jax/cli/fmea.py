@@ -25,7 +25,7 @@ from verifai_jax.cli.json_output import command, draw, give_result
 @arguments.PLOT
 @arguments.PROGRESS
 def fmea(target: str, folder: Path | None, plot: Path | None, **options: Any) -> None:
-    """Table what each fault of TARGET (FILE.py:NAME) does, and how probable that is."""
+    """Tabulate the effect and the probability of each fault of TARGET (FILE.py:NAME)."""
     from verifai_jax import fmea as run
     from verifai_jax.core.messages.text import printable
 

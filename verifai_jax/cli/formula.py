@@ -1,4 +1,4 @@
-"""`verifai-jax formula lint "always speed < 30" logs/`: whether a formula says what is meant."""
+"""`verifai-jax formula lint "always speed < 30" logs/`: checks for mistakes in a formula."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -31,7 +31,7 @@ ASKED = arguments.all_of(
 
 @click.group()
 def formula() -> None:
-    """Ask whether formulas say what is meant, and find formulas to start from."""
+    """Check formulas for mistakes, and find formulas to start from."""
 
 
 @command()
@@ -168,7 +168,7 @@ def _parsed(text: str, constants: tuple[str, ...], definitions: tuple[str, ...])
 
 
 def _signals(recordings: tuple[Path, ...], problem: str | None) -> Any:
-    """Return what the formula is asked about: recordings, a problem, or neither."""
+    """Return the source of signals: recordings, a problem, or neither."""
     if problem is not None:
         if recordings:
             raise click.UsageError("give either recordings or --problem, and not both")

@@ -1,4 +1,4 @@
-"""`verifai-jax fuzz specs/handover.py:handover --stop-after 1`: follow what was covered."""
+"""`verifai-jax fuzz specs/handover.py:handover --stop-after 1`: search guided by coverage."""
 
 from functools import partial
 from pathlib import Path
@@ -42,7 +42,7 @@ def fuzz(
     fail_on: Gate | None,
     **options: Any,
 ) -> None:
-    """Look for failures of TARGET (specs/FILE.py:NAME) by covering what can happen in it."""
+    """Look for failures of TARGET (specs/FILE.py:NAME) by covering its possible behaviour."""
     from verifai_jax import fuzz as run_fuzz
 
     chosen = {name: _cells(name, text) for name, text in arguments.split_pairs("--cells", cells)}

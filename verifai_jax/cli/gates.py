@@ -4,8 +4,8 @@
     def falsify(..., fail_on: Gate | None): ...
         check_gate(fail_on, {"counterexample": run.table.counts.claimed > 0})
 
-A gate is a name, or `rate>P` for a failure rate. It fails unless the result shows that it is kept:
-a rate whose interval reaches above P is not known to be below.
+A gate is a name, or `rate>P` for a failure rate. It passes only if the result proves it: a rate
+whose interval reaches above P fails the gate.
 """
 
 from collections.abc import Callable, Mapping

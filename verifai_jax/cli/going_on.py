@@ -4,7 +4,7 @@
         found = estimate(problem)
         kept.stopped(found.stopped)
 
-The same command goes on from them, whatever ended it: the folder follows from its arguments.
+The same command continues from them, whatever ended it: its arguments determine the folder.
 """
 
 import contextlib
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 WORDS = "verifai_jax.words"
 """Entry of a context that has the words of the command line."""
 FOLDER = Path("runs") / "unfinished"
-"""Where what is not done lies, a folder a command."""
+"""Folder of unfinished work, with a subfolder for each command."""
 EARLY = ("interrupted", "max_seconds")
 """What ends work before it is done."""
 _BESIDES = frozenset(

@@ -1,4 +1,4 @@
-"""`verifai-jax harden specs/FILE.py:STUDY`: train a policy where it fails, and certify it."""
+"""`verifai-jax harden specs/FILE.py:STUDY`: train a policy on its failures, and certify it."""
 
 from pathlib import Path
 from typing import Any
@@ -35,7 +35,7 @@ from verifai_jax.cli.json_output import command, draw, give_result
 def harden(
     target: str, folder: Path | None, plot: Path | None, fail_on: Gate | None, **options: Any
 ) -> None:
-    """Train a policy of the study TARGET (FILE.py:NAME), go on where it fails, certify it."""
+    """Train a policy of the study TARGET (FILE.py:NAME), train it on its failures, certify it."""
     from verifai_jax import Study
     from verifai_jax import harden as run
     from verifai_jax.core.messages.text import printable

@@ -5,7 +5,7 @@
         ...
         give_result(probability=found.probability, low=found.low, high=found.high)
 
-With `--json` the standard output is that object alone; what people read goes to the standard error
+With `--json` the standard output is only this object; text for people goes to the standard error
 stream. Numbers that are not finite are null.
 """
 

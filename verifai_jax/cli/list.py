@@ -86,7 +86,7 @@ def _print_target(target: "Problem | Study") -> None:
 
 
 def _no_specs() -> str:
-    """Say that this folder has no problems, and what it has."""
+    """Write that this folder has no problems, and list its content."""
     files = sorted(file.name for file in Path().glob("[!_]*.py"))
     others = f". Python files here: {', '.join(files)}" if files else ""
     return (

@@ -86,7 +86,7 @@ COMMANDS = (
 
 @contextlib.contextmanager
 def _signals_interrupt() -> Iterator[list[int]]:
-    """Let SIGTERM and SIGHUP interrupt as Ctrl-C does, so that a command saves what it has.
+    """Let SIGTERM and SIGHUP interrupt as Ctrl-C does, so that a command saves its results.
 
     A second one of a kind ends the process at once. Those that are ignored (`nohup`) stay ignored.
 

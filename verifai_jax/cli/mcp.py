@@ -1,8 +1,8 @@
 """`verifai-jax mcp`: the commands as tools of an agent, by the Model Context Protocol over pipes.
 
-Messages are JSON-RPC 2.0, one a line. A tool is a command in a process of its own, with a budget of
-simulations and of seconds. Paths are below one folder. Formulas are parsed, and nothing else of a
-message is: what runs are files of problems that are in that folder.
+Messages are JSON-RPC 2.0, one a line. A tool runs a command in a separate process, with a budget of
+simulations and of seconds. Paths are below one folder. Formulas in a message are only parsed; the
+code that runs is in files of problems in that folder.
 """
 
 import json
@@ -219,7 +219,7 @@ class Server:
         path = value.rpartition(":")[0] if key == "problem" and ":" in value else value
         whole = (self.folder / path).resolve() if "\0" not in path else Path("/")
         if not whole.is_relative_to(self.folder) or not whole.exists() or path.startswith("-"):
-            raise Refused(f"{key} {value!r} is nothing in the folder of this server")
+            raise Refused(f"{key} {value!r} does not exist in the folder of this server")
         if key == "problem" and whole.suffix != ".py":
             raise Refused(f"problem {value!r} must be FILE.py:NAME")
 

@@ -185,7 +185,7 @@ def _read(
     method: Literal["hold", "linear"] | None,
     missing: "Missing | None",
 ) -> "Trace":
-    """Read the recording; what is missing is reported as an option of this command."""
+    """Read the recording; errors name the missing option of this command."""
     from verifai_jax import mtl
 
     if (period is None) != (method is None):

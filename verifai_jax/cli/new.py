@@ -1,4 +1,4 @@
-"""`verifai-jax new my_project`: a small project that works, to be changed into one's own."""
+"""`verifai-jax new my_project`: a small working project as a starting point."""
 
 import contextlib
 import json

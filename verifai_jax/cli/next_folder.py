@@ -1,4 +1,4 @@
-"""The folder into which a command writes: the one that was given, or the next of several."""
+"""The folder into which a command writes: the given one, or the next free one."""
 
 import contextlib
 from collections.abc import Callable, Iterator
@@ -16,8 +16,9 @@ def given_or_next(
     """Return the given folder, or else the next one, made by `next_folder`.
 
     **Arguments:**
-    - `goes_on`: returns the command that resumes the folder; it is printed in case of a kill.
-    - `record`: the file from whose existence on that is possible.
+    - `goes_on`: a function that returns the command to resume the folder, printed for the case of a
+      kill.
+    - `record`: the file that must exist before the folder can be resumed.
     """
     from verifai_jax.core.display.progress import goes_on_with
 

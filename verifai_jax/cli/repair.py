@@ -43,7 +43,7 @@ def repair(
     fail_on: Gate | None,
     **keywords: Any,
 ) -> None:
-    """Change parameters of TARGET (specs/FILE.py:NAME) as little as removes its failures."""
+    """Remove the failures of TARGET (specs/FILE.py:NAME) by a small change of its parameters."""
     from verifai_jax import repair as run_repair
     from verifai_jax.core.messages.text import printable
 

@@ -1,4 +1,4 @@
-"""`verifai-jax shrink runs/balance-1`: the least departure from nominal that still fails."""
+"""`verifai-jax shrink runs/balance-1`: the smallest departure from nominal that still fails."""
 
 from pathlib import Path
 from typing import Any

@@ -162,7 +162,7 @@ def sweep(
 def _resuming(
     folder: Path, target: str, cache: Path | None, max_seconds: float | None, cluster: str | None
 ) -> str:
-    """Write the command that goes on with a sweep."""
+    """Write the command that continues a sweep."""
     apart = None if cache == folder else cache
     more = {"--cache": apart, "--max-seconds": max_seconds, "--cluster": cluster}
     return arguments.resuming("sweep", folder, target, more)
@@ -214,7 +214,7 @@ def _read_command(folder: Path) -> dict[str, Any]:
 
 
 def _describe_folder(folder: Path) -> str:
-    """Say what a place without finished work is."""
+    """Describe a folder without finished work."""
     if (folder / "run.json").is_file():
         goes_on = arguments.resuming("falsify", folder, None, {})
         return f": it is the folder of a run; {goes_on} goes on with it"

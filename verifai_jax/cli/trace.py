@@ -1,4 +1,4 @@
-"""`verifai-jax trace specs/brake.py`: what serves each requirement, and which links are broken."""
+"""`verifai-jax trace specs/brake.py`: the evidence for each requirement, and broken links."""
 
 from pathlib import Path
 

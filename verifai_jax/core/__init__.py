@@ -1,1 +1,1 @@
-"""The ground of every room, in six folders; it imports no other room."""
+"""The base of all other rooms, in six folders; it imports no other room."""

@@ -79,20 +79,19 @@ def estimate(
 
     A failure is a simulation that breaks a formula of the problem.
 
-    The prior is the distribution of the features, given that the constraint holds (uniform on the
-    unit cube, from which features are computed). If the system draws random numbers, the
-    probability is over these too.
+    The prior is the distribution of the features, given that the constraint holds. If the system
+    draws random numbers, the probability covers these too.
 
     **Arguments:**
     - `problem`: the system with its feature space and formulas.
     - `method`: `"monte_carlo"`, `"importance"`, `"splitting"` or `"surrogate"`; when left out, it
       is chosen from the first samples.
     - `budget`: maximum number of simulations, including those of pilot runs and fits.
-    - `batch`: simulations at once; by default as many as the method needs at a time.
+    - `batch`: number of simulations at once; by default what the method needs.
     - `seed`: the same seed gives the same estimate on the same machine.
     - `confidence`: the confidence of the interval and of the bound, between 0 and 1.
-    - `p0`: an upper limit of the probability to be shown, between 0 and 1; the result says whether
-      it is shown, and otherwise how many more simulations without a failure would show it.
+    - `p0`: an upper limit between 0 and 1. The result says whether the probability is shown to lie
+      below it, and if not, how many more simulations without a failure would show that.
     - `precision`, `backend`: as in `falsify`.
     - `max_seconds`: wall-clock seconds after which the estimate is made from finished simulations.
     - `progress`: True draws a bar, False none; None draws one on a terminal and in a notebook.
@@ -105,8 +104,8 @@ def estimate(
     - `cheap`: a cheap model of the same features, which shows where failures may be. It is
       simulated some 100 000 times; every claim rests on simulations of `problem` alone.
       `simulations_are` is then `"slow"`, and `within` 1.5 by default.
-    - `proved`: the result of `verify` for this problem, or its file. Where it proved that no point
-      fails, or that all do, nothing is estimated; all simulations are in the rest of the space.
+    - `proved`: the result of `verify` for this problem, or its file. Proved parts of the space,
+      safe or failing, are not simulated; all simulations are in the rest.
     **Returns:** the estimate with its interval and a guaranteed bound. Ctrl-C gives the estimate
     from the finished simulations. A simulation without a verdict (not finite, raised, out of time)
     counts as safe in the estimate, and as a failure at the upper ends of interval and bound.
@@ -274,7 +273,7 @@ def _robustness_of(cheap: Problem, precision: str, seed: int) -> answers.Cheap:
 
 
 def _differentiates(problem: Problem) -> bool:
-    """Return whether the searches take gradients: in few dimensions chains do without."""
+    """Return whether the searches use gradients, which chains do not need in few dimensions."""
     many = not problem.black_box and problem.space.levels.count(0) >= GRADIENTS_FROM
     return many and without_derivative(problem) is None
 
@@ -298,9 +297,9 @@ def _nothing_left(
 
 
 def _with_decided(found: Estimate, rest: "Rest", limit_state: LimitState, seed: int) -> Estimate:
-    """Return the estimate for the whole prior, where `found` is for the rest of a proof.
+    """Return the estimate for the whole prior from `found`, which covers the rest of a proof.
 
-    What is decided lies within the constraint; samples say how much of the rest does.
+    Decided boxes satisfy the constraint; samples show the share of the rest that does.
     """
     left, error = rest.mass, 0.0
     if rest.mass + rest.decided < 1 and rest.mass:

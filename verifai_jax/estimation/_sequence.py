@@ -3,8 +3,8 @@
     whole = sequence([approach, overtake], {"gap0": "gap", "v0": "v"})
     print(whole); whole.counterexamples
 
-A part begins where the part before it has ended. The whole succeeds if all parts do, so that its
-probability of success is the product of the parts', each given that those before it succeeded.
+A part begins where the previous part ended. The sequence succeeds if all parts do, so its
+probability of success is the product of the parts' conditional probabilities.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -29,11 +29,11 @@ from verifai_jax.statistics.binomial import exact_interval
 Handover = Mapping[str, str]
 """Features of a part, with the signals, or features, of the part before that they come from."""
 TRIES = 32
-"""Draws of a part's own features until its constraint accepts them together with a beginning."""
+"""Maximum draws of a part's own features until its constraint accepts them with a start."""
 CONFIRMED = 16
 """Failures of weighted rows that are simulated from where the part before has ended."""
 FAR = 0.1
-"""Part of a range from which the nearest row of a run is too far to stand for a beginning."""
+"""Distance, as a share of a range, beyond which the nearest row of a run is not used."""
 
 
 @suggests_options
@@ -49,19 +49,19 @@ def sequence(
     precision: str = "float32",
     progress: bool | None = None,
 ) -> SequenceEstimate:
-    """Estimate how often a sequence of scenarios fails, part by part.
+    """Estimate the failure probability of a sequence of scenarios, part by part.
 
     Samples of the first part come from its prior. Each sample that does not fail starts one sample
-    of the next part: the features named in `handover` take their values from it, the others are
-    drawn from their own prior. So the samples of a part are independent, its interval is the exact
-    one of Clopper and Pearson, and the product of the intervals covers the whole sequence
+    of the next part: features named in `handover` take their values from it, and all others are
+    drawn from their own prior. So the samples of a part are independent. Each part has the exact
+    interval of Clopper and Pearson, and the product of the intervals covers the whole sequence
     (Bonferroni).
 
     The verdicts of a `Run` are reused. Rows of the first part are already samples of it. Rows of
-    the last part started from other values: each sample takes the verdict of the row with the
-    nearest start, so rows are weighted by how often the sequence reaches them. That interval is
-    approximate, and a note says so. Final states are not stored, so rows of the first part are
-    simulated again to obtain them, and parts in between are always simulated.
+    the last part have other initial values, so each sample that reaches it takes the verdict of the
+    row with the nearest initial values. The interval is then approximate, and a note says so. Rows
+    of the first part are simulated again to obtain their final states, which are not stored; parts
+    in between are always simulated.
 
     **Arguments:**
     - `parts`: problems, or runs with `search="uniform"`, in their order.
@@ -125,7 +125,7 @@ class _Arrivals:
 
 
 class _Stage:
-    """A part, its number, and what the next one takes from its end."""
+    """A part, its number, and the values that the next part takes from its end."""
 
     def __init__(
         self,
@@ -180,7 +180,7 @@ class _Stage:
     def points(
         self, arrivals: _Arrivals | None, samples: int
     ) -> tuple[Float[np.ndarray, "n d"], Bool[np.ndarray, " n"]]:
-        """Draw points that begin where the part before ended, and say which are in the space."""
+        """Draw points that begin where the previous part ended, and flags of those in the space."""
         space = self.problem.space
         rng = np.random.default_rng([self.seed, self.number])
         count = samples if arrivals is None else len(arrivals.paths)
@@ -201,7 +201,7 @@ class _Stage:
     def weighted(
         self, arrivals: _Arrivals, confidence: float
     ) -> tuple[PartEstimate, list[dict[str, Any]], list[str]]:
-        """Weigh the rows of the run by how often the sequence begins near them."""
+        """Weight the rows of the run by the number of sequence samples that start near them."""
         from scipy.spatial import KDTree
 
         assert self.run is not None
@@ -277,7 +277,7 @@ class _Stage:
 def _estimate(
     name: str, failures: int, without: int, count: int, effective: float, confidence: float
 ) -> PartEstimate:
-    """Return a part with the interval of Clopper and Pearson, of so many effective samples."""
+    """Return a part with the interval of Clopper and Pearson for a number of effective samples."""
     known, share = count - without, effective / count
     low, high = exact_interval(
         share * failures, share * (failures + without), effective, confidence

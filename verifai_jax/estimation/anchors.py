@@ -1,4 +1,4 @@
-"""Components around the regions that searches found, which every proposal keeps.
+"""Mixture components around the regions found by searches; every proposal keeps them.
 
 anchors = anchors_of(explorations, defensive=0.1)
 anchors.fit()                                   # a mixture, of about equal parts for all regions
@@ -20,15 +20,15 @@ from verifai_jax.estimation.exploration import Exploration
 from verifai_jax.estimation.mixture import Mixture
 
 ONE = 0.25
-"""Distance below which two least distant failures of different searches count as one."""
+"""Distance below which the least distant failures of two searches count as the same."""
 MAX_CENTRES = 16
 """Regions that get components of their own, at most."""
 CHAINS_WORTH = 1.5
-"""Independent failures that the states of one chain are worth."""
+"""Effective number of independent failures among the states of one chain."""
 FAR_WIDER = 3.0
-"""Factor on those of a component for what few chains have not seen of a region."""
+"""Factor on a component's deviations, to cover parts of a region that few chains missed."""
 MAX_DIRECTIONS = 8
-"""Directions that decide in a region, at most; with more of them it is bounded on all sides."""
+"""Maximum number of deciding directions; a region with more is bounded on all sides."""
 DIRECTION = 0.3
 """Part of the greatest singular value of the normals from which a direction counts."""
 MIN_WEIGHT = 0.02
@@ -38,7 +38,7 @@ Around: TypeAlias = tuple[Gaussian, Gaussian, *tuple[Gaussian | Marginals, ...]]
 
 
 class WeightedFailures(NamedTuple):
-    """Failures `z` `[n, d]`, and the share `[n]` of their distribution that each represents."""
+    """Failures `z` `[n, d]`, and the share `[n]` of all failures that each represents."""
 
     z: Float[np.ndarray, "n d"]
     weight: Float[np.ndarray, " n"]
@@ -52,9 +52,9 @@ class WeightedFailures(NamedTuple):
 class Anchors:
     """Mixture components around the regions that explorations found, kept in every proposal.
 
-    Regions have about equal shares, so that samples of this mixture tell how probable each region
-    is, whatever earlier samples said. A region keeps its share even if it turns out to be
-    improbable.
+    Regions have about equal shares, so that samples of this mixture estimate the probability of
+    each region independently of earlier samples. A region keeps its share even if it turns out to
+    be improbable.
 
     - `chains`: all explorations together.
     - `regions`: the chains of each region.
@@ -109,7 +109,8 @@ class Anchors:
     def _around(self, number: int, samples: WeightedFailures | None = None) -> Around:
         """Fit components to a region's chains, and to samples where there are any.
 
-        In many dimensions a few chains know no correlations, but how each coordinate is spread.
+        In many dimensions a few chains cannot show correlations, only the spread of each
+        coordinate.
         """
         chains = self.regions[number]
         points = self.chains.points[np.isin(self.chains.chain_ids, chains)]
@@ -159,7 +160,7 @@ def join_explorations(explorations: Sequence[Exploration]) -> Exploration:
 def _regions(exploration: Exploration) -> list[Int[np.ndarray, " chains"]]:
     """Return the chains of each region, the least distant first.
 
-    Regions whose least distant failures are one are one.
+    Regions with the same least distant failure are merged.
     """
     norms = np.linalg.norm(exploration.nearest, axis=1)
     found: list[Int[np.ndarray, " chains"]] = []

@@ -1,4 +1,4 @@
-"""Answers: what samples, splitting runs and bounds say of a probability, with their notes."""
+"""Answers: probabilities and notes from samples, splitting runs and bounds."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -170,7 +170,7 @@ def importance_answer(
 def check_by_splitting(
     answer: Answer, run: SplittingRun, reached: float, interval: tuple[float, float], plan: Plan
 ) -> None:
-    """Compare an answer with splitting, as far as splitting reached the same failures."""
+    """Compare an answer with the result of splitting, for the failures that splitting reached."""
     assert answer.probability is not None
     if reached < 1 - NOTED_UNSEEN:
         answer.notes.append(
@@ -213,10 +213,10 @@ def splitting_answer(
     runs: list[SplittingRun],
     counts: Counts,
 ) -> Answer:
-    """Answer with the mean of these runs and of as many more as the budget allows.
+    """Answer with the mean of these runs and of further runs within the budget.
 
-    If the first level of each run already consists of failures, the runs only count samples of the
-    prior. Then these are counted, which is more precise, and exact if all of them fail.
+    If the first level of each run already consists of failures, the runs contain only samples of
+    the prior. The answer then counts these, which is more precise, and exact if all of them fail.
     """
     if all(run.levels == [-np.inf] for run in runs):
         counts = counts + monte_carlo.sample_prior(limit_state, rng, limit_state.left)

@@ -1,4 +1,4 @@
-"""Densities over standard normal space that proposals are mixed from, relative to the prior.
+"""Densities on standard normal space, relative to the prior: the components of proposals.
 
 component = Gaussian(mean, axes, stds)
 z = component.sample(rng, 1000)
@@ -55,7 +55,7 @@ class Gaussian:
     stds: Float[np.ndarray, " d"]
 
     def widened(self, factor: float) -> "Gaussian":
-        """Return it with standard deviations below the prior's enlarged towards the prior's."""
+        """Return this density with standard deviations below the prior's increased towards it."""
         stds = np.where(self.stds < 1, np.minimum(factor * self.stds, 1.0), self.stds)
         return Gaussian(self.mean, self.axes, stds)
 

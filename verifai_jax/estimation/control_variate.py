@@ -1,4 +1,4 @@
-"""A surrogate as a control variate: simulations have to tell only how often it is wrong.
+"""A surrogate as a control variate: simulations only estimate how often it is wrong.
 
     control = Control(limit_state, rng, surrogate, proposal)
     control.estimate(samples, 0.95)         # value, cv, low, high
@@ -24,7 +24,7 @@ UNSEEN = 8.0
 
 
 class ControlledMean(NamedTuple):
-    """A mean with its relative error and its interval, and whether the surrogate is part of it."""
+    """A mean with its relative error and its interval, and a flag for the use of the surrogate."""
 
     value: float
     cv: float
@@ -36,8 +36,8 @@ class ControlledMean(NamedTuple):
 class Control:
     """The surrogate as a control variate of the samples of a proposal.
 
-    How often it predicts a failure is known from samples that need no simulation; simulations only
-    tell how often it is wrong. If it is wrong too often, the simulations are used alone.
+    Its rate of predicted failures is computed from samples without simulation; simulations only
+    estimate how often it is wrong. If it is wrong too often, the simulations are used alone.
     """
 
     def __init__(
@@ -55,7 +55,7 @@ class Control:
             self.mean, self.error = float(weights.mean()), float(weights.std() / len(z) ** 0.5)
 
     def sees(self, z: Float[np.ndarray, "n d"]) -> Bool[np.ndarray, " n"]:
-        """Return where the surrogate predicts a failure that the constraint accepts."""
+        """Return flags of points that the constraint accepts and the surrogate predicts to fail."""
         return (self._surrogate.predict(z)[0] < 0) & self._accepts(z)
 
     def estimate(self, samples: ImportanceSamples, confidence: float) -> ControlledMean:

@@ -2,10 +2,10 @@
 
     nearest, normals = approach_corner(limit_state, failures)
 
-One gradient says how a failing region ends in one direction. A step by it towards the middle of the
-prior stops at the first limit, and slides along it only as far as the next one. So the planes that
-touch the limit state at all points so far count together: the next point is the one nearest to the
-origin within all of them.
+One gradient describes only one border of a failing region. A descent towards the middle of the
+prior slides along this border and stops at the next one. So the tangent planes of the limit state
+at all points so far are combined: the next point is the one nearest to the origin that lies inside
+all planes.
 
 Sources: Kelley, The cutting-plane method for solving convex programs, Journal of the Society for
 Industrial and Applied Mathematics 8 (1960); Lawson and Hanson, Solving Least Squares Problems
@@ -32,8 +32,8 @@ def approach_corner(
 ) -> tuple[Float[np.ndarray, "n d"], list[Float[np.ndarray, "_ d"]]]:
     """Move failures to nearby ones closest to the origin, using all their tangent planes.
 
-    The path to the closest point that all planes allow is followed as long as it fails. Where it
-    stops failing, the next plane is added.
+    The path to the closest point that all planes allow is followed as long as it fails; the next
+    plane is added where it ends.
 
     **Arguments:**
     - `limit_state`: a limit state with gradients.

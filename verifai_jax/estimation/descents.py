@@ -1,13 +1,13 @@
-"""Descents from many places into failing regions, the first part of an independent search.
+"""Descents from many points into failing regions, the first part of an independent search.
 
     ends = descend_from_many(limit_state, rng, simulations=2000)
     ends.points                                     # failures [n, d], one of each that fails
     ends.feet                                       # where their tangent planes are least distant
 
-Starts lie anywhere from the middle of the prior to far outside of it. A region of which little
-leads to it is found only where many descents begin, so they end at the first failure, and those
-that begin at a local minimum of the starts go first. Where there are gradients, starts are near
-one another if their slopes lead to the same place.
+Starts lie anywhere from the middle of the prior to far outside of it. A region with a small basin
+of attraction is only found by many descents. So descents end at their first failure, and starts
+that are local minima among the starts go first. With gradients, starts count as near each other if
+their slopes lead to the same point.
 
 Sources: Breitung, The geometry of limit state functions and subset simulation, Reliability
 Engineering and System Safety 182 (2019), for the regions that a population is led away from;
@@ -32,15 +32,15 @@ WHERE_RARE = 0.5
 """Share of the starts that lie no farther out than rare failures do, `FAR` from the middle: little
 of the space farther out leads to a small region among them."""
 FAR = 4.0
-"""Standard deviations from the middle of the prior at which failures are rare."""
+"""Distance of rare failures from the middle of the prior, in standard deviations."""
 DRAWN, DRAWN_WITH_SLOPES = 0.2, 0.33
 """Starts that are drawn together, in parts of the simulations; the most promising descend first."""
 MAX_DRAWN = 2048
 """Starts that are drawn together, at most, since all are compared with one another."""
 HITS = 0.02
-"""Starts that fail themselves and count as ends, at most, in parts of the simulations."""
+"""Maximum share of the simulations used for starts that fail themselves and count as ends."""
 MIN_AT_ONCE, MAX_AT_ONCE = 16, 128
-"""Descents that are side by side."""
+"""Minimum and maximum number of simultaneous descents."""
 STEPS, FURTHER_STEPS = 60, 12
 """Steps of a descent without gradients, at most, and of one that gradients have led nowhere."""
 NEWTON_STEPS, MISSES = 24, 4
@@ -170,7 +170,7 @@ def draw_starts(
 
 
 def _planes(feet: Float[np.ndarray, "n d"]) -> Float[np.ndarray, "n coordinates"]:
-    """Return points that tell planes apart: the feet and the directions.
+    """Return points that distinguish planes: the feet and the directions.
 
     Where planes pass near the origin their feet lie together, wherever their regions are.
     """
@@ -179,7 +179,7 @@ def _planes(feet: Float[np.ndarray, "n d"]) -> Float[np.ndarray, "n coordinates"
 
 
 def points_ahead(limit_state: LimitState, descents: Descents) -> Float[np.ndarray, "n d"]:
-    """Return where the slope at each point predicts the limit state; without it, the point itself.
+    """Return the point at which each slope predicts the limit state, or the point itself.
 
     The prediction is limited to the length of one step.
     """

@@ -3,9 +3,9 @@
     evaluate = DoublePrecisionEvaluator(problem, batch=448, precision="float32", seed=0)
     rho, failing, proper = evaluate(u)              # u [n, d], float64
 
-Rare failures lie near the ends of the coordinates, where single precision has no numbers: next to 1
-its probabilities are multiples of 6e-8. So features are computed from the points in double
-precision, and simulated in that of the run.
+Rare failures lie near the ends of the coordinates, where single precision is too coarse: next to 1
+its numbers are multiples of 6e-8. So features are computed from the points in double precision, and
+simulated in the precision of the run.
 """
 
 from functools import cached_property, partial
@@ -76,8 +76,8 @@ class FlattenedFeatures(FeatureSpace):
 class DoublePrecisionEvaluator:
     """An evaluator of points in double precision; see the module's docstring.
 
-    `clamped` is True at coordinates `[d]` whose domain has an outermost value, beyond which a
-    simulation cannot see. `uniform` is True at coordinates on which the features depend linearly.
+    `clamped` `[d]` is True at coordinates whose domain has an outermost value, which no simulation
+    exceeds. `uniform` is True at coordinates on which the features depend linearly.
 
     **Arguments:**
     - `problem`: a checked problem, on the backend on which it should run.

@@ -1,20 +1,20 @@
-"""Searches for failing regions that do not depend on one another, nor on splitting.
+"""Searches for failing regions, independent of each other and of splitting.
 
     exploration = explore(limit_state, rng, simulations=3000)
     exploration.points, exploration.chain_ids       # failures, and the chain of each
     exploration.nearest, exploration.regions        # least distant failure and region of each chain
 
-Splitting follows the robustness as a population: where it falls fastest, all chains gather, and a
-region that the robustness leads to more slowly is left behind, however probable it is. Here
-descents begin in many places and end at their first failure (`descents`). Failures between which
-another one lies count as one region, and each region has about as many chains as any other: they
-come in towards the origin, where failures are more probable (`towards_origin`), find out which
-coordinates decide, and then walk among the failures by moves that keep the prior (`walks`).
+In splitting all chains gather where the robustness falls fastest, so another region may be lost
+even if it is probable. Here descents begin in many places and end at their first failure
+(`descents`). Two failures with another failure between them count as one region. Each region gets
+about the same number of chains: they move towards the origin, where failures are more probable
+(`towards_origin`), find the deciding coordinates, and then walk among the failures by moves that
+keep the prior (`walks`).
 
 Sources: Breitung, The geometry of limit state functions and subset simulation, Reliability
-Engineering and System Safety 182 (2019), for the failures of splitting that this mends; Hasofer and
-Lind, Exact and invariant second-moment code format, Journal of the Engineering Mechanics Division
-100 (1974), for the least distant failure.
+Engineering and System Safety 182 (2019), for the weaknesses of splitting that this avoids; Hasofer
+and Lind, Exact and invariant second-moment code format, Journal of the Engineering Mechanics
+Division 100 (1974), for the least distant failure.
 """
 
 from dataclasses import dataclass
@@ -89,7 +89,7 @@ class Exploration:
 
 
 def explore(limit_state: LimitState, rng: np.random.Generator, simulations: int) -> Exploration:
-    """Search for failures with descents, and with chains that start from what these find.
+    """Search for failures with descents, and with chains that start from the failures found.
 
     **Arguments:**
     - `simulations`: approximate number of simulations.
@@ -230,7 +230,7 @@ def _joined(
 
 
 def spread_out(ends: Ends, maximum: int) -> Int[np.ndarray, " k"]:
-    """Return ends that are distinct and far from one another, nearest to the origin first."""
+    """Return distinct ends that are far from one another, nearest to the origin first."""
     everything = np.arange(len(ends.points))
     nearest = int(np.linalg.norm(ends.points, axis=1).argmin())
 

@@ -6,9 +6,9 @@
     fit_copula(z, weight, marginals)
     fit_shell(z, weight)
 
-Points are `z [n, d]`, their weights `[n]` sum to one. `worth` is the number of independent points
-that one point stands for (states of a chain are alike, so less than one): a component departs from
-the prior only as far as that many points can show.
+Points are `z [n, d]`; their weights `[n]` sum to one. `worth` is the number of independent points
+that one point counts for; it is below one for the correlated states of a chain. A component differs
+from the prior only as far as that number of points can prove.
 """
 
 import numpy as np
@@ -52,11 +52,11 @@ def weigh_together(
     """Weight states of chains and weighted samples of the same failures by their information.
 
     **Arguments:**
-    - `states`: number of states; they are correlated, and so worth less than their number.
+    - `states`: number of states, which are correlated.
     - `worth`: number of independent points that all of them are worth.
     - `weight`: the weight of the samples.
-    **Returns:** weights of the states, then of the samples; the more the samples are worth, the
-    less the states count.
+    **Returns:** weights of the states, then of the samples; more informative samples reduce the
+    weights of the states.
     """
     fresh = effective_size(weight)
     worth *= worth / (worth + fresh)
@@ -193,7 +193,7 @@ def fit_copula(
     steps: Marginals,
     worth: float = 1.0,
 ) -> Copula | None:
-    """Join marginals by those correlations that exceed sampling noise; None if there are none."""
+    """Join marginals by their correlations beyond sampling noise; None if there are none."""
     d, size = z.shape[1], effective_size(weight) * worth
     v = rank_scores(steps, z)
     centred = v - weight @ v

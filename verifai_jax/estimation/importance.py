@@ -1,12 +1,12 @@
-"""Importance sampling: a proposal fitted to failures, then fresh samples of it as it is.
+"""Importance sampling: a proposal is fitted to failures, then frozen and sampled.
 
     fitted = fit_proposal(limit_state, rng, points, chain_ids, simulations=30_000)
     samples = sample_proposal(limit_state, rng, fitted.proposal, limit_state.left)
     samples.mean, samples.interval(0.95)
 
-The proposal is fitted to the failures that a splitting run ended with, then to those of samples of
-itself, which the cross-entropy method does. Only samples drawn after that, from the frozen
-proposal, are in the estimate, which is therefore unbiased whatever the fit.
+The proposal is fitted to the last failures of a splitting run, then to failures among its own
+samples (the cross-entropy method). Only samples drawn later, from the frozen proposal, enter the
+estimate, so it is unbiased for any fit.
 
 Source: Rubinstein and Kroese, The cross-entropy method (2004), chapter 3; Owen and Zhou, Safe and
 effective importance sampling, JASA 95 (2000).
@@ -62,8 +62,8 @@ class ImportanceSamples:
 
     - `x`: prior density over proposal density at failures, zero elsewhere.
     - `without`: the same at simulations without a verdict, zero elsewhere.
-    - `edge`: weight that may lie beyond the outermost values of a domain, which no simulation
-      reaches.
+    - `edge`: weight that may lie beyond the outermost values of a domain, where nothing is
+      simulated.
     - `origin`: the component of the proposal that each sample came from; 0 is the prior.
     - `failing`: True where a simulation breaks a formula.
     - `points`: the points of the samples.
@@ -133,7 +133,7 @@ class ImportanceSamples:
 
     @property
     def defensive_counts(self) -> tuple[int, int]:
-        """Number of failures among the samples of the defensive part, and of these samples."""
+        """Counts of failures and samples in the defensive part of the proposal."""
         own = self.origin == 0
         return int(self.failing[own].sum()), int(own.sum())
 
@@ -154,7 +154,7 @@ class FittedProposal:
     probability: float = 0.0
 
     def promise(self, simulations: int) -> float:
-        """Return the effective failures expected of this many samples, fewer for a heavy tail."""
+        """Return the effective failures expected from `samples`, fewer for a heavy tail."""
         return self.effective * simulations / widening(self.tail) ** 2
 
 

@@ -1,14 +1,14 @@
-"""The first proposal: what splitting and the independent explorations found, each in its place.
+"""The first proposal, fitted to the failures of splitting and of the independent explorations.
 
     proposals = [proposal_from(exploration, rng) for exploration in explorations]
     initial = mix(proposals)
     agreement = compare_explorations(limit_state, rng, failures, weights, proposals, found)
     agreement.unseen                                # share of the failures that all may have missed
 
-A failing region that one exploration reached keeps a part of the proposal, however few chains are
-there, so that fresh samples can say how probable it is. These samples also tell how much of the
-probability each exploration had reached by itself. What only one of several has reached is a
-measure of what none has, as species seen once are of those not seen yet.
+A failing region reached by one exploration keeps a part of the proposal even if only few chains are
+there, so that fresh samples can estimate its probability. These samples also show the share of the
+probability that each exploration reached by itself. The share that only one of them reached
+estimates the share that none reached, just as species seen once estimate the unseen ones.
 
 Source: Good, The population frequencies of species and the estimation of population parameters,
 Biometrika 40 (1953); Burnham and Overton, Robust estimation of population size when capture

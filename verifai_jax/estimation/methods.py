@@ -3,11 +3,11 @@
     answer = estimate_automatically(limit_state, rng, plan)
     answer.probability, answer.low, answer.high, answer.method
 
-A first level of prior samples decides. Failures that are frequent enough are counted in fresh
-samples. Rarer ones are reached by splitting, whose failures make a proposal for importance
-sampling, whose fresh samples are the estimate; splitting, which does not depend on the fit,
-checks it, and repeats itself where the proposal is no good. Where no failure is reached, what is
-left goes to the prior, and only its bound is claimed.
+A first level of prior samples decides. Frequent failures are counted in fresh samples. Rare ones
+are reached by splitting; a proposal for importance sampling is fitted to its failures, and fresh
+samples of the proposal give the estimate. Splitting, which does not depend on the fit, checks it,
+and replaces it if the proposal is poor. If no failure is reached, the remaining simulations sample
+the prior, and only their bound is claimed.
 """
 
 import numpy as np
@@ -196,7 +196,7 @@ def _without_proposal(
 
 
 def _promised_by(run: SplittingRun, limit_state: LimitState) -> float:
-    """Return the failures that splitting is worth, with as many more runs as what is left."""
+    """Return the effective failures of splitting with the remaining simulations."""
     more = limit_state.left / splitting_cost(run, run.first[0])
     return (1 + more) / max(UNDERSTATED * run.cv, 1e-6) ** 2
 

@@ -4,9 +4,10 @@
     z, _ = proposal.sample(rng, 1000)
     ratio = proposal.ratio(z)                       # proposal density over prior density
 
-Components of several kinds are fitted to one half of the failures, and weighed by what they do on
-the other: the weights minimise the second moment of the importance weights, `E[p/q | failure]`,
-which is convex in them. So the kind is not chosen, and a mode that no component covers costs most.
+Components of several kinds are fitted to one half of the failures and weighted on the other half:
+the weights minimise the second moment of the importance weights, `E[p/q | failure]`, which is
+convex in them. So no kind has to be chosen in advance, and leaving a mode uncovered is penalised
+most.
 
 Sources: Rubinstein and Kroese, The cross-entropy method (2004), chapter 8; Papaioannou, Geyer and
 Straub, Improved cross entropy-based importance sampling with a flexible mixture model, Reliability
@@ -78,7 +79,7 @@ class Mixture:
         )
 
     def with_shares(self, shares: Float[np.ndarray, " k"]) -> "Mixture":
-        """Return this mixture with shares in these proportions; the prior keeps its own."""
+        """Return this mixture with new proportions of components; the prior keeps its share."""
         prior = float(self.shares[0])
         rest = shares * (1 - prior) / max(float(shares.sum()), 1e-12)
         return Mixture(self.components, np.append(prior, rest))

@@ -4,10 +4,10 @@
         proposals = [moved_priors(ends) for ends in found]
         fitted = share_out(limit_state, rng, mix(proposals), limit_state.left)
 
-Where a point fails with a probability, failures are distributed as the prior times it. A proposal
-that is fitted to failures, as for other systems, is the worst one then: places that fail seldom get
-the fewest samples, and a failure there weighs as much as thousands of others, or is not seen at all
-and nothing tells. The prior moved by a vector, as wide as it was, has weights without such a tail.
+If points fail with a probability, failures are distributed as the prior times this probability. A
+proposal fitted to failures is then a poor choice: regions that fail seldom get few samples, and a
+failure there weighs as much as thousands of others, or is missed unnoticed. The prior, moved by a
+vector at unchanged width, has weights without such a heavy tail.
 
 Source: Asmussen and Glynn, Stochastic Simulation (2007), chapter VI, for exponential tilting.
 """
@@ -45,7 +45,7 @@ the more the draws decide."""
 ENDS = 12
 """Failures towards which the prior is moved, at most."""
 EVEN = 0.5
-"""Share of the proposal in which all moves are alike; the rest is what the failures say is best."""
+"""Share of the proposal with equal weights of all moves; the rest follows the failures."""
 
 
 def notice_own_chance(limit_state: LimitState, rng: np.random.Generator) -> None:

@@ -3,11 +3,11 @@
     slopes = natural_slopes(z, gradient, uniform)   # by natural coordinates
     z = move_naturally(z, steps, uniform)           # steps in natural coordinates
 
-A simulation depends on its features, and smoothly so. A normal feature is linear in normal space, a
-uniform one in the unit cube: there a line is a line, and a step of Newton's lands where the
-robustness promises. In normal space the same robustness bends, most of all near the ends of the
-interval, where a uniform feature hardly moves. So a natural coordinate is that of normal space, or,
-for a uniform feature, its position in the cube in units of its standard deviation.
+A simulation depends smoothly on its features. A normal feature is linear in normal space, a uniform
+one in the unit cube; in these coordinates Newton steps are accurate. In normal space a uniform
+feature is strongly curved near the ends of its interval, where it hardly changes. So the natural
+coordinate is that of normal space or, for a uniform feature, its position in the cube in units of
+its standard deviation.
 
 Source: Nocedal and Wright, Numerical Optimization (2006), section 19.2, for steps that go no more
 than a fraction of the way to a boundary.

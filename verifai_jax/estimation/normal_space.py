@@ -67,7 +67,7 @@ class Linearized(NamedTuple):
 
 
 FIRST = 16
-"""Simulations that are asked for at first, where they take their time one after another."""
+"""Initial number of requested simulations, if they run one after another."""
 SECONDS = 1.0
 """Seconds after which fewer of these are asked for at a time."""
 BUSY = 4

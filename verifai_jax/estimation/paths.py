@@ -3,8 +3,8 @@
     connected(limit_state, a, b)                    # [n], for points a [n, d] and b [n, d]
     last, beyond = halve(limit_state, a, b, 10)     # about the end of the failures on the way to b
 
-Two paths are tried: the straight one, which stays inside a convex region, and the arc that turns
-about the origin at the distances of its ends, which follows a region that lies around the prior.
+Two paths are tried: the straight line, which stays inside a convex region, and an arc about the
+origin between the distances of its ends, which follows a region around the prior.
 """
 
 import numpy as np

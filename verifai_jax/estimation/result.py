@@ -42,7 +42,7 @@ class Estimate(Drawn, Reported, InNotebook):
     - `method`: a name of `METHODS`; None without an estimate.
     - `simulations`: number of all simulations; one with its gradient counts as 2.
     - `budget`: simulations that were allowed.
-    - `failures`, `no_verdict`: how many simulations failed, and how many had no verdict.
+    - `failures`, `no_verdict`: number of failed simulations, and of simulations without a verdict.
     - `upper_bound`: upper bound guaranteed at `confidence` by independent samples of the prior
       alone, whatever a search may have missed.
     - `prior_simulations`, `prior_failures`, `prior_no_verdict`: the samples of the prior on which
@@ -106,7 +106,7 @@ class Estimate(Drawn, Reported, InNotebook):
         return self.rest * self.prior_no_verdict / max(self.prior_simulations, 1)
 
     def simulations_until(self, p0: float, confidence: float | None = None) -> int:
-        """Return how many more samples without a failure show a probability below `p0`.
+        """Return the number of further failure-free samples that show a probability below `p0`.
 
         **Arguments:**
         - `p0`: failure probability to be shown, between 0 and 1.

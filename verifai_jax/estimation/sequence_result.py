@@ -19,7 +19,7 @@ class PartEstimate:
     - `probability`: share that fails; NaN if no simulation has a verdict.
     - `low`, `high`: ends of its interval.
     - `samples`: number of simulations, or of rows of a run, on which it rests.
-    - `without`: how many of these have no verdict, or start outside the part's space.
+    - `without`: number of these without a verdict, or with a start outside the part's space.
     - `effective`: effective number of independent samples; smaller than `samples` only if rows of a
       run are weighted.
     """

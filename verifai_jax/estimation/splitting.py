@@ -3,8 +3,8 @@
     run = run_splitting(limit_state, rng, per_level=2560, chains=256)
     run.estimate, run.cv, run.points                # failures, distributed as the prior's
 
-The failure is reached through levels of the robustness, each about a tenth as probable as the one
-before; the probability is the product of the conditional ones.
+Failures are reached through levels of the robustness, each about a tenth as probable as the
+previous one; their probability is the product of the levels' conditional probabilities.
 
 Sources: Au and Beck, Estimation of small failure probabilities in high dimensions by subset
 simulation, Probabilistic Engineering Mechanics 16 (2001), equations 8, 19 and 25 to 29;
@@ -61,7 +61,7 @@ class SplittingRun:
 
     @property
     def estimate(self) -> float:
-        """Failure probability: the product of the conditional ones; NaN for a stopped run."""
+        """Failure probability: the product of `fractions`; NaN for a stopped run."""
         return float(np.prod(self.fractions)) if self.stopped is None else float("nan")
 
     @property

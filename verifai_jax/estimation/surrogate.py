@@ -2,11 +2,11 @@
 
     answer = estimate_by_surrogate(limit_state, rng, plan)
 
-A Gaussian process on the robustness learns where the border of the failures is, from simulations
-that are chosen where its sign is least sure. A proposal is fitted to the failures of the surrogate,
-at which no simulation is spent. The estimate is made of fresh samples of that proposal alone, all
-of them simulated and weighted, with the surrogate as a control variate where that is shorter: it is
-unbiased whatever the surrogate is worth, and its interval is wide where that is little.
+A Gaussian process models the robustness near the border of the failures, from simulations chosen
+where its sign is least certain. A proposal is fitted to failures of the surrogate, without
+simulations. The estimate uses only fresh samples of that proposal, all simulated and weighted, with
+the surrogate as a control variate if that shortens the interval. It is unbiased for any surrogate;
+a poor surrogate only widens the interval.
 
 Sources: Echard, Gayton, Lemaire, AK-MCS, Structural Safety 33 (2011), for the choice of
 simulations; Dubourg, Sudret, Deheeger, Metamodel-based importance sampling for structural

@@ -1,12 +1,12 @@
-"""Ways of failures towards the origin of normal space, the middle of the prior.
+"""Moves of failures towards the origin of normal space, the middle of the prior.
 
     z = come_in(limit_state, z)                     # straight, as far as that fails
     z = approach_origin(limit_state, z)             # along the limit state, by its gradients
     z = come_in_by_parts(limit_state, rng, z)       # in some coordinates only
     z, deciding = redraw_by_parts(limit_state, rng, z)
 
-A failure often needs a few coordinates only, and any value of the others. The third way sets these
-others to zero, so that failures of one region become alike, in however many dimensions.
+A failure often depends on a few coordinates only. The third method sets all other coordinates to
+zero, so that failures of one region become similar in any number of dimensions.
 
 Sources: Rackwitz and Fiessler, Structural reliability under combined random load sequences,
 Computers and Structures 9 (1978), for the steps to the least distant failure; Zeller and
@@ -31,7 +31,7 @@ SHORTEST = 0.05
 
 
 def come_in(limit_state: LimitState, z: Float[np.ndarray, "n d"]) -> Float[np.ndarray, "n d"]:
-    """Halve the distance to the origin as long as the points still fail."""
+    """Halve the points' distances to the origin as long as they still fail."""
     return halve(limit_state, z, np.zeros_like(z), HALVINGS)[0]
 
 

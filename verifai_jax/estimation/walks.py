@@ -2,9 +2,9 @@
 
 states, nearest = walk_among_failures(limit_state, rng, z, deciding, groups, steps=24)
 
-A move is `z' = sqrt(1 - s^2) z + s xi`, reversible for the standard normal, and taken where it
-fails. The coordinates that decide whether something fails move in turn with the others: all at once
-could move only as far as the few that decide allow. How far is learnt by the chains of a group.
+A move is `z' = sqrt(1 - s^2) z + s xi`, reversible for the standard normal, and accepted if the new
+point fails. The deciding coordinates and all others move in turn, since a joint move could only be
+as long as the deciding ones allow. The chains of a group learn the step size together.
 
 Source: Papaioannou, Betz, Zwirglmaier and Straub, MCMC algorithms for subset simulation,
 Probabilistic Engineering Mechanics 41 (2015), for the moves and their adaptation.
@@ -36,7 +36,7 @@ def walk_among_failures(
 
     **Arguments:**
     - `z`: the failure where each chain begins.
-    - `deciding`: the coordinates of each that must stay close to their values for it to fail.
+    - `deciding`: for each failure, the coordinates that must stay close to their values.
     - `groups`: the group of each chain, from 0.
     - `steps`: number of simulations of a chain.
     **Returns:** the states of the second half, and the state of each chain nearest to the origin.

@@ -3,10 +3,10 @@
     problem = resolved(problem, gradient=False, batch=1024, budget=20_000)
     problem = resolved(problem, wanted="native")
 
-A gradient needs a backend that JAX can trace. Without one the faster backend is taken, as measured
-on this machine with this problem, unless the run is over before a compiler would be; the
-run notes what was chosen, and why. `engines_for` has the problem in other engines, by which a
-failure is to be confirmed, too.
+If gradients are needed, the backend must be one that JAX can trace. Otherwise the faster backend is
+chosen by measurements on this machine with this problem, unless the run would end before a
+compilation; the run notes the choice and the reason. `engines_for` returns the problem in other
+engines that have to confirm a failure.
 """
 
 import time

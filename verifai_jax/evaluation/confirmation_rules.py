@@ -35,7 +35,7 @@ def decide(
     - `run`: robustness of the rows in the run, if known.
     - `untraceable`: the error raised when a check was traced; empty if there was none.
     - `may_refute`: whether some check simulates more finely than the run.
-    - `by_far`: whether rows have to fail by more than their robustness moved.
+    - `by_far`: whether rows have to fail by more than the change of their robustness.
     - `came_again`: whether other rows could be simulated again, so that an error now means that the
       failure was not reproduced.
     """
@@ -136,7 +136,7 @@ def describe_disagreement(
     - `i`: index of the row.
     - `found`: the replays of all rows, by check.
     - `rho`: robustness of the row in the finest replay.
-    - `band`: how far the robustness moved between replays.
+    - `band`: the change of the robustness between replays.
     - `as_run`: its robustness in the run, if known.
     """
     lost = [name for name in found if not found[name].proper[i]]

@@ -109,7 +109,7 @@ class Confirmation(InNotebook):
     - `row`: its number in the table; None for features that are not a row.
     - `verdict`: `"confirmed"`, `"refuted"`, `"fragile"` or `"raised"`.
     - `rho`: the robustness by name: `as_run`, NaN if unknown, and that of each check.
-    - `band`: how far the robustness moved between the replays.
+    - `band`: the change of the robustness between the replays.
     - `why`: a sentence with the reason for the verdict.
     - `notes`: checks that could not be made, with the reasons.
     - `precision`: the precision of the run.
@@ -174,7 +174,7 @@ class Confirmations(InNotebook):
       none. Names are `float64` (or `again`, in the precision of the run), `half_step`,
       `quarter_step`, `quarter_step_float32`, `nudged` (at the finest step, with features moved by
       one rounding of float32), and `engine.NAME` of another engine.
-    - `band`: `[n]`, how far the robustness moved. Between half and quarter of the step this is the
+    - `band`: `[n]`, the change of the robustness. Between half and quarter of the step this is the
       remaining error of a method of order 1 at the quarter (Richardson extrapolation). By rounding
       it moves between two precisions, two neighbouring features, or the run and its replay if
       `run_rho` is known. A row is confirmed if it fails by more than the former and by four times
@@ -224,7 +224,7 @@ class Confirmations(InNotebook):
             self.rho.setdefault(name, np.full(len(self), np.nan))[rows] = values
 
     def refuse(self) -> tuple[Bool[np.ndarray, " n"], Float[np.ndarray, " n"]]:
-        """Return which rows are not claimed, and the robustness that a search observes for them.
+        """Return flags of unclaimed rows, and the robustness that a search observes for them.
 
         It is the largest value of the run and its replays, and positive, so that a search leaves
         points that are not failures; NaN without a replay.

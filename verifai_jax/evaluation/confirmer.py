@@ -1,18 +1,18 @@
-"""Confirmation of counterexamples: each is replayed more finely than it was found.
+"""Confirmation of counterexamples by replays that are more precise than the search.
 
     confirmer = Confirmer(problem, precision="float32", seed=0)
     found = confirmer(rows, numbers)                    # columns [n] of the table, row numbers [n]
     found.verdict                                       # [n]: "confirmed", "fragile", ...
     found.rho["quarter_step"]                           # [n], robustness at a quarter of the step
 
-A search simulates in single precision at the model's step; both may break a property that the
-model keeps. A counterexample is claimed only if it fails in double precision, at half and at a
-quarter of the step, there in single precision too, and with features that are one rounding away;
-and if it fails by more than the finer step has moved it, and by far more than rounding has.
-What runs on the host and has no finer step is simulated once more, with the same features and the
-same key: what fails then too is confirmed, and what does not is fragile, since the system remembers
-earlier simulations or draws numbers that do not come from its key.
-`confirmation_rules.py` decides from the replays, `confirmations.py` has the results.
+A search simulates in single precision at the model's step; both can cause false violations. A
+counterexample is claimed only if it fails in double precision, at half and at a quarter of the step
+(there also in single precision), and with features changed by one rounding. It also has to fail by
+more than the finer step changed its robustness, and by far more than rounding did. A host system
+without a finer step is simulated once more with the same features and key: a row that fails again
+is confirmed. Otherwise it is fragile, since the system remembers earlier simulations or draws
+numbers that do not come from its key. `confirmation_rules.py` decides from the replays,
+`confirmations.py` has the results.
 """
 
 from collections.abc import Mapping, Sequence

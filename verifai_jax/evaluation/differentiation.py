@@ -5,8 +5,8 @@
     derivatives, auxiliary = derivative.of_several(objective, u)         # values [k]: [k, d]
 
 Forward mode takes a sweep for each coordinate, several at a time, and works for every model.
-Reverse mode takes one sweep whatever their number, but keeps what the way back needs, and JAX has
-none for a loop that ends by its own condition, such as a constraint solver's.
+Reverse mode takes one sweep for any number of coordinates, but stores intermediate results, and JAX
+does not support it for a loop that ends by its own condition, such as a constraint solver's.
 """
 
 from collections.abc import Callable

@@ -6,8 +6,8 @@
     engine_for(problem, 1024, gradient=True).evaluate(u, key, 0, temperature=0.1)
     engine_for(problem, 16, gradient=True, clauses=True)              # clause by clause
 
-A batch is padded to a fixed shape, split over the devices, and worked through in chunks of lanes
-small enough for the cache, so that there is one executable for each (problem, batch, mode).
+A batch is padded to a fixed shape, split over the devices, and processed in chunks of lanes that
+fit into the cache. So there is one executable for each (problem, batch, mode).
 """
 
 import time
@@ -63,8 +63,8 @@ class Engine:
     - `alone`: whether the engine takes one row at a time, without `jax.vmap`, which compiles
       faster; only with `own_keys`.
     - `lanes`: number of rows that a device processes together; by default that of the system.
-    - `effort`: how strongly XLA optimises its programs. By default that of the system; for
-      derivatives, which have few rows, at most a little.
+    - `effort`: XLA's optimisation effort; by default that of the system, and for derivatives, which
+      have few rows, at most little.
     - `guidance`: additional results for a search.
 
     `program` is the program of one row.

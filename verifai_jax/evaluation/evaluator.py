@@ -3,9 +3,9 @@
     evaluate = Evaluator(problem, batch=512, seed=0)
     verdicts = evaluate(u)                              # u [n, d], any n: Verdicts
 
-Every verb that simulates points stands on this: it says which points, and gets verdicts. The
-evaluator takes the engine that suits the problem, compiled or on the host, or sends points to the
-workers of an executor. Each simulation has a random key of its own, by its number.
+Every function that simulates points uses an evaluator, which returns verdicts. It chooses the
+engine that suits the problem, compiled or on the host, or sends points to the workers of an
+executor. The random key of a simulation follows from its number.
 """
 
 from collections.abc import Callable
@@ -36,7 +36,7 @@ NOT_NATIVE = (
     "simulated without native code, which supports only systems that JAX traces, in single "
     "precision and in this process"
 )
-"""Note of a run for which native code was asked for in vain."""
+"""Note of a run for which requested native code was not possible."""
 
 
 class Evaluator:
@@ -215,7 +215,7 @@ class Evaluator:
         temperature: Float[np.ndarray, " n"] | float,
         simulate: Callable[[], Verdicts],
     ) -> Verdicts:
-        """Return the verdicts of work that goes on where an earlier process was killed."""
+        """Return the verdicts of work that continues after an earlier process was killed."""
         kept = self.part()
         if kept is None:
             return simulate()  # Traces are not stored.

@@ -1,13 +1,13 @@
-"""Verdicts from the workers of an executor: rows are cut into blocks, and put together in order.
+"""Verdicts from the workers of an executor: rows are sent in blocks, and verdicts joined in order.
 
     engine = ExecutorEngine(problem, batch=1024, executor=client.get_executor())
     engine.evaluate(u, key, first=0)                    # Verdicts, as of `engine.Engine`
     pending = engine.submit(u, key, first=0)            # the same in two steps
     pending.result()
 
-What a row gives depends on its point and its number alone, so that it does not matter how many
-workers there are, in which order they end, and which of them died and had their blocks run again by
-the executor. Blocks are as long as takes about a second, as measured.
+The verdict of a row depends only on its point and its number, so the number and order of workers do
+not matter, nor whether some died and the executor repeated their blocks. The size of blocks is
+chosen by measurement to take about a second.
 """
 
 from collections import deque

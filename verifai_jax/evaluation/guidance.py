@@ -3,8 +3,7 @@
     guidance = Guidance(guide=True, outcome=True)
     guidance.values(problem, trace, features)           # [size], traced by JAX
 
-Nothing of it decides a verdict. It is computed with the traces of a search that wants it, and
-nowhere else.
+These results never decide a verdict. They are computed only for searches that want them.
 """
 
 from collections.abc import Mapping

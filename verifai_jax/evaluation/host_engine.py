@@ -1,11 +1,10 @@
-"""Evaluation of what JAX cannot trace: the same batches as the engine's, simulated on the host.
+"""Evaluation of systems that JAX cannot trace: batches as for the engine, simulated on the host.
 
     engine = HostEngine(problem)
     engine.evaluate(u, key, first=0)                    # Verdicts, as of `engine.Engine`
 
-A simulation that raises, hangs or takes its process with it becomes a row with a status and a
-message; the others go on. Traces are evaluated in blocks of one shape, so that few monitors
-compile.
+A simulation that raises, hangs or kills its process becomes a row with a status and a message; the
+others continue. Traces are evaluated in blocks of one shape, so that few monitors compile.
 """
 
 import time
@@ -335,7 +334,7 @@ def _without_verdict(status: Status, message: str) -> RowVerdict:
 
 
 def _trace(outcome: Outcome) -> tuple[Trace | None, RowVerdict]:
-    """Return the trace to evaluate; or none, and what its row says instead."""
+    """Return the trace to evaluate; or None, and the content of its row instead."""
     trace, status, message = outcome
     if not isinstance(trace, Trace) and (trace is not None or status == Status.OK):
         given = type(trace).__name__

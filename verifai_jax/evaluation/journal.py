@@ -1,12 +1,12 @@
-"""Rows of a batch that is not finished yet, on disk as soon as they have a verdict.
+"""Rows of an unfinished batch, written to disk as soon as they have a verdict.
 
     journal = Journal(folder)
     journal.add(row, point, verdict)                    # in the log when it returns
     journal.recall(first, points)                       # {i: verdict} of those that are there
     journal.settle(rows)                                # the table and its checkpoint have so many
 
-For simulators of which one simulation takes minutes: a run that is killed in the middle of a batch
-does not simulate its finished rows again. A row is recalled only for the same point.
+For simulators that take minutes: a run killed in the middle of a batch does not simulate its
+finished rows again. A row is recalled only for the same point.
 """
 
 import contextlib

@@ -1,4 +1,4 @@
-"""The work that evaluators of this process are part of, while its simulations are kept in a folder.
+"""The present work of this process, whose simulations are stored in a folder.
 
 kept = present_part(kept, problem, "float32", 0)    # a `Part`; None if nothing is kept
 """

@@ -1,12 +1,12 @@
-"""Simulations by native code, where that is worth its compilation, and by XLA otherwise.
+"""Simulations by native code if its compilation pays, and by XLA otherwise.
 
     engine = NativeEngine(engine_for(problem, 32768), wanted="auto", budget=100_000)
     engine.evaluate(u, key, first=0)                    # Verdicts, as of an `Engine`
 
-Which rows are native follows from the problem, the budget and the number of the row: those from
-`FIRST` on, where the budget is worth it. XLA simulates the rows before, while the native program is
-compiled, and all rows whose robustness is so near to zero that rounding may decide the verdict. A
-native program is used once it agreed with XLA on the rows that it met first.
+Rows from `FIRST` on are native if the budget is large enough for this problem. XLA simulates the
+earlier rows while the native program is compiled, and all rows whose robustness is so near to zero
+that rounding may decide the verdict. A native program is used only if it agrees with XLA on its
+first rows.
 """
 
 import math
@@ -96,7 +96,7 @@ class NativeEngine:
             self._program.begin()
 
     def compile(self) -> None:
-        """Compile now what the first rows need."""
+        """Compile the programs of the first rows now."""
         self._xla.compile()
 
     def evaluate(

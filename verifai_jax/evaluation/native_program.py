@@ -1,4 +1,4 @@
-"""The native program of an engine: compiled once, and used once it agreed with that of XLA.
+"""The native program of an engine: compiled once, and used if it agrees with XLA's.
 
 program = NativeProgram(engine_for(problem, 32768))
 program.begin()                                     # compiles in the background

@@ -1,11 +1,11 @@
-"""The robustness of a problem as a pure function, for optimisers and samplers of one's own.
+"""The robustness of a problem as a pure function, for your own optimisers and samplers.
 
     rho = objective(problem, mtl.smooth(0.1), of="unit")
     rho(u)                                              # u[dim] -> a number; positive, it holds
     jax.grad(rho)(u), jax.vmap(rho)(us), jax.jit(rho)
 
-The searches of this package work on the engine, which batches, pads and counts. This is the same
-number without any of that: a function that JAX transforms.
+The searches of this package use the engine, which batches, pads and counts. This function returns
+the same number without these, so that JAX can transform it.
 """
 
 from collections.abc import Callable, Mapping

@@ -1,11 +1,11 @@
-"""Simulations that all raise: an error of the problem, which is reported once and ends the work.
+"""Detection of problems whose simulations all raise: the error is reported once and ends the work.
 
     raising = Raising()
     raising.add(verdicts.status, verdicts.messages)     # of each batch, until one does not raise
     raising.reason                                      # None, or what all of them say
 
 A formula on a signal that no trace has, a vector where a number is needed, a function with a
-misspelt name: each simulation says the same, and more of them would say nothing else.
+misspelt name: every simulation then raises the same error, so more of them are pointless.
 """
 
 import re

@@ -1,4 +1,4 @@
-"""Notes of simulations on themselves (`Trace.notes`), added up for the notes of a run."""
+"""Notes of simulations (`Trace.notes`), added up for the notes of a run."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field

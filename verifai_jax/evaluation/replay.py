@@ -1,4 +1,4 @@
-"""One simulation looked at again, with its trace.
+"""One repeated simulation, with its trace.
 
 replay(problem, row, key, number).trace             # the trace of a row of a table
 """
@@ -56,7 +56,7 @@ class Replay(InNotebook):
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """Sentences on doubts that the replay shows its row; often none."""
+        """Sentences on doubts that the replay reproduces its row; often none."""
         return tuple(text for text in (self.changed, self.finding) if text)
 
     @property

@@ -83,8 +83,8 @@ class Replays:
     - `precision`: the precision of the replays.
     - `key`: the key of the run's simulations, from `run_keys`.
 
-    `draws` tells whether the system uses its random key, `compile_seconds` how long its programs
-    took to compile. One program is traced at once; its errors are raised here.
+    `draws` tells whether the system uses its random key; `compile_seconds` is the compilation time
+    of its programs. The first program is traced here, and its errors are raised here.
     """
 
     def __init__(self, problem: Problem, precision: str, key: Key[Array, ""]) -> None:
@@ -149,7 +149,7 @@ class Replays:
 
     @staticmethod
     def _together(count: int, times: int) -> int:
-        """Return how many replays are made in one call, of so many rows so many times."""
+        """Return the number of replays in one call, for numbers of rows and repetitions."""
         if count <= ONE_BY_ONE:
             return 1
         some, many = (lanes * len(jax.local_devices()) for lanes in LANES)

@@ -6,9 +6,9 @@
     function = RowFunction(problem, inputs, "float32", gradient=True, goals=None, guidance=NOTHING)
     function(row, key, temperature, shared, Derivative(d))          # Row, traced by JAX
 
-An engine compiles one program for each kind of inputs; everything else about it is the same.
-Derivatives are of an objective, which is a simulation and its monitor: `objective` is that alone,
-and `finish` makes a row's result of its values and their derivatives.
+An engine compiles one such program for each kind of inputs. The differentiated objective consists
+of a simulation and its monitor: `objective` computes its values, and `finish` makes the row's
+result from these values and their derivatives.
 """
 
 import abc
@@ -43,7 +43,7 @@ class Inputs(abc.ABC):
     row_form: PyTree
     """Shapes and types of one row, as `jax.ShapeDtypeStruct`s."""
     shared_form: PyTree = ()
-    """The same of what all rows share."""
+    """The same for values shared by all rows."""
     dim: int = 0
     """Coordinates by which the robustness may be differentiated."""
     keeps_features: bool = False
@@ -51,7 +51,7 @@ class Inputs(abc.ABC):
     streaming: bool = False
     """Whether the monitor may travel with the rollout, where the system allows it."""
     purpose: str = "the simulation"
-    """What is simulated, for people who wait until it is compiled."""
+    """Description of the simulation, shown while it compiles."""
 
     @abc.abstractmethod
     def coordinates(self, row: PyTree, shared: PyTree, precision: str) -> Float[Array, " dim"]:
@@ -69,8 +69,9 @@ class CubePoints(Inputs):
 
     **Arguments:**
     - `problem`: the problem whose space it is.
-    - `given`: whether rows have the form of `given_rows`: points, followed by real numbers of
-      user-given features, which are simulated exactly; NaN stands for the number of the point.
+    - `given`: whether rows have the form of `given_rows`: a point, followed by the real numbers of
+      user-given features, which are simulated exactly. NaN means that the number follows from the
+      point.
     - `precision`: the precision of the given numbers.
     """
 

@@ -1,4 +1,4 @@
-"""The function of one row of an engine as a program that is traced once, and all else made of it.
+"""The function of one row of an engine, traced once, and the programs derived from it.
 
 program = RowProgram(problem, CubePoints(problem), "float32")
 program.trace("evaluate")                           # robustness and status, packed
@@ -46,8 +46,8 @@ class RowProgram:
     - `clauses`: whether to evaluate and differentiate clauses instead.
     - `guidance`: additional results for a search.
 
-    After tracing, `notes` lists decisions that may surprise a user; `derivative` is the way of
-    differentiating rows.
+    After tracing, `notes` lists decisions that may surprise a user; `derivative` is the chosen mode
+    of differentiation.
     """
 
     def __init__(

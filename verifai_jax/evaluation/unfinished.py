@@ -1,13 +1,13 @@
-"""Finished simulations of work that may be killed, in a folder until the work is done.
+"""Finished simulations of work that may be killed, stored in a folder until it is done.
 
     with keeping(folder, {"command": "estimate", "seed": 0}) as kept:
         found = estimate(problem)
         kept.done = True
 
-A verb that is called again with the same arguments asks its evaluators for the same simulations, in
-the same order. So it has those that are in the folder at once, and goes on from there with the
-same result, however the earlier call ended. A simulation is recalled for the same evaluator, point,
-random key and temperature, and while the model is what it was; otherwise the work begins anew.
+A function called again with the same arguments requests the same simulations in the same order. So
+it reads those in the folder and continues with the same result, however the earlier call ended. A
+simulation is recalled only for the same evaluator, point, random key, temperature and model;
+otherwise the work begins again.
 """
 
 import contextlib

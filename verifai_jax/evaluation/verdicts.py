@@ -1,4 +1,4 @@
-"""The result of every simulation, and the law that says which of them violate the property.
+"""The result of every simulation, and the rule that decides which violate the property.
 
     verdicts = engine.evaluate(u, key, first=0)
     verdicts.rho, verdicts.status                       # [n, formulas], [n]

@@ -2,9 +2,9 @@
 
     executor.submit(evaluate_block, shipment, mode, key, first, u, temperature)
 
-A worker keeps the problem and what it has compiled for it between blocks, and compiled programs on
-its disk (`VERIFAI_JAX_CACHE`). Blocks are worked through with as many lanes on a device as on one
-machine, so that their bits do not depend on how the rows were cut.
+A worker keeps the problem and its compiled programs between blocks, and stores programs on its disk
+(`VERIFAI_JAX_CACHE`). Blocks use the same number of lanes per device as on one machine, so their
+bits do not depend on the division into blocks.
 """
 
 import threading

@@ -1,4 +1,4 @@
-"""Runs: the checks and choices before the first simulation, of new runs and of resumed ones.
+"""Starting and resuming runs: the checks and choices before the first simulation.
 
 run = falsify(problem, search="cross_entropy", budget=20_000, seed=0)
 run = resume(run, budget=50_000)
@@ -101,20 +101,21 @@ def falsify(
     - `problem`: what to break.
     - `search`: a name (`verifai_jax.search.names()`), or a search with its options. `"auto"` is
       `portfolio`, or `trace_surrogate`, which saves simulations, if the first two simulations of a
-      black box take half a second or longer. Name it for the same table on a machine of any speed.
+      black box take half a second or longer. Name a search to get the same table on machines of any
+      speed.
     - `budget`: maximum number of simulations; the last batch is cut to fit.
-    - `batch`: simulations in a round. A search that learns does so once a round: a small batch
-      spends fewer simulations, a large one less time. The default is 1024, but at most a twentieth
-      of the budget for a search that learns (16 for `bayes`). If a search does not learn and only
-      the budget can end the run, it is an eighth of a budget over 8192.
+    - `batch`: simulations in a round. A search that learns does so once a round: small batches need
+      fewer simulations, large ones less time. The default is 1024, but at most a twentieth of the
+      budget for a search that learns (16 for `bayes`). For a search that does not learn it is an
+      eighth of any budget over 8192, if only the budget can end the run.
     - `seed`: the same seed gives the same table, bit for bit, on the same machine.
     - `max_seconds`: wall-clock seconds, compilation included, after which no round begins.
-    - `stop_after`: stop after the round in which that many counterexamples are reached.
+    - `stop_after`: number of counterexamples; the run stops after the round that reaches it.
     - `stop_when`: stop when the failure rate is known well enough: `Within(0.005)`,
       `Decided(0.01)`; only for searches that sample the prior.
     - `warm_start`: an earlier run or table with the same features; a search that learns starts from
       its rows. They are not copied.
-    - `folder`: where rows are stored on disk as they come; must not hold another run.
+    - `folder`: the folder in which rows are stored during the run; it must not hold another run.
     - `precision`: of simulations and verdicts, `"float32"` or `"float64"`.
     - `backend`: the backend of a system that has several (`"mjx"`, `"native"`). By default both are
       timed here and the faster one that the search can use is taken, so name it for the same table
@@ -123,8 +124,8 @@ def falsify(
       and a quarter of its step. Violations that disappear are not claimed: they stay in the table
       as `unconfirmed`. At most 1024 rows are replayed, or one for every 128 simulations if that is
       more; the others are `unexamined` (`vj.confirm` replays them). A host system without finer
-      steps simulates violations once more: 32 rows, or one for every 25 simulations, and up to 1024
-      if one of them gave another result.
+      steps only repeats violations: 32 rows, or one for every 25 simulations, and up to 1024 if a
+      repetition gave another result.
     - `diverse`: look for failures of kinds not found yet; `stop_after` then counts failures that
       are far from each other (`search.Diverse`). True or `"inputs"`: far apart in their inputs.
       `"behaviour"`: far apart in the deciding predicate, its time and the shape of the trace.
@@ -143,7 +144,7 @@ def falsify(
       `concurrent.futures`. On workers with this machine's kind of processor the table is the same,
       bit for bit.
     - `keep_going`: whether to go on if the first simulations all raise. Otherwise the run ends with
-      an error after 16 that raise the same, or after a first round of many at once.
+      an error after 16 simulations with the same error, or after the first large round.
     - `engine`: `"xla"`, or `"native"`: rows from the 513th on are simulated by vector code that the
       machine's own C++ compiler builds. It is two to five times as fast if no large network is in
       the loop, and equal up to rounding; XLA decides values near zero, and simulates what cannot be
@@ -310,7 +311,7 @@ def resume(
     even_if_changed: bool = False,
     keep_going: bool = False,
 ) -> Run:
-    """Continue a run that stopped or was cut off, as if it had never stopped.
+    """Continue a run that stopped or was interrupted, as if it had never stopped.
 
     **Arguments:**
     - `run`: a run, or its folder; new rows are added to a folder.
@@ -364,7 +365,7 @@ def _resume(
     even_if_changed: bool,
     keep_going: bool,
 ) -> Run:
-    """Go on with a run whose folder is locked; `ends` is completed from the run."""
+    """Continue a run whose folder is locked; missing conditions in `ends` come from the run."""
     made = {"derived": run.derived, "space_data": run.space_data}
     problem = run.problem if problem is None else as_simulated(problem, made)
     if problem is None:
@@ -433,7 +434,7 @@ def _resume(
 
 
 def _seconds_of(run: Run) -> dict[str, float]:
-    """Return the seconds of a run by what they were spent on."""
+    """Return the seconds of a run by activity."""
     rest = max(run.run_seconds - run.search_seconds - run.simulate_seconds, 0.0)
     return {
         COMPILE: run.compile_seconds,

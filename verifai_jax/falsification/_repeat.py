@@ -1,12 +1,12 @@
-"""The same search from many seeds in one compiled program: how soon, and how surely, it falsifies.
+"""The same search from many seeds in one compiled program, to measure how soon it falsifies.
 
     trials = repeat(problem, "gradient", budget=300, batch=8, seeds=50)
     trials.falsified, trials.median_simulations         # seeds that found a failure; how soon
     trials.first_failure                                # [seeds], counted from 1; inf without one
     trials.violating, trials.first_violation            # the same as simulated, before confirmation
 
-Whole rounds (ask, simulate, evaluate, differentiate, tell) run in one `lax.scan`, all seeds side by
-side: for comparing searches, where a run a seed would spend its time between rounds.
+Whole rounds (ask, simulate, evaluate, differentiate, tell) of all seeds run together in one
+`lax.scan`. Separate runs for each seed would spend most of their time between rounds.
 """
 
 from collections.abc import Mapping, Sequence
@@ -38,7 +38,7 @@ from verifai_jax.problem.problem import Problem
 from verifai_jax.search import Observations, Search
 
 SIMULATIONS_A_CALL = 512
-"""Of each seed between two looks at who has found a failure: so many at most are made in vain."""
+"""Simulations of each seed between two checks for failures; at most so many are wasted."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,12 +48,12 @@ class Trials(InNotebook):
     - `name`, `search`: the name of the problem; the repr of the search.
     - `seeds`: `[seeds]`, the seeds.
     - `batch`: simulations in a round.
-    - `rho`: `[seeds, simulations]`, the least robustness of the formulas; NaN without a verdict.
-    - `violated`: `[seeds, simulations]`, which simulations violate the property, as in `falsify`.
+    - `rho`: `[seeds, simulations]`, the least robustness over the formulas; NaN without a verdict.
+    - `violated`: `[seeds, simulations]`, whether a simulation violates the property.
     - `failures`: `[seeds, d]`, the first failing point of each seed in the unit cube, or NaN.
-    - `not_claimed`: `[seeds, simulations]`, which violating simulations closer replays reject, as
-      in `falsify`; None without closer replays. Unless all violations were replayed, replays of a
-      seed end with its first claimed failure.
+    - `not_claimed`: `[seeds, simulations]`, whether closer replays reject a violation, as in
+      `falsify`; None without closer replays. Unless all violations were replayed, replays of a seed
+      end with its first claimed failure.
     - `differentiated`: `[seeds, simulations]`, the differentiated simulations; None if none or all
       were.
     - `sources`: the files of the model, as a run records them.
@@ -71,7 +71,7 @@ class Trials(InNotebook):
     sources: Mapping[str, Any] = field(default_factory=dict)
 
     def cost(self, derivative: float = 2.0) -> Float[np.ndarray, " seeds"]:
-        """Return `first_failure`, counting each differentiated simulation as this many."""
+        """Return `first_failure`, with each differentiated simulation counted as several."""
         first = self.first_failure
         if self.differentiated is None:
             return first
@@ -143,7 +143,7 @@ def repeat(
     confirm: bool = True,
     progress: bool | None = None,
 ) -> Trials:
-    """Run a search from many seeds at once; each seed proposes what it would in `falsify`.
+    """Run a search from many seeds at once; each seed proposes the same points as in `falsify`.
 
     **Arguments:**
     - `budget`: simulations of each seed, rounded up to whole batches.
@@ -153,9 +153,9 @@ def repeat(
       (`portfolio`, `gradient`) each seed ends with its own first failure.
     - `confirm`: count only failures that `falsify` would claim: a violation is replayed more
       finely, and does not count if it is `refuted` or `fragile`. A replay costs at least ten
-      simulations, so violations of a seed are replayed in order until one is claimed (all of them
-      without `stop_early`), for all seeds together. False counts violations as simulated, and
-      compiles nothing but the search.
+      simulations, so the violations of a seed are replayed in order only until one is claimed
+      (without `stop_early`, all of them). False counts violations as simulated, and compiles only
+      the search.
     - `progress`: whether to show one line of progress; see `core.display.progress` for the default.
 
     A search that plans its rounds observes an unclaimed violation as safe, as in `falsify`. Any
@@ -166,8 +166,8 @@ def repeat(
     violations that are not claimed.
     **Raises:** the errors of `falsify`; `AlwaysRaises` if all of the first simulations raise the
     same error; `ValueError` for a black box, a constraint (`where=`), a priority, a guide or the
-    search `trace_surrogate`, which need work between rounds: use `falsify` with one seed after the
-    other.
+    search `trace_surrogate`, which need work between rounds: call `falsify` once for each seed
+    instead.
     """
     check_options(budget, 1 if batch is None else batch, 0, None, None)
     search = check_search(problem, search)
@@ -230,7 +230,7 @@ def repeat(
 
 
 def _first(failing: Bool[np.ndarray, "seeds simulations"]) -> Float[np.ndarray, " seeds"]:
-    """Return the number of each seed's first such simulation, from 1; infinite without one."""
+    """Return the number of each seed's first marked simulation, from 1; infinite without one."""
     return np.where(failing.any(axis=1), failing.argmax(axis=1) + 1.0, np.inf)
 
 
@@ -244,7 +244,7 @@ def _traced(problem: Problem, backend: str | None) -> Problem | None:
 
 
 class _WholeRounds:
-    """Compiled rounds of a search, several at a time, from all seeds side by side."""
+    """Compiled rounds of a search, several at a time, for all seeds together."""
 
     def __init__(
         self, problem: Problem, search: Search, batch: int, rounds: int, precision: str

@@ -1,4 +1,4 @@
-"""Rows of a cheap model that a run of a slow model of the same features begins with.
+"""Rows of a cheap model, with which a run of a slow model of the same features begins.
 
 check_same_features(slow, cheap)
 rows = gravest_rows(run_of_cheap, 16)               # features to simulate first
@@ -15,13 +15,13 @@ from verifai_jax.problem.problem import Problem, ProblemError
 if TYPE_CHECKING:
     import pandas as pd
 TIMES, MAX_CHEAP = 20, 50_000
-"""Simulations of a cheap model for each one of the slow one, and at most."""
+"""Simulations of a cheap model for each simulation of the slow one, and their maximum."""
 MAX_ROWS = 16
-"""Rows that a cheap model proposes at most: beyond these its failures are alike."""
+"""Maximum number of rows that a cheap model proposes; further failures would be similar."""
 MAX_CANDIDATES = 4096
-"""Rows of the cheap run at most among which those to simulate are chosen, the lowest ones."""
+"""Maximum number of candidates: the rows of the cheap run with the lowest robustness."""
 LOWEST = 0.02
-"""Share of the rows that are candidates, where fewer fail."""
+"""Share of the rows that are candidates if fewer rows fail."""
 
 
 def check_same_features(slow: Problem, cheap: Problem) -> None:
@@ -47,17 +47,17 @@ def check_same_features(slow: Problem, cheap: Problem) -> None:
 
 
 def budget_for(budget: int) -> int:
-    """Return the number of simulations of a cheap model, given the budget of the slow one."""
+    """Return the number of simulations of a cheap model from the budget of the slow one."""
     return min(TIMES * budget, MAX_CHEAP)
 
 
 def gravest_rows(run: Run, cheap: Problem, budget: int) -> "pd.DataFrame":
-    """Choose rows of a run: its gravest failure, then failures far from those chosen before.
+    """Choose rows of a run: its gravest failure, then failures far from the chosen ones.
 
     If few rows fail, those with the lowest robustness are used as well.
 
     **Arguments:**
-    - `run`, `cheap`: the run of the cheap model, and that model.
+    - `run`, `cheap`: the run of the cheap model, and the model.
     - `budget`: simulations of the slow model; at most a quarter of them go to these rows.
     """
     count = max(1, min(budget // 4, MAX_ROWS))

@@ -190,7 +190,7 @@ def rows_of(
 
 
 def without_failure(verdicts: Verdicts, rows: Bool[np.ndarray, " n"]) -> Verdicts:
-    """Raise the clauses of these rows until they are not broken."""
+    """Raise the robustness of these rows' clauses until none is broken."""
     if verdicts.clauses is None or not rows.any():
         return verdicts
     lift = np.where(rows, 1e-6 - np.max(verdicts.clauses, axis=1), 0.0)

@@ -1,10 +1,10 @@
-"""Closer replays of what the seeds of `repeat` violate: which failures `falsify` would claim.
+"""Closer replays of the violations in `repeat`, to find the failures that `falsify` would claim.
 
     confirmer = SeedConfirmer(problem, "float32", seeds, thorough=False)
     refused, greatest = confirmer(seed, numbers, u, rho)      # of violating simulations
 
-A replay costs as much as many simulations, so of each seed they are made in their order until one
-is claimed; of all seeds together, so that few programs make many of them.
+A replay costs as much as many simulations. So the violations of each seed are replayed in order
+until one is claimed, and those of all seeds together in few large batches.
 """
 
 import jax
@@ -56,11 +56,11 @@ class SeedConfirmer:
         """Replay violating simulations.
 
         **Arguments:**
-        - `seed`: index of the seed of each, ascending.
+        - `seed`: index of the seed of each simulation, ascending.
         - `numbers`: the numbers of the simulations in their runs, ascending for each seed.
         - `u`, `rho`: their points and the least formula's robustness.
-        **Returns:** which of them are not claimed, and the greatest robustness of their replays, at
-        least 1e-6, NaN where there was none.
+        **Returns:** for each simulation, whether it is not claimed, and the greatest robustness of
+        its replays, at least 1e-6, or NaN without replays.
         """
         refused, greatest = np.zeros(len(seed), bool), np.full(len(seed), np.nan)
         left, width = np.arange(len(seed)), 1
@@ -123,5 +123,5 @@ class SeedConfirmer:
 
 
 def _rank(seed: Int[np.ndarray, " n"]) -> Int[np.ndarray, " n"]:
-    """Return the number of each row within those of its seed, from 0; seeds are ascending."""
+    """Return the position of each row among the rows of its seed, from 0; seeds are ascending."""
     return np.arange(len(seed)) - np.searchsorted(seed, seed)

@@ -1,4 +1,4 @@
-"""Counts over the rows of a table that stand out: what a summary says, without the other rows."""
+"""Counts over the rows of a table that stand out, from which a summary is written."""
 
 from collections import Counter
 from collections.abc import Iterable
@@ -14,17 +14,18 @@ from verifai_jax.falsification.columns import Columns
 
 @dataclass
 class Counts:
-    """Counts over a table, computed from its rows that are not ordinary safe rows.
+    """Counts over a table, computed without its ordinary safe rows.
 
     - `violating`: rows that violate the property as simulated.
-    - `claimed`: those among them that closer replays did not refute.
+    - `claimed`: violating rows that closer replays did not refute.
     - `failing_alone`: violating rows that violate only this formula, if there are several.
-    - `failed`: rows without a verdict, by status, the most frequent first.
-    - `verdicts`: violating rows by what closer replays say, the most frequent first.
-    - `repetitions`: how many violating rows of a host system gave the same result again.
+    - `failed`: number of rows without a verdict by status, the most frequent first.
+    - `verdicts`: number of violating rows by verdict of closer replays, the most frequent first.
+    - `repetitions`: number of violating rows of a host system whose repetition gave the same
+      result.
     - `worst`: number of the claimed row with the least robustness; None without one.
     - `nearest`: number of the row with the least robustness among all rows with a verdict.
-    - `lowest`: the least robustness of all rows; NaN where none has one.
+    - `lowest`: the least robustness of all rows; NaN if no row has a verdict.
     - `first_message`: number and text of the first row without a verdict that has a message.
     - `not_differentiated`: rows whose gradient is not finite.
     """

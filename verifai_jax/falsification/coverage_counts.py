@@ -1,11 +1,12 @@
-"""Coverage ids of simulations, numbers of what they covered, and who was the first to have each.
+"""Coverage ids: numbers of the items that simulations covered, and the first row for each.
 
     coverage = CoverageCounts(problem)
     rows = coverage.of(points, verdicts)                   # [n, ids], -1 for nothing
     fresh = coverage.add(rows)                             # [n], ids that no earlier row had
 
-The numbers: statuses first, then what features cover (transitions of an automaton, and pairs of
-them), then what traces show (`problem.behaviour`): cells, and the clause nearest to breaking.
+The ids number statuses first, then items covered by features (transitions of an automaton and pairs
+of them), then items covered by traces (`problem.behaviour`): cells, and the clause nearest to
+breaking.
 """
 
 from collections.abc import Mapping

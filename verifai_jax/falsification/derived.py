@@ -1,9 +1,9 @@
-"""The problem that a run simulated, made again from the one that a person gives.
+"""The problem that a run simulated, derived again from the problem that the user gives.
 
     as_simulated(problem, record)       # with the properties of `fuzz`, and with features held
 
-A verb may simulate another problem than the one that it is given: `fuzz` adds properties of its
-own, `--only` holds features. Whoever goes on with the run names the problem as they wrote it.
+A command may simulate a modified problem: `fuzz` adds its own properties, and `--only` holds
+features at their nominal values. To continue the run, users name the unmodified problem.
 """
 
 from collections.abc import Mapping

@@ -1,13 +1,13 @@
-"""Proposals of the search of a run, and what it learns of the simulations.
+"""The proposals of a run's search, and its learning from simulations.
 
     learning = Learning(problem, search, key)
     learning.begin(batch=32)                            # once its programs are being compiled
     points = learning.proposals.next(32)
     learning.learn(Batch(points, "search"), objective, verdicts, coverage_ids)
 
-A search minimises the robustness of the worst formula, or, where formulas have a priority, the one
-number of `problem.rulebook.Objective`; a guide adds its term. Some searches want more: coverage ids
-of what was covered, what happened in a trace, or a model of the traces (`Surrogate`).
+A search minimises the robustness of the worst formula or, for formulas with a priority, the number
+of `problem.rulebook.Objective`; a guide adds its term. Some searches also need coverage ids,
+traces, or a model of the traces (`Surrogate`).
 """
 
 from collections.abc import Mapping
@@ -33,16 +33,16 @@ MAX_WARM = 2048
 """Rows of an earlier table that a search starts with at most, the worst ones: a bound on what the
 first `tell` costs, whatever the length of that table."""
 Source = Literal["search", "first", "suggested"]
-"""Who gave the points of a round: the search, a person before it began, or a person on the way."""
+"""The origin of a round's points: the search, the user before the run, or the user during it."""
 
 
 class Batch(NamedTuple):
     """The points of a round.
 
     - `points`: the points of the unit cube, or rows of given features (`given_rows`).
-    - `source`: who proposed them.
+    - `source`: the origin of the points.
     - `cut`: whether the budget cut the round.
-    - `verdicts`: their verdicts, if workers have simulated them already.
+    - `verdicts`: verdicts of the points, if workers have simulated them already.
     """
 
     points: Float[Any, "n row"]
@@ -117,7 +117,7 @@ class Learning:
 
     @property
     def distinct(self) -> int | None:
-        """Failures that are far from each other, for a search for diverse ones; else None."""
+        """Failures that are far from each other, for a search for diverse failures; else None."""
         return self.proposals.distinct
 
     @property
@@ -191,7 +191,7 @@ class Learning:
         coverage_ids: Int[np.ndarray, "n ids"] | None,
         outcomes: Float[np.ndarray, "n outcome"] | None,
     ) -> None:
-        """Tell the search what came of its points, in float32 whatever the simulations do."""
+        """Pass the results of its points to the search, always in float32."""
 
         def single(values: np.ndarray | None) -> np.ndarray | None:
             return None if values is None else values.astype(np.float32)

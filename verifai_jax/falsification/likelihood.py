@@ -3,9 +3,9 @@
     objective = Likelihood(problem.space)
     objective, verdicts = objective.learned(points, rho, verdicts)
 
-Failures are the better the likelier they are, and all others are worse than any failure, the worse
-the greater their robustness (Lee et al., Adaptive stress testing: finding likely failure events
-with reinforcement learning, JAIR 69, 2020). It is never negative, so that no search stays with the
+Likelier failures have a lower objective. Safe rows have a higher objective than any failure, and it
+grows with their robustness (Lee et al., Adaptive stress testing: finding likely failure events with
+reinforcement learning, JAIR 69, 2020). It is never negative, so that no search stays with the
 failures that it has found.
 """
 
@@ -18,7 +18,7 @@ from verifai_jax.features import FeatureSpace
 from verifai_jax.features.improbability import Improbability
 
 SAFE = 1e4
-"""The objective of a robustness of zero: more standard deviations than any failure departs by."""
+"""The objective of a robustness of zero: more standard deviations than any failure has."""
 
 
 class Likelihood:
@@ -39,7 +39,7 @@ class Likelihood:
         rho: Float[np.ndarray, " n"],
         failing: Bool[np.ndarray, " n"],
     ) -> Float[np.ndarray, " n"]:
-        """Return the standard deviations of failures, and more for what does not fail."""
+        """Return the distance of failures in standard deviations, and more for safe rows."""
         known = np.abs(rho[np.isfinite(rho)])
         if not self.state["scale"] and known.any():
             self.state = {"scale": np.array(np.mean(known))}
@@ -53,7 +53,7 @@ class Likelihood:
 
         **Arguments:**
         - `points`: the points of a round, in the unit cube.
-        - `rho`: the objective of a usual search; positive where a failure is not claimed.
+        - `rho`: the usual objective, which is positive for failures that are not claimed.
         - `verdicts`: the verdicts of their simulations.
         """
         points = np.asarray(points, np.float64)

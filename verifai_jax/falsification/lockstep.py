@@ -1,8 +1,8 @@
-"""Many seeds of a search that plans its rounds, side by side: for `repeat`.
+"""Many seeds of a search that plans its rounds, run together for `repeat`.
 
-Such a search asks for derivatives in some rounds only, each seed in its own. A program of whole
-rounds would have to differentiate every simulation; here the points of all seeds that want the same
-go together, and the loop is on the host.
+Such a search needs derivatives only in some rounds, which differ between seeds. One program for
+whole rounds would have to differentiate every simulation. So the loop runs on the host, and points
+of all seeds with the same needs are simulated together.
 """
 
 from functools import partial
@@ -35,7 +35,7 @@ DERIVATIVES_AT_ONCE = 64
 class SeedHistories(NamedTuple):
     """The simulations of each seed, padded after its last one.
 
-    - `rho`: the least robustness; NaN where there is no simulation or no verdict.
+    - `rho`: the least robustness; NaN without a simulation or a verdict.
     - `violated`: whether the simulation violates the property.
     - `differentiated`: whether derivatives were taken.
     - `failures`: the first failing point of each seed in the unit cube; the first claimed one if

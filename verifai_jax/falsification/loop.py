@@ -5,8 +5,8 @@
     while ...:
         rounds.advance(batch)
 
-A round leaves everything in step: the table, the search and the counts. The `checkpoint` after a
-round is enough to go on from there, whatever happened since.
+After a round the table, the search and the counts are consistent. The `checkpoint` after a round is
+enough to continue from there.
 """
 
 import time
@@ -45,7 +45,7 @@ if TYPE_CHECKING:
     from verifai_jax.falsification.suggestions import Suggestions
     from verifai_jax.search import Suggested
 COMPILE, SEARCH, SIMULATE, CONFIRM, REST = "compile", "search", "simulate", "confirm", "rest"
-"""What the seconds of a run are spent on."""
+"""Activities by which the seconds of a run are counted."""
 
 
 class Rounds:
@@ -56,7 +56,7 @@ class Rounds:
     `record_checksum` is the checksum of the run's record, for the checkpoints. `only_budget_ends`
     is true if nothing but the budget can end the run. `checks` names the closer replays that were
     made. `watch` measures seconds: `COMPILE`; `SEARCH`, for proposals, learning and suggestions;
-    `SIMULATE`, including adding rows to the table; `CONFIRM`. All other time belongs to the caller.
+    `SIMULATE`, including adding rows to the table; `CONFIRM`. Other time is not counted here.
     """
 
     def __init__(
@@ -112,8 +112,8 @@ class Rounds:
     def compile(self, resumed: bool = False) -> None:
         """Compile the engine and the search, concurrently.
 
-        - `resumed`: whether the first round may be of any kind. A new run begins with gradients if
-          the first stage of the search wants those of clauses.
+        - `resumed`: whether the run is resumed, so that its first round may be of any kind. A new
+          run begins with gradients if the first stage of the search wants gradients of clauses.
         """
         cube = self.problem.space.cube
         while_compiling(import_tables, after=0.0)
@@ -198,7 +198,7 @@ class Rounds:
         return Prefetch(proposals, self.evaluate, self.batch, limit, done, self._searching)
 
     def _simulate(self, batch: Batch, first: int) -> Verdicts:
-        """Simulate the points of a round, of which the first has this number in the run."""
+        """Simulate the points of a round; `first` is the number of its first row in the run."""
         compiled, proposals = self._simulations.compile_seconds, self.learning.proposals
         verdicts = self._simulations(
             batch.points,
@@ -213,7 +213,7 @@ class Rounds:
     def _take_in(self, batch: Batch, verdicts: Verdicts, *, learns: bool = True) -> None:
         """Confirm, learn from, store and count the simulations of a round.
 
-        - `learns`: whether the search learns of them; not of rows after which the run ends.
+        - `learns`: whether the search learns from them, which it need not after the last round.
         """
         self._raising.add(verdicts.status, verdicts.messages)
         if batch.given:
@@ -245,10 +245,10 @@ class Rounds:
         columns: dict[str, np.ndarray],
         objective: Float[np.ndarray, " n"],
     ) -> tuple[Bool[np.ndarray, " n"], Float[np.ndarray, " n"]]:
-        """Replay what violates the property, and write the verdicts into the columns.
+        """Replay violations, and write the verdicts into the columns.
 
-        **Returns:** which rows are claimed, and the objective, in which the others hold: a search
-        that took them for failures would stay with them.
+        **Returns:** flags of the claimed rows, and the objective, in which unclaimed rows count as
+        safe, so that a search does not stay with them.
         """
         with self.watch.on(CONFIRM):
             compiled = confirmer.compile_seconds
@@ -270,7 +270,7 @@ class Rounds:
 
     @contextmanager
     def _searching(self) -> Iterator[None]:
-        """Count the time as the search's, but for that in which its programs compile."""
+        """Count the time as the search's, except the time of compiling its programs."""
         with self.watch.on(SEARCH), self.watch.waiting_for_programs_is(COMPILE):
             yield
 
@@ -301,13 +301,13 @@ class Rounds:
         self.save()
 
     def measure(self, maximum: int, timed: bool) -> float:
-        """Simulate the first rows, and return the shortest time of one in seconds.
+        """Simulate the first rows, and return the shortest time of a row in seconds.
 
         These rows belong to the run. They are simulated one by one; if the first is quick and does
         not raise, it is the only one.
 
         - `maximum`: maximum size of the first round.
-        - `timed`: whether the time is wanted, for which rows are simulated one by one.
+        - `timed`: whether to measure the time, for which rows are simulated one by one.
         """
         if not len(self.first):
             with self._searching():
@@ -319,7 +319,7 @@ class Rounds:
     def take_in_measured(self) -> None:
         """Store the rows that were simulated one by one, without the rest of their round.
 
-        The checkpoint stays before them: a resumed run simulates their whole round.
+        The checkpoint stays that before these rows: a resumed run repeats their whole round.
         """
         given = len(self.first) > 0
         points = np.asarray(self.first if given else self._pending)[: self._simulations.measured]
@@ -348,7 +348,7 @@ class Rounds:
     def _journal_without_traces(self) -> None:
         """Leave the journal if traces are wanted: its rows have none.
 
-        Those of a batch that is cut off are simulated again.
+        Rows of an interrupted batch are simulated again.
         """
         if self.learning.surrogate is not None and self._journal is not None:
             self._journal.settle(len(self.table) + MEASURED)
@@ -433,7 +433,7 @@ class Rounds:
         self._keep()
 
     def _keep(self) -> None:
-        """Take the checkpoint: nothing is copied, as nothing in it is ever written to."""
+        """Take the checkpoint, without copies, because none of its arrays is ever modified."""
         ahead, proposals = self._prefetch, self.learning.proposals
         state = proposals.checkpoint() if ahead is None else ahead.checkpoint
         self.checkpoint = {**state, "rows": np.array(len(self.table))}
@@ -442,6 +442,6 @@ class Rounds:
 
     @property
     def _parts(self) -> "list[Learning | Suggestions | Confirmer]":
-        """What has entries of its own in a checkpoint."""
+        """The objects with their own entries in a checkpoint."""
         each = (self.learning, self.suggestions, self._confirmer)
         return [part for part in each if part is not None]

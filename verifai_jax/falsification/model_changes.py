@@ -1,9 +1,9 @@
-"""Changes of the model of a run since it ran, and rows that do not give their numbers again.
+"""Changes of a run's model since it ran, and rows whose replay gives another number.
 
     sources_of_row(run.sources, 417)                    # what row 417 was simulated with
     finding_of(seen, stored, several=False)             # "" where a replay gives the row's number
 
-A run has a record of its model for each part of it that was simulated in one go.
+A run records its model for each part that was simulated without interruption.
 """
 
 from collections.abc import Mapping, Sequence
@@ -22,12 +22,11 @@ ROUNDING = 1e-4
 """Share of the signals by which a replay may differ where JAX compiles it: alone it rounds
 otherwise than in a batch, and some systems make that grow."""
 EXACT = 1e-6
-"""The same for a black box, whose code is the same; its numbers are stored in single precision."""
+"""The same for a black box, which runs the same code; its numbers are stored as float32."""
 NEAR = 1e-3
-"""The same for a replay in another precision, above which it is simulated again in that of the
-run."""
-EVEN = "even_if_changed=True (--even-if-changed) goes on all the same, and notes it in the record"
-"""How to go on with another model."""
+"""The same for a replay in another precision; above it, the run's own precision is tried."""
+EVEN = "even_if_changed=True (--even-if-changed) continues regardless, and notes it in the record"
+"""Advice on continuing with another model."""
 
 
 def sources_of_row(recorded: Sequence[Mapping[str, Any]], row: int) -> Sources | None:
@@ -93,7 +92,7 @@ def continued_with(
 
 
 def has_several_models(recorded: Sequence[Mapping[str, Any]]) -> bool:
-    """Return whether rows of a run come from several models, and so sample none of them."""
+    """Return whether rows of a run come from several models, so that they sample no single one."""
     parts = [Sources.from_json(part) for part in recorded]
     return any(before.changes(after) for before, after in pairwise(parts))
 
@@ -144,7 +143,7 @@ def finding_of(
 
 
 def _scale(seen: "Replay") -> float:
-    """Return the greatest number that the formulas see, which rounding is a share of."""
+    """Return the greatest number in the formulas' signals, to which rounding is relative."""
     values = [np.asarray(seen.trace.signals[n]) for n in seen.problem.monitored]
     values += [np.asarray(list(seen.rho.values()))]
     greatest = [np.max(np.abs(each[np.isfinite(each)]), initial=0.0) for each in values]

@@ -1,8 +1,8 @@
-"""Sentences on a run whose rows are no samples of the prior, and so give no failure rate.
+"""Sentences on a run whose rows are not samples of the prior, so that it has no failure rate.
 
     why_no_rate(run)                   "its points are those of a sequence, spread on purpose"
 
-Every text that says so takes its reason from here, so that all of them give the same one.
+All texts take the reason from here, so that they agree.
 """
 
 from verifai_jax.falsification.run import Run

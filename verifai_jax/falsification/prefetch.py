@@ -3,10 +3,10 @@
     ahead = Prefetch(proposals, evaluate, batch=1024, limit=1_000_000, first=0)
     points, verdicts = ahead.next()                     # of one round, in their order
 
-Such a search can be asked for the points of many rounds before the verdicts of the first are there:
-no worker of an executor waits, and in this process the next round is simulated while the last one
-is confirmed and stored. The checkpoint is that of the last round that was taken: what is on its way
-when the run ends is as if it had never been proposed.
+Such a search can propose many rounds before the verdicts of the first are known. So no worker of an
+executor waits, and in this process the next round is simulated while the last one is confirmed and
+stored. The checkpoint is that of the last round taken; rounds still running when the run ends are
+discarded.
 """
 
 from collections import deque
@@ -31,7 +31,7 @@ one is confirmed for longer than another takes."""
 
 
 class _Round(NamedTuple):
-    """One round: its points, where it begins among those sent together, the state after it."""
+    """One round: its points, its offset among the rows sent together, and the state after it."""
 
     points: Float[Any, "n d"]
     pending: Pending | Future[Verdicts]
@@ -108,7 +108,7 @@ class Prefetch:
 
     @property
     def _ahead(self) -> int:
-        """Rows that are on their way at a time."""
+        """Number of rows that are simulated ahead at a time."""
         return AHEAD * self._batch if self._workers is None else self._workers.ahead
 
     def _submit(self, points: Float[Any, "n d"], first: int) -> Pending | Future[Verdicts]:
@@ -121,7 +121,7 @@ class Prefetch:
             return self._evaluate(points, first=first)
 
     def _fill(self) -> None:
-        """Propose and send rounds until enough rows are on their way."""
+        """Propose and send rounds until enough rows are being simulated."""
         waiting = sum(len(each.points) for each in self._rounds)
         while waiting < max(self._ahead, 1) and self._failure is None:
             group: list[tuple[Any, dict[str, Any]]] = []

@@ -1,4 +1,4 @@
-"""The result of a falsification: its table, its statistics, and how to see a row again."""
+"""The result of a falsification: its table, its statistics, and replays of its rows."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -42,8 +42,8 @@ class Run(InNotebook):
     - `table`, `search`: one row for each simulation; the repr of the search that proposed them.
     - `seed`, `batch`, `budget`: as given to `falsify`.
     - `stopped`: `"budget"`, `"max_seconds"`, `"stop_after"`, `"stop_when"`, `"exhausted"` (a finite
-      search came to its end), `"interrupted"`, the error that ended it, or `"running"` for one that
-      was cut off.
+      search came to its end), `"interrupted"`, the error that ended it, or `"running"` if the
+      process was killed.
     - `compile_seconds`, `confirm_seconds`, `run_seconds`: time spent compiling, in closer replays,
       and in everything else, over all parts of the run.
     - `search_seconds`: the part of `run_seconds` spent on proposals, suggestions and learning.
@@ -51,9 +51,9 @@ class Run(InNotebook):
       table. The rest went to callbacks and checkpoints.
     - `version`: the version of verifai_jax.
     - `prior`: whether the rows are independent samples of the feature space.
-    - `origin`: why the rows are not such samples: `"first"` (given rows came first), `"given"` (all
-      were given), `"sequence"` (a low-discrepancy sequence), `"coverage"`, `"learned"` (by the
-      search).
+    - `origin`: the reason why the rows are not such samples: `"first"` (given rows came first),
+      `"given"` (all were given), `"sequence"` (a low-discrepancy sequence), `"coverage"`,
+      `"learned"` (by the search).
     - `folder`: the folder on disk; None for a run in memory.
     - `target`: the problem's name on the command line.
     - `problem`: the problem; None for a run that was loaded without it.
@@ -64,7 +64,7 @@ class Run(InNotebook):
     - `backend`: the backend that simulated; None for a system that has only one.
     - `engine`: `"xla"`, `"native"` for rows from the 513th on, or `"host"` for a black box;
       `"auto"` before it is decided.
-    - `notes`: decisions that were made without asking the user.
+    - `notes`: sentences on automatic decisions and likely mistakes.
     - `lasting_notes`: the `notes` that stay true when the run is resumed.
     - `confirm`: whether violations were replayed more finely before they were claimed.
     - `checks`: names of the checks that a confirmed row has passed; empty if none was made.
@@ -76,7 +76,7 @@ class Run(InNotebook):
       not.
     - `requirements`: the content of the formulas' requirements, by identifier, as plain data.
     - `model`: a hash of the simulated model, for a problem with requirements.
-    - `damage`: which parts of its files could not be read; such a run cannot be resumed.
+    - `damage`: a description of unreadable parts of its files; such a run cannot be resumed.
     """
 
     _internal = frozenset((
@@ -124,7 +124,7 @@ class Run(InNotebook):
 
     @property
     def checked(self) -> str:
-        """The checks that a confirmed row has passed, as the end of a sentence; often empty."""
+        """The checks that a confirmed row has passed, as the end of a sentence; may be empty."""
         return describe_checks(self.checks)
 
     @property
@@ -144,7 +144,7 @@ class Run(InNotebook):
 
     @property
     def best(self) -> "pd.Series":
-        """The counterexample with the least robustness; without any, the row with the least one.
+        """The counterexample with the least robustness, or without any the row with the least.
 
         **Raises:** `ValueError` when no simulation ended properly.
         """
@@ -260,7 +260,7 @@ class Run(InNotebook):
         return len(self.formulas) > 1
 
     def _why_not_again(self, row: int) -> str:
-        """Say what may be the reason where no file has changed."""
+        """Name possible reasons for a difference although no file has changed."""
         then = sources_of_row(self.sources, row)
         if then is None or self.problem is None:
             return "the files of its model were not recorded, so it may have changed"
@@ -279,7 +279,7 @@ class Run(InNotebook):
         **Returns:** a table indexed by row number. `log_density` is the natural logarithm of the
         prior's density (in a constrained space not divided by the accepted share), NaN if a feature
         has no density, such as an automaton. For each column with a distribution `tail.NAME` is the
-        probability of a value at least as far out.
+        probability of a value at least as extreme.
         **Raises:** `ValueError` if neither the problem nor the space of the run is known, and for a
         row outside the space.
         """
@@ -372,7 +372,7 @@ class Run(InNotebook):
     def _natively(
         self, number: int, values: "pd.Series | Mapping[str, Any]", stored: Mapping[str, Any]
     ) -> "Replay | None":
-        """Replay a row that MJX simulated in native MuJoCo; None if that has another number.
+        """Replay a row of MJX in native MuJoCo; None if that gives another robustness.
 
         MJX compiles a program for it first, for half a minute where there are contacts.
         """

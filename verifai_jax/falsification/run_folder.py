@@ -4,9 +4,8 @@
     write_record(run, folder)                           # `run.json`, all but the other two
     write_checkpoint(state, folder, rows, record)       # `search.state`, a log of one entry
 
-With the state stand a checksum of the rows of the table that the search has seen, and one of what
-the record says of the run: none of the three is exchanged for that of another run, or of another
-moment, unnoticed.
+The state contains checksums of the table's rows that the search has seen and of the record's
+entries. So it is noticed if one of the three files comes from another run or another time.
 """
 
 import re
@@ -40,16 +39,16 @@ RECORD = "run.json"
 STATE = "search.state"
 """Name of the checkpoint in a run's folder."""
 ROWS_CHECKSUM = "rows.checksum"
-"""Array of it with the checksum of the rows that the search has seen, `ErrorTable.digest`."""
+"""Entry of the checkpoint with the checksum of the rows seen, `ErrorTable.digest`."""
 RECORD_CHECKSUM = "record.checksum"
-"""Array of it with that of what the record says of the run, `deciding_checksum`."""
+"""Entry of the checkpoint with the checksum of the record, `deciding_checksum`."""
 _ENTRY = "search"
 RECORDED = tuple(
     field.name
     for field in fields(Run)
     if field.name not in ("table", "folder", "problem", "checkpoint", "damage")
 )
-"""Attributes of a run that are entries of its record; `features`, those of its table, is another.
+"""Attributes of a run that its record stores, in addition to the table's `features`.
 """
 DECIDING = (
     "features",
@@ -64,7 +63,7 @@ DECIDING = (
     "prior",
     "guide",
 )
-"""Entries that decide what the rows of a run are; they stay what they are when it is resumed."""
+"""Entries that determine the rows of a run; they do not change when it is resumed."""
 
 
 def save_run(run: Run, folder: Path) -> Path:
@@ -153,13 +152,13 @@ def as_made(run: Run) -> Run:
 
 
 ANEW = "begin anew, from what it has found: vj.falsify(problem, warm_start=run)"
-"""How to go on with a run that cannot be resumed."""
+"""Advice for a run that cannot be resumed."""
 
 
 def _read_state(
     folder: Path, record: Mapping[str, Any], table: ErrorTable
 ) -> tuple[dict[str, Any] | None, list[str]]:
-    """Return the checkpoint, and what speaks against going on from it."""
+    """Return the checkpoint, and the reason why the run cannot be resumed from it, if any."""
     damage, checkpoint = [table.damage] if table.damage else [], None
     try:
         checkpoint = read_checkpoint(folder)
@@ -191,7 +190,7 @@ def _read_state(
 
 
 def check_not_continued(run: Run, folder: Path) -> None:
-    """Refuse to overwrite a folder whose run has been continued, or is another run.
+    """Refuse to overwrite a folder that holds another run, or whose run has been continued.
 
     **Raises:** `ValueError`.
     """
@@ -200,14 +199,14 @@ def check_not_continued(run: Run, folder: Path) -> None:
     record = read_record(folder)
     remedy = "load it, vj.load(folder, problem), or save this one elsewhere, run.save(folder)"
     if deciding_checksum(record) != deciding_checksum(_as_record(run)):
-        raise ValueError(f"{folder} holds another run by now, of {record.get('name')!r}; {remedy}")
+        raise ValueError(f"{folder} now holds another run, of {record.get('name')!r}; {remedy}")
     rows = 0
     if ErrorTable.exists(folder):
         rows = len(ErrorTable.load(folder, run.table.features))
     if rows > run.simulations:
         raise ValueError(
-            f"somebody has gone on with the run in {folder}: it has {rows} simulations by now, "
-            f"this one {run.simulations}; {remedy}"
+            f"the run in {folder} has been continued: it has {rows} simulations now, this one "
+            f"{run.simulations}; {remedy}"
         )
 
 
@@ -218,7 +217,7 @@ def shown_folder(folder: Path) -> str:
 
 
 def replay_command(run: Run, row: int | None = None) -> str:
-    """Return what simulates a row again; without a row, what goes before its number."""
+    """Return the command that replays a row; without a row, its text before the row number."""
     number = "" if row is None else str(row)
     if run.folder is None:
         return f"run.replay({number})"
@@ -242,7 +241,7 @@ def read_record(folder: Path) -> dict[str, Any]:
     """Read the record of a run.
 
     **Raises:** `FileNotFoundError` if there is none; `DamagedError` for one that is damaged. Both
-    say where the rows are, which are not affected.
+    errors name the files of the rows, which are not affected.
     """
     file = folder / RECORD
     if not file.is_file():
@@ -254,7 +253,7 @@ def read_record(folder: Path) -> dict[str, Any]:
 
 
 def _check_entries(record: Mapping[str, Any], folder: Path) -> None:
-    """Refuse the record of a version of verifai_jax with other entries.
+    """Refuse a record with other entries, written by another version of verifai_jax.
 
     **Raises:** `DamagedError`.
     """
@@ -330,7 +329,7 @@ _NUMERIC = ("Box", "DiscreteBox", "Normal", "TruncatedNormal", "LogUniform", "Lo
 
 
 def _rows_alongside(folder: Path) -> str:
-    """Say how the rows of a folder are read without its record."""
+    """Describe how to read the rows of a folder without its record."""
     if (folder / FINISHED).is_file():
         return f"; the rows are in {folder / FINISHED}, which pandas.read_parquet reads"
     if list_segments(folder / SEGMENTS) and not (folder / TAIL).exists():

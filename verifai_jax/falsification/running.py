@@ -3,8 +3,8 @@
     running = Running(rounds, Ending(started, budget), choice, seed)
     run = running.play(progress=True)
 
-Whatever happens, what is finished is returned or stands in the `run` of the error; a run in a
-folder can be resumed from there.
+The finished part is always returned, or available as the `run` of the error. A run in a folder can
+be resumed.
 """
 
 import time
@@ -52,7 +52,7 @@ def origin_of(search: Search, first: int) -> Origin:
 
 
 RAISES = "an error of every simulation"
-"""What has stopped a run whose first simulations all raise."""
+"""The value of `stopped` for a run whose first simulations all raise."""
 
 
 class RunError(RuntimeError):
@@ -72,7 +72,7 @@ class Ending(NamedTuple):
     stop_after: int | None
     stop_when: "StoppingRule | None"
     earlier: Mapping[str, float] = MappingProxyType({})
-    """Seconds that an earlier part of the run has taken, by what they were spent on."""
+    """Seconds that earlier parts of the run have taken, by activity."""
 
     @property
     def only_budget(self) -> bool:
@@ -183,7 +183,7 @@ class Running:
     def _begin(
         self, bar: SimulationProgress, progress: bool | None, prepare: Callable[[], None]
     ) -> None:
-        """Compile, and say what was decided; `prepare` may choose another search."""
+        """Compile, and note the decisions; `prepare` may choose another search."""
         rounds, search = self.rounds, self.rounds.search
         slow = rounds.problem.system.why_slow_to_compile(search.wants.derivatives)
         if slow and bar.bar.show:
@@ -207,7 +207,7 @@ class Running:
     def _play_rounds(
         self, bar: SimulationProgress, callbacks: Sequence[Callback], begun: float
     ) -> str:
-        """Play rounds; return what has ended them."""
+        """Run rounds; return the condition that ended them."""
         rounds, budget, settled = self.rounds, self.ends.budget, False
         stopped = "exhausted" if rounds.exhausted else None
         if self._is_hopeless:
@@ -231,7 +231,7 @@ class Running:
         return stopped
 
     def _settle(self, begun: float) -> None:
-        """Note which files the simulations have read by now."""
+        """Record the files that the simulations have read so far."""
         if self._models:
             last = Sources.from_json(self._models[-1]).settled(begun)
             self._models = (*self._models[:-1], last.to_json())
@@ -242,14 +242,14 @@ class Running:
         return self.rounds.hopeless is not None and not self.keep_going
 
     def _write_record(self) -> None:
-        """Write the record of the run as it is now, for whoever resumes it."""
+        """Write the current record of the run, so that it can be resumed."""
         folder = self.rounds.folder
         if folder is not None:
             with writing(folder):
                 self.rounds.record_checksum = write_record(self.result("running"), folder)
 
     def _with_notes_after(self, result: Run) -> Run:
-        """Return the result with notes on what all of its simulations have in common."""
+        """Return the result with notes on common properties of all its simulations."""
         rounds, search = self.rounds, self.rounds.search
         after = notes_after(rounds.table, result.formulas, search, self.warm)
         if not rounds.exhausted:
@@ -260,7 +260,7 @@ class Running:
 
     @property
     def _recorded_search(self) -> Search:
-        """The search with the suggestions that it is wrapped in."""
+        """The search, wrapped in its suggestions if it has any."""
         asked = self.rounds.suggestions
         return self.rounds.search if asked is None else asked.search
 
@@ -315,7 +315,7 @@ class Running:
 
 
 def _hopeless_message(run: Run, said: str, budget: int) -> str:
-    """Say what all simulations of a run raised, and how to simulate on."""
+    """Write the error that all simulations of a run raised, and how to go on regardless."""
     first = first_message(run)
     said = one_line(said or ("" if first is None else first[1])).rstrip(".")
     where = "" if run.folder is None else f" and in {run.folder}, which can be resumed"

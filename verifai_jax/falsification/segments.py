@@ -3,11 +3,10 @@
     table/rows-000000000000-000001048576-9f3c2a1b.parquet       rows 0 to 1048575
     failures/rows-000000000000-000001048576-07d1e44a.parquet    those of them that stand out
 
-A file is written once, in whole, and renamed into place; its name has its first row, the one after
-its last, and its checksum. Beside each segment stand the rows of it that stand out: those that
-violate the property, have no verdict or a gradient that is not finite, and the one of least
-robustness. What counts or shows failures reads these alone. `pandas.read_parquet` opens either
-folder as one table.
+A file is written completely and then renamed; its name has its first row, the row after its last
+one, and its checksum. A second file has those rows of the segment that stand out: violations, rows
+without a verdict or with a gradient that is not finite, and the row of least robustness. Counts and
+views of failures read only this file. `pandas.read_parquet` opens either folder as one table.
 """
 
 import re
@@ -42,7 +41,7 @@ class TableError(DamagedError):
 
 
 def damaged(path: Path, error: Exception) -> TableError:
-    """Return the error for a file that a library cannot read, whatever the reason."""
+    """Return the error for a file that a library cannot read."""
     return TableError(f"{path} is damaged: {printable(format_error(error), 300)}")
 
 

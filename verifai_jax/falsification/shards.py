@@ -1,12 +1,12 @@
-"""One run as a job array: each job simulates a part of the rows, `merge` makes the run of them.
+"""One run as a job array: each job simulates a part of the rows, and `merge` joins the parts.
 
     simulate_shard(problem, Shard(3, 16), "uniform", 10_000_000, folder="parts/3")
     merge(sorted(Path("parts").iterdir()), problem, folder="runs/merged")
 
-For searches that do not learn: their points depend on the seed and their number alone, so every
-job can tell its own. What it simulates lies in a log, in blocks of a few thousand rows; a job that
-was killed goes on where it was. Merging is the run itself, which takes from the logs what it would
-have simulated: its table, its confirmations and its record are those of one machine.
+This works for searches that do not learn: a point depends only on the seed and its number, so every
+job can compute its own points. A job writes a log in blocks of a few thousand rows, and continues
+from it after a kill. Merging performs the run with stored rows instead of simulations, so table,
+confirmations and record are those of a run on one machine.
 """
 
 import json
@@ -47,9 +47,9 @@ from verifai_jax.search import Search
 from verifai_jax.search.proposals import Proposals
 
 SHARD = "shard.rows"
-"""Name of the log in the folder of a part: which run and which part of it, and blocks of rows."""
+"""Name of the log in the folder of a part; it identifies run and part, and holds the rows."""
 _ABOUT = "about"
-"""Entry that says which run, and which part of it; others are blocks, named by their rows."""
+"""Entry that identifies run and part; all others are blocks, named by their rows."""
 _OPTIONS = (
     "name", "formulas", "features", "search", "budget", "batch", "seed", "precision", "backend",
     "confirm", "target",
@@ -178,7 +178,7 @@ def _simulate(
     progress: bool | None,
     shard: str,
 ) -> None:
-    """Simulate these rows, but for those that are in the log already."""
+    """Simulate the rows that are not in the log yet."""
     batch, budget = record["batch"], record["budget"]
     evaluate = Evaluator(problem, batch, precision=record["precision"], seed=record["seed"])
     key, space = run_keys(record["seed"])[0], problem.space
@@ -203,7 +203,7 @@ def _simulate(
 
 
 def _claim(log: Log, record: Mapping[str, Any]) -> None:
-    """Write the record of a part, or refuse the folder of another one."""
+    """Write the record of a part; refuse the folder of another part."""
     assert log.path is not None
     path = log.path.parent
     if not log.names():
@@ -224,7 +224,7 @@ def _claim(log: Log, record: Mapping[str, Any]) -> None:
 
 
 def _check_same_model(folder: Path, record: Mapping[str, Any], now: Sources) -> None:
-    """Refuse a part that another model has simulated.
+    """Refuse a part that was simulated with another model.
 
     **Raises:** `ValueError`.
     """
@@ -270,7 +270,7 @@ def _write(log: Log, first: int, u: Float[np.ndarray, "n d"], verdicts: Verdicts
 
 
 def _blocks(log: Log) -> Iterator[tuple[range, Log, str]]:
-    """Yield the rows of each block, its log, and its name there."""
+    """Yield the rows of each block, its log, and its name in the log."""
     for name in log.names():
         if match := re.fullmatch(r"(\d+)-(\d+)", name):
             yield range(int(match[1]), int(match[2])), log, name
@@ -282,7 +282,7 @@ def _read(log: Log, name: str) -> dict[str, np.ndarray] | None:
 
 
 class _StoredRows:
-    """An executor that has simulated already: what a run asks for is in the logs of the parts."""
+    """An executor that returns the rows stored in the logs of the parts."""
 
     _max_workers = 1
 
@@ -292,7 +292,7 @@ class _StoredRows:
     def submit(self, function: Callable[..., Any], /, *arguments: Any) -> "Future[dict[str, Any]]":
         """Return a future with the stored rows, instead of simulating them with `function`.
 
-        Rows that are replayed before they are claimed are simulated here.
+        Replays that confirm violations are simulated here.
         """
         future: Future[dict[str, Any]] = Future()
         try:
@@ -303,7 +303,7 @@ class _StoredRows:
         return future
 
     def _stored(self, first: int, u: np.ndarray) -> dict[str, Any] | None:
-        """Return stored rows as `evaluate_block` does; None for one at another point."""
+        """Return stored rows in the form of `evaluate_block`; None if a row has another point."""
         try:
             parts = list(self._parts(first, u))
         except _OtherPointsError as error:
@@ -350,7 +350,7 @@ class _StoredRows:
 
 
 class _OtherPointsError(Exception):
-    """Stored rows are not at the points asked for."""
+    """Stored rows are not at the requested points."""
 
 
 def merge(

@@ -1,10 +1,10 @@
-"""Notes on what is likely a mistake: before a search starts, and on the table that it leaves.
+"""Notes on likely mistakes, before a search starts and after it, from its table.
 
     notes_before(problem, search)                       # nothing compiles
     nominal_note(problem, evaluate)                     # one simulation, on the run's own engine
     notes_after(run.table, run.formulas, search)
 
-Each is a sentence that is true of the run, for its `notes` and so for its summary.
+Each is a true sentence about the run, for its `notes` and its summary.
 """
 
 import math
@@ -24,11 +24,11 @@ from verifai_jax.problem.silent_mistakes import is_quick, silent_mistakes, trace
 from verifai_jax.search import Search
 
 ENOUGH = 32
-"""Simulations with a verdict from which on what all of them have in common is worth a note."""
+"""Minimum number of simulations with a verdict for a note on a common property."""
 MAX_SAMPLES = 5_000_000
-"""Samples of a whole batch up to which it is simulated for the nominal features alone."""
+"""Maximum samples of a batch that is simulated for the nominal features alone."""
 HARDLY_MOVES = 0.05
-"""Share of its least value within which a robustness hardly moves."""
+"""Range of the robustness, as a share of its least value, that counts as no change."""
 
 
 def notes_before(problem: Problem, search: Search) -> tuple[str, ...]:
@@ -52,9 +52,8 @@ def notes_before(problem: Problem, search: Search) -> tuple[str, ...]:
 def nominal_note(problem: Problem, evaluate: Evaluator, search: Search) -> tuple[str, ...]:
     """Return a note if the nominal features fail; simulated once for each problem.
 
-    Nothing is simulated if the problem has no nominal features, or if it could take long: an
-    engine's program has one fixed number of rows, and one of MuJoCo is compiled for each number of
-    rows.
+    Nothing is simulated if the problem has no nominal features, or if it could take long: an engine
+    would have to simulate a full batch, and MuJoCo compiles for each number of rows.
 
     **Arguments:**
     - `problem`: the problem of the run.

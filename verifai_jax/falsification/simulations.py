@@ -1,12 +1,12 @@
-"""The simulations of a run: of its rounds, and of the first rows that are timed one by one.
+"""The simulations of a run, in rounds; the first rows may be timed one by one.
 
     simulations = Simulations(problem, search, batch=32, seed=0, precision="float32", ...)
     verdicts = simulations(points, first=0)                      # of a round
     verdicts = simulations(points, first=32, differentiate=True, temperature=temperature)
     seconds = simulations.measure(points)                        # of a black box
 
-Derivatives of clauses are wanted for some rounds only, so an evaluator of their own computes them,
-which is compiled when it is needed.
+Derivatives of clauses are needed for some rounds only, so a second evaluator computes them; it is
+compiled on demand.
 """
 
 from functools import partial
@@ -141,7 +141,7 @@ class Simulations:
 
         **Arguments:**
         - `points`: the points of the unit cube.
-        - `first`: number of the first of them in the run.
+        - `first`: number of the first point in the run.
         - `differentiate`: whether derivatives of their clauses are wanted.
         - `temperature`: the temperature of the smooth robustness, one for all or one each.
         """
@@ -159,9 +159,8 @@ class Simulations:
         """Simulate the first rows of the run, and return the shortest time of one in seconds.
 
         Rows are simulated one by one; if the first is quick and does not raise, it is the only one.
-        If no time is wanted, an engine that simulates many rows together gets them together. Their
-        round does not simulate them again. If all of many raise, `hopeless` is their error, else
-        None.
+        If no time is needed, an engine for many rows gets them together. Their round does not
+        simulate them again. If all of many raise, `hopeless` is their error, else None.
         """
         from verifai_jax.evaluation.host_engine import HostEngine
 
@@ -194,7 +193,7 @@ class Simulations:
             self.keep_traces, self._journals = True, False
 
     def _after_measured(self, points: Float[Any, "n d"], first: int) -> Verdicts:
-        """Return the verdicts of the first round, whose first rows are there."""
+        """Return the verdicts of the first round, whose first rows are simulated already."""
         known, self._measured = self._measured, None
         assert known is not None
         count = len(known.status)

@@ -1,10 +1,9 @@
-"""A question to whoever suggests points: the problem and the rows so far, as plain data.
+"""A question to a source of suggested points: the problem and the rows so far, as plain data.
 
     question = describe_run(problem, frame, search)
     json.dumps(question)                                # numbers, texts, lists and dictionaries
 
-No instant of the clock is in it, so that a function which depends on the question alone gives the
-same table again.
+It contains no time of day, so a function of the question alone gives a reproducible table.
 """
 
 import math
@@ -29,7 +28,7 @@ SAMPLES = 16
 """Samples of a signal that are shown, evenly spaced, the first and the last among them: a question
 has to stay short for whoever reads it."""
 SIGNALS = 8
-"""Signals that are shown at most, those of formulas first, for the same reason."""
+"""Maximum number of signals shown, those of formulas first, for the same reason."""
 
 
 def describe_run(
@@ -51,13 +50,14 @@ def describe_run(
     - `refused`: the reasons why earlier suggestions were refused.
     **Returns:** a dictionary of plain data:
     - `problem`, `description`, `context`: texts.
-    - `formulas`: text by name; the system should keep them all, and breaking one is a failure.
-    - `features`: a dictionary for each, with `name`, `kind`, `unit` if there is one, and the
-      entries of its domain (`low`, `high`, `choices`, `knots`, ...); `columns` are its names in the
-      rows.
+    - `formulas`: texts by name; the system should satisfy all of them, and breaking one is a
+      failure.
+    - `features`: a dictionary for each feature, with `name`, `kind`, `unit` if it has one, and the
+      entries of its domain (`low`, `high`, `choices`, `knots`, ...); `columns` lists its columns in
+      the rows.
     - `constraint`: the constraint of the features, its text or name; None without one.
     - `nominal`: the nominal features; None without any.
-    - `wanted`: how many suggestions.
+    - `wanted`: requested number of suggestions.
     - `simulations`, `counterexamples`, `least_robustness`: the run so far.
     - `rows`: the last rows of the table, without those that are among the worst: features,
       robustness (`rho`, and `rho.NAME` of each of several formulas), `status`.
@@ -124,7 +124,7 @@ def _row(problem: Problem, frame: "pd.DataFrame", number: Any) -> dict[str, Any]
 
 
 def _trace(simulated: Callable[[], Replay]) -> dict[str, Any]:
-    """Return what a simulation shows; nothing where it cannot be shown."""
+    """Return the trace of a simulation as plain data; empty if it has none."""
     try:
         seen = simulated()
         if seen.status != Status.OK:

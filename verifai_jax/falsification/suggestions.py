@@ -1,12 +1,12 @@
-"""Questions to whoever suggests points, and the suggestions that were made.
+"""Questions to a source of suggested points, and its suggestions.
 
     suggestions = Suggestions(search, problem, 'float32')   # of a `search.Suggested`
     suggestions.due(rows)                               # whether it is time for a question
     suggestions.ask(question(...), rows)                # checks what comes back, and keeps it
     suggestions.waiting(rows)                           # rows to simulate next, [n, row]
 
-What was suggested is in the checkpoint, written before the first of it is simulated: a run that
-goes on does not ask again for suggestions that it has already received.
+Suggestions are written to the checkpoint before they are simulated, so a resumed run does not ask
+for them again.
 """
 
 from collections.abc import Callable, Iterable, Mapping
@@ -49,7 +49,7 @@ class Suggestions:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """Say how many suggestions there were, and which were left out."""
+        """Write the number of suggestions, and the refused ones."""
         if not len(self.asked):
             return ()
         questions = f"{len(self.asked)} question{'s' * (len(self.asked) != 1)}"

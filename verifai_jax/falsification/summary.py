@@ -1,4 +1,4 @@
-"""The summary of a run: how many simulations fail, how many of them surely, how often, the worst.
+"""The summary of a run: violations, confirmed failures, failure rate, and the worst case.
 
 balance: 604 of 20000 simulations violate the property
 property     always[0,4] (abs(x) <= 2.4 & abs(theta) <= 0.20944)
@@ -15,7 +15,7 @@ from verifai_jax.falsification.no_rate import remedy, why_no_rate
 from verifai_jax.falsification.run import Run
 
 SHOWN = 0.005
-"""Seconds from which on they are not zero in the summary."""
+"""Minimum seconds that the summary shows; less is left out."""
 
 
 def summarize(run: Run) -> str:
@@ -107,7 +107,7 @@ def _differentiated(run: Run) -> str:
 
 
 def _headline(run: Run, violating: int) -> str:
-    """Write how many simulations violate the property, and whatever makes that number doubtful."""
+    """Write the number of violations, and any doubts about it."""
     without = run.table.counts.without_verdict
     if run.has_several_models:
         return (
@@ -128,7 +128,7 @@ def _headline(run: Run, violating: int) -> str:
 
 
 def _closer_look(run: Run) -> str:
-    """Count the violating rows by what closer replays say of them."""
+    """Write the number of violating rows by verdict of closer replays."""
     counts = run.verdict_counts
     if not counts:
         return ""
@@ -154,7 +154,7 @@ _UNDECIDED_IN_WORDS = {
 
 
 def _times(run: Run) -> str:
-    """Write what the time was spent on: parts that were measured each, and add up."""
+    """Write the time by activity; the parts are measured separately and add up."""
     simulating = run.simulate_seconds
     speed = f" ({run.simulations / simulating:z,.0f} simulations/s)" if simulating > 0 else ""
     parts = [f"{run.compile_seconds:z.1f} s to compile"]
@@ -169,7 +169,7 @@ def _times(run: Run) -> str:
 
 
 def _rates(run: Run) -> list[str]:
-    """Write the failure rate as simulated, and that of confirmed failures where it differs."""
+    """Write the failure rate as simulated, and the confirmed rate if it differs."""
     if not run.prior:
         return [f"  failure rate not given: {why_no_rate(run)}; {remedy(run)}"]
     if run.failure_rate is None:

@@ -5,9 +5,10 @@
     points = surrogate.improve(points)                  # some of a round's points replaced
 
 Each proposal comes from a simulator drawn from the model's posterior (`search/trace_model.py`):
-many points are monitored on it, and from the best ones the smooth robustness is descended, all in
-one batch. Where the model is sure of a failure all of them go there; where it is not they differ as
-much as it knows too little (Thompson sampling). The real system decides on each.
+many points are monitored on it, and gradient descents on the smooth robustness start from the best,
+all in one batch. If the model is certain of a failure, all proposals go there; otherwise they
+differ according to its uncertainty (Thompson sampling). The real system decides the verdict of
+each.
 """
 
 from collections.abc import Mapping
@@ -36,11 +37,11 @@ from verifai_jax.search.process_data import snap
 POOL = 512
 """Points that are monitored on each drawn simulator, before the best ones descend."""
 PARENTS = 8
-"""Best rows around which half of them are."""
+"""Number of best rows; half of the pool lies around them."""
 NEIGHBOUR = 0.1
-"""Distance, greatest over the coordinates, up to which one row is the neighbour of another."""
+"""Maximum distance of neighbours, in the maximum norm."""
 MIN_ROWS = 64
-"""Least number of rows that programs are compiled for; fewer are padded, more to four times it."""
+"""Minimum size of programs in rows; each further size is four times the last."""
 RATE = (0.1, 0.01)
 """First and last step of a descent, in cubes."""
 TEMPERATURES = (0.3, 0.02)
@@ -52,13 +53,13 @@ PATIENCE = 8
 """Rows for each dimension without progress, before any failure, from which on the model is believed
 less."""
 PROGRESS = 0.9
-"""Share of the least robustness below which a new one is progress."""
+"""A row is progress if its robustness is below this share of the least so far."""
 MAX_SPREAD = 5.0
-"""Greatest factor on the standard deviations of a model that is believed less."""
+"""Maximum factor on the standard deviations of the model."""
 SPREADS = 4
-"""Factors from one to the greatest, in turn."""
+"""Number of factors, from one to the maximum, used in turn."""
 APART = 1e-3
-"""Distance, greatest over the coordinates, below which two points are the same."""
+"""Distance in the maximum norm below which two points count as the same."""
 
 
 class Surrogate:
@@ -83,7 +84,7 @@ class Surrogate:
         self._programs = problem.programs.get(DESCENTS, options, lambda: Descents(problem, options))
 
     def learn(self, u: Float[Any, "n d"], verdicts: Verdicts) -> None:
-        """Keep the rows that have a verdict and a trace of the same form as the others."""
+        """Keep rows with a verdict and a trace of the same form as the others."""
         proper = verdicts.proper & np.isfinite(verdicts.lowest)
         given = [
             (i, trace)
@@ -177,7 +178,7 @@ class Surrogate:
             self.traces = np.stack(each).astype(np.float32) if each else empty
 
     def _forget(self) -> None:
-        """Keep no more rows than the capacity: the best half, and the last ones."""
+        """Reduce the rows to the capacity: the best rows for one half, the latest for the other."""
         extra = len(self.rho) - self.options.capacity
         if extra <= 0:
             return
@@ -187,9 +188,9 @@ class Surrogate:
         self.u, self.traces, self.rho = self.u[kept], self.traces[kept], self.rho[kept]
 
     def _proposals(self, count: int, guess: bool) -> Float[np.ndarray, "m d"]:
-        """Return so many points, or fewer where there are no more that differ.
+        """Return this number of different points, or fewer if there are no more.
 
-        - `guess`: whether the first one is of the posterior's mean.
+        - `guess`: whether the first point is from the posterior's mean.
         """
         form = self.form
         assert form is not None
@@ -217,7 +218,7 @@ class Surrogate:
         return self._distinct(np.asarray(ends), np.asarray(value))
 
     def _parents(self) -> Float[np.ndarray, "parents d"]:
-        """Return the best rows that are no close neighbours, or else all are of one hollow."""
+        """Return the best rows that are not close neighbours, so that not all share one minimum."""
         chosen = np.zeros((0, self.cube.dim), np.float32)
         for point in self.u[np.argsort(self.rho, kind="stable")]:
             if np.all(np.max(np.abs(chosen - point), axis=1) > NEIGHBOUR):
@@ -269,7 +270,7 @@ class Descents:
         guess: Bool[Array, ""],
         spread: Float[Array, ""],
     ) -> tuple[Float[Array, "count starts d"], Float[Array, "count starts"]]:
-        """Return where the descents on `count` drawn simulators end, and the value there."""
+        """Return the end points of the descents on `count` drawn simulators, and their values."""
         cube = self.cube
         x = _embed(u, cube)
         model = models.condition(hyper, x, mask, coefficients, mean, components)
@@ -319,7 +320,7 @@ class Descents:
         return jax.lax.map(one, weights)
 
     def _value(self, trace: Trace, semantics: Semantics) -> Float[Array, ""]:
-        """Return the least value of a goal, each of whose clauses is to be broken."""
+        """Return the least value over the goals, each a set of clauses to break together."""
         clauses = self.goals.values(trace, semantics, self.end)
         return jnp.min(jnp.max(clauses, axis=1))
 
@@ -329,7 +330,7 @@ DESCENTS: Slot[TraceOptions, Descents] = Slot("descents on a model of the traces
 
 
 def spread_factor(rho: Float[np.ndarray, " n"], number: int, dim: int) -> float:
-    """Return the factor on the model's standard deviations, which grows while no row improves.
+    """Return the factor on the model's standard deviations; it grows while no row improves.
 
     An overconfident model proposes points near one local minimum again and again; with a wider
     spread its simulators have minima elsewhere. After a failure this is not needed.
@@ -362,7 +363,7 @@ def _width(cube: Cube) -> int:
 
 
 def _embed(u: Float[Any, "n d"], cube: Cube) -> Float[Array, "n x"]:
-    """Return points as the model takes them: about zero, a coordinate for each unordered choice."""
+    """Return points as model inputs: centred, with a coordinate for each unordered choice."""
     u = snap(jnp.asarray(u), cube)
     columns: list[Array] = []
     cells = cube.cells(u)
@@ -376,7 +377,7 @@ def _embed(u: Float[Any, "n d"], cube: Cube) -> Float[Array, "n x"]:
 
 
 def padded_rows(rows: int, capacity: int) -> int:
-    """Return the padded number of rows of the program for this many; each size compiles once."""
+    """Return the padded size, from few that each compile once, for a number of rows."""
     size = MIN_ROWS
     while size < rows:
         size *= 4

@@ -1,4 +1,4 @@
-"""The error table: one row a simulation, written to disk while it grows.
+"""The error table: one row for each simulation, written to disk while it grows.
 
     table.append(columns)   a batch of them
     table.all               all of them, and more of the kind in `table_view.py`
@@ -60,19 +60,19 @@ RESERVED = (
 )
 """Names of the table's own columns, which no feature may have."""
 _FEW = 256
-"""Small batches in memory that are joined to one."""
+"""Number of small batches in memory from which on they are joined."""
 
 
 class ErrorTable(TableView):
     """Rows in the order in which they were simulated; append-only.
 
     **Arguments:**
-    - `features`: names of the feature columns; may not be one of `RESERVED`.
+    - `features`: names of the feature columns; none may be in `RESERVED`.
     - `folder`: where to keep the rows; in memory only when left out.
 
     **Attributes:**
     - `missing`: ranges of rows that are missing because their files are damaged or gone.
-    - `damage`: which files are damaged and which rows are missing; empty if none.
+    - `damage`: a text on damaged files and missing rows; empty if there are none.
     - `changed`: whether rows differ from those written, so that no number of the table is reliable.
 
     **Raises:** `ValueError` for a feature with a reserved name.
@@ -248,7 +248,7 @@ class ErrorTable(TableView):
         write_complete(folder / FINISHED, parquet(columns, np.arange(self._next)))
 
     def _replace_by(self, parts: Iterator[Batch]) -> None:
-        """Take these rows, in place of what the folder holds."""
+        """Take these rows, and replace the content of the folder by them."""
         if self._folder is not None:
             (self._folder / TAIL).unlink(missing_ok=True)
             remove_segments(self._folder, 0)
@@ -257,14 +257,14 @@ class ErrorTable(TableView):
             self.append(part)
 
     def _recall(self, begin: int) -> None:
-        """Take the rows from `begin` on into memory, from segments that are about to go."""
+        """Load the rows from `begin` on into memory, before their segments are removed."""
         if begin < self._begin:
             rows = list(self._parts(begin, self._next))
             self._segments = [each for each in self._segments if each.stop <= begin]
             self._batches, self._small = rows, 0
 
     def _attach_segments(self, found: list[Segment]) -> None:
-        """Take the segments that are whole, and say which rows the others had."""
+        """Attach the undamaged segments, and record the missing rows of the others."""
         for segment in found:
             if segment.first < self._begin:
                 continue  # Of an earlier part of the run; the rows are there.
@@ -276,7 +276,7 @@ class ErrorTable(TableView):
             self._next = segment.stop
 
     def _take(self, first: int, batch: Columns) -> None:
-        """Take rows from a file into memory, as far as they are not there."""
+        """Load rows of a file into memory if they are not there yet."""
         have, n = self._next, length(batch)
         if first + n <= have:
             return
@@ -284,14 +284,14 @@ class ErrorTable(TableView):
         self._hold(*cut((first, batch), have, first + n))
 
     def _miss(self, first: int) -> None:
-        """Note that the rows before `first` are missing, where they are."""
+        """Record rows before `first` as missing if they are."""
         if first > self._next:
             self.missing = (*self.missing, range(self._next, first))
             self._note(f"rows {self._next} to {first - 1} are missing")
             self._next = first
 
     def _check(self, numbers: Sequence[str]) -> None:
-        """Refuse a table without a column that it must have, or with one of another type."""
+        """Refuse a table that lacks a required column, or has one of a wrong type."""
         parts = [segment.names for segment in self._segments]
         parts += [tuple(batch) for _, batch in self._batches]
         if not parts or not len(self):

@@ -1,9 +1,8 @@
 """The rows of an error table as they are read, in memory and in segments on disk.
 
-table.all               every simulation: features, rho, violated, status
-table.violating         rows that ended properly and broke the property, as simulated
-table.counterexamples   those among them that a closer look did not refute
-table.unconfirmed       the others: refuted, or not sure
+table.all               every simulation: features, rho, violated, status table.violating
+rows that ended properly and broke the property, as simulated table.counterexamples   violating rows
+that closer replays did not refute table.unconfirmed       the others: refuted, or not sure
 table.safe              rows that ended properly and kept it
 """
 
@@ -35,7 +34,7 @@ from verifai_jax.falsification.segments import Segment, standing_out
 if TYPE_CHECKING:
     import pandas as pd
 FEW = 64
-"""Batches in memory up to which they are read one by one: to make one batch of them copies each."""
+"""Maximum number of batches in memory that are read without joining, which copies them."""
 
 
 class TableView(InNotebook):
@@ -233,7 +232,7 @@ class TableView(InNotebook):
         return frame
 
     def _join(self) -> None:
-        """Make one batch of those in memory, so that each is copied but once."""
+        """Join the batches in memory to one, so that each is copied only once."""
         if len(self._batches) > 1 and not self.missing:
             self._batches, self._small = [(self._batches[0][0], merge(self._batches))], 0
 

@@ -1,4 +1,4 @@
-"""The form of the traces that a model of them gives: its signals, its clock, what the monitor sees.
+"""The form of modelled traces: their signals, their clock, and the samples for the monitor.
 
     form = TraceForm.of(signals, dt, length, formulas)
     form.flat(trace)                                    # the modelled samples of a real trace
@@ -28,7 +28,7 @@ class TraceForm:
     - `signals`: names and components (0 for a plain signal), in order.
     - `dt`: sampling period in seconds.
     - `length`: number of samples.
-    - `stride`: step between the samples of a model's trace that the monitor sees.
+    - `stride`: step between the samples of a modelled trace that the monitor reads.
     """
 
     signals: tuple[tuple[str, int], ...]
@@ -111,7 +111,7 @@ def signals_of(trace: Trace, names: list[str]) -> tuple[tuple[str, int], ...]:
 
 
 def _bounds(formulas: Iterable[Formula], dt: float) -> list[int]:
-    """Return the finite bounds of all windows in samples; those of one sample for "next"."""
+    """Return the finite bounds of all windows in samples; for "next", those of one sample."""
     bounds = []
     for formula in formulas:
         for part in formula.subformulas(valued=True):

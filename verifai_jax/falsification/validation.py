@@ -38,16 +38,16 @@ def usual_batch(
 ) -> int:
     """Return the default batch: at least twenty rounds for a search that learns.
 
-    It is a power of two, so that there are few shapes, and small for a run that stops at few
-    counterexamples, which is likely to end in its first round. A search that does not learn has at
-    most a thousand rounds.
+    It is a power of two, so that there are few shapes. It is small if the run stops at few
+    counterexamples, because such a run is likely to end in its first round. A search that does not
+    learn has at most a thousand rounds.
 
     **Arguments:**
     - `search`: the search of the run.
     - `budget`: number of simulations of the run.
-    - `stop_after`: number of counterexamples at which it ends; None if it does not.
-    - `whole`: whether only the budget can end the run; a search that does not learn then has eight
-      rounds, unless these would be too large.
+    - `stop_after`: number of counterexamples that ends the run, or None.
+    - `whole`: whether only the budget can end the run. A search that does not learn then has eight
+      rounds, or more if these would be too large.
     """
     if not search.learns and stop_after is not None:
         few = 1 << (min(search.wants.max_batch, 16 * stop_after).bit_length() - 1)
@@ -86,7 +86,7 @@ def batch_size(
 
 
 def as_wanted(engine: object, portable: bool = False) -> Wanted:
-    """Return the engine that was asked for or recorded; a host system has only one.
+    """Return the requested or recorded engine; a host system has only one.
 
     - `portable`: whether `"auto"` means XLA: if few simulations may end the run, or if rounding may
       change the next proposals of a search that learns.
@@ -121,7 +121,7 @@ def check_search(problem: object, search: object) -> Search:
 
 
 def _why_not_traced(system: System) -> str:
-    """Return why a system with several backends has none that JAX can trace; often empty."""
+    """Return the reason why none of a system's backends can be traced by JAX; empty if one can."""
     if not system.backends or "mjx" in system.backends:
         return ""
     return f". It does not run on mjx: {system.why_not('mjx')}"
@@ -178,7 +178,7 @@ def with_objective(search: Search, objective: str, diverse: bool) -> Search:
 
 
 def check_objective(problem: Problem, search: Search) -> None:
-    """Refuse a search for likely failures if it conflicts with another order or has no density.
+    """Refuse a search for likely failures if another order exists or the prior has no density.
 
     **Raises:** `ValueError`.
     """
@@ -187,8 +187,8 @@ def check_objective(problem: Problem, search: Search) -> None:
     other = "a guide" if problem.guide is not None else "a priority"
     if problem.guide is not None or problem.rulebook is not None:
         raise ValueError(
-            f"problem {problem.name!r} has {other}, which says which simulations are better, and "
-            "so does objective='likelihood'; leave out one of them"
+            f"problem {problem.name!r} has {other}, which orders simulations, and "
+            "objective='likelihood' is another order; leave out one of them"
         )
     from verifai_jax.features.improbability import Improbability
 
@@ -245,7 +245,7 @@ def _label(search: Search) -> str:
 
 
 def _why_no_derivatives(problem: Problem) -> str | None:
-    """Return why a search cannot follow derivatives on this problem; None if it can."""
+    """Return the reason why a search cannot use derivatives on this problem; None if it can."""
     if problem.black_box:
         return "the system is a black box"
     if problem.rulebook is not None:
@@ -260,7 +260,7 @@ def _why_no_derivatives(problem: Problem) -> str | None:
 
 
 def _why_no_traces(problem: Problem, executor: "Executor | None") -> str | None:
-    """Return why a search cannot learn from the traces of this problem; None if it can."""
+    """Return the reason why a search cannot learn from this problem's traces; None if it can."""
     if executor is not None:
         return "workers of an executor send no traces, which trace_surrogate learns from"
     if problem.rulebook is not None:
@@ -270,19 +270,18 @@ def _why_no_traces(problem: Problem, executor: "Executor | None") -> str | None:
 
 OBJECTIVES = ("robustness", "likelihood")
 AUTO = "auto"
-"""The search of a run that names none: by the seconds that a simulation takes."""
+"""The default search, which depends on the seconds of a simulation."""
 SLOW = 0.5
-"""Seconds of a simulation from which on arithmetic is spent to save simulations."""
+"""Seconds of a simulation from which on a surrogate pays."""
 FEW_DIMENSIONS = 20
-"""Dimensions up to which a Gaussian process needs no trust region."""
+"""Maximum dimension in which a Gaussian process needs no trust region."""
 
 
 def can_be_slow(problem: Problem, executor: "Executor | None") -> bool:
     """Return whether the time of a simulation decides which search is the default.
 
-    It does not for a system that JAX traces, which is quick; for one that simulates many rows in a
-    call, where one takes as long as all; and with an executor, where the simulation is not the only
-    cost.
+    It does not in three cases: a system that JAX traces is quick; a system that simulates many rows
+    in a call needs as long for one row; with an executor, simulation is not the only cost.
     """
     if problem.system.backends or problem.system.can_simulate_batch:
         return False

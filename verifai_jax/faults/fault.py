@@ -1,6 +1,6 @@
-"""Descriptions of faults: the channel, the time, and numbers that say how severe they are.
+"""Descriptions of faults: the channel, the time, and numbers for the severity.
 
-Each number is fixed, or a domain, which makes it a feature of the problem.
+Each number is fixed or given as a domain; a domain becomes a feature of the problem.
 """
 
 import math
@@ -22,21 +22,21 @@ Vector: TypeAlias = Float[Array | np.ndarray, " n"]
 
 
 def number(low: float = -math.inf, high: float = math.inf, default: Any = MISSING) -> Any:
-    """Return the field of a number of a fault, which has to lie between two ends."""
+    """Return a dataclass field for a number of a fault, limited to the range between two ends."""
     return field(metadata={"ends": (low, high)}, default=default)
 
 
 class Moment(NamedTuple):
-    """The instant at which a fault acts, and its numbers there.
+    """An instant of the simulation, with the numbers of a fault.
 
     - `xp`: `jax.numpy`, or `numpy` on the host.
     - `number`: the numbers of the fault by name.
     - `live`: whether the onset has passed and the end has not; `since`: seconds since the onset, at
       least 0.
-    - `time`, `period`: of the instant, and between two instants, in seconds.
-    - `first`: whether nothing passed before; `acts`: whether the channel is part of an action.
+    - `time`, `period`: time of the instant, and time between two instants, in seconds.
+    - `first`: whether this is the first instant; `acts`: whether the channel is part of an action.
     - `other`: the values of the channel `source` of `WrongChannel`.
-    - `uniform(count)`: random numbers of this instant, between 0 and 1.
+    - `uniform(count)`: function that returns random numbers of this instant, between 0 and 1.
     """
 
     xp: Any
@@ -52,7 +52,7 @@ class Moment(NamedTuple):
 
 
 class FaultFeatures(Struct):
-    """The numbers of a fault that vary, or the choice of `AtMost`; nominal is the weakest fault."""
+    """The varying numbers of a fault, or the choice of `AtMost`; the weakest fault is nominal."""
 
     fault: "Fault | AtMost"
 
@@ -68,30 +68,30 @@ class FaultFeatures(Struct):
 @dataclass_transform(kw_only_default=True, frozen_default=True, field_specifiers=(field, number))
 @dataclass(frozen=True, kw_only=True)
 class Fault:
-    """A fault of one channel; its kinds derive from it, as frozen dataclasses.
+    """A fault of one channel: the base class of all kinds, which are frozen dataclasses.
 
     **Arguments:**
-    - `channel`: `"observation"`, `"action"`, one entry of them, `"observation[2]"`, or the name of
+    - `channel`: `"observation"` or `"action"`, one entry such as `"observation[2]"`, or the name of
       a sensor, signal, joint, actuator or part of the state.
-    - `onset`: seconds from the beginning of the simulation until the fault; below 0 it has begun
-      before.
+    - `onset`: start of the fault in seconds; a negative onset lies before the simulation.
     - `duration`: seconds until the channel recovers; None for never.
-    - `name`: the name of the fault, and of its feature: `gyro_dropout` when left out.
+    - `name`: the name of the fault and of its feature; by default channel and kind, such as
+      `gyro_dropout`.
     **Raises:** `ValueError` for numbers that are not finite or out of range, with their names.
     """
 
     severity: ClassVar[str] = "duration"
-    """The number that says how bad it is."""
+    """The name of the number that is its severity."""
     off: ClassVar[float] = 0.0
     """The severity at which there is no fault."""
     choices: ClassVar[bool] = True
-    """Whether a channel of whole numbers can have it."""
+    """Whether the fault can affect a channel of integers."""
     draws: ClassVar[bool] = False
     """Whether it draws random numbers."""
     holds: ClassVar[bool] = False
     """Whether it remembers a value to repeat it."""
     late: ClassVar[tuple[str, ...]] = ()
-    """The numbers whose sum is the longest time, in seconds, by which a value can be late."""
+    """Names of the numbers whose sum is the maximum delay of a value, in seconds."""
     channel: str = field(kw_only=False)
     onset: Number = field(default=0.0, metadata={"ends": (-math.inf, math.inf)})
     duration: Number | None = field(default=None, metadata={"ends": (0.0, math.inf)})
@@ -124,7 +124,7 @@ class Fault:
 
     @property
     def numbers(self) -> dict[str, Number]:
-        """All numbers by name, those of the kind first; no duration if the fault never ends."""
+        """All numbers by name, those of the kind first; `duration` only if the fault ends."""
         timing = ("onset",) if self.duration is None else ("onset", "duration")
         all_of_them = [each.name for each in fields(self) if each.metadata]
         own = [name for name in all_of_them if name not in ("onset", "duration")]
@@ -132,43 +132,44 @@ class Fault:
 
     @property
     def domains(self) -> dict[str, Domain]:
-        """The numbers that vary."""
+        """The domains of the varying numbers, by name."""
         return {n: value for n, value in self.numbers.items() if isinstance(value, Domain)}
 
     @property
     def grade(self) -> str:
-        """The number that varies and says how bad the fault is."""
+        """The name of the varying number that is the severity of the fault."""
         ordered = (self.severity, "duration", "onset", *self.domains)
         return next(name for name in ordered if name in self.domains)
 
     def weakest(self, name: str) -> PyTree:
-        """Return the value of a number that varies in the weakest, shortest and latest fault."""
+        """Return the value of a varying number for the weakest, shortest and latest fault."""
         low, high = ends(self.domains[name])
         wanted = {"onset": math.inf, "duration": 0.0, self.severity: self.off}
         value = min(max(wanted.get(name, (low + high) / 2), low), high)
         return value if self.domains[name].levels == (0,) else round(value)
 
     def memory(self, zero: Vector, period: float) -> PyTree:
-        """Return what it remembers at first, for entries like `zero`."""
+        """Return the initial memory of the fault, for entries with the shape of `zero`."""
         if self.late:
             longest = sum(ends(self.numbers[name])[1] for name in self.late)
             return line_of(zero, math.ceil(longest / period - 1e-6) + 1)
         return zero if self.holds else ()
 
     def corrupt(self, good: Vector, memory: PyTree, at: Moment) -> tuple[Vector, PyTree]:
-        """Return the entries that the fault makes of `good` ones, and what it remembers then."""
+        """Return the faulty entries for the correct entries `good`, and the new memory."""
         raise NotImplementedError
 
 
 @dataclass(frozen=True)
 class AtMost:
-    """Several faults of which at most `count` happen in one simulation.
+    """A set of faults; at most `count` of them happen in one simulation.
 
-    - `count`: the number of faults in one simulation; `faults`: those that are chosen from.
-    - `name`: the name of the feature that chooses, whose entries are each the name of a fault or
-      `none`, equally likely.
+    - `count`: the maximum number of faults in one simulation; `faults`: the candidates.
+    - `name`: the name of the feature that chooses. Each of its entries is the name of a fault or
+      `none`, all equally likely.
 
-    **Raises:** `ValueError` for a count that is not positive, and for things that are no faults.
+    **Raises:** `ValueError` for a count that is not positive, and for a candidate that is not a
+    fault.
     """
 
     count: int
@@ -185,12 +186,12 @@ class AtMost:
 
     @property
     def domains(self) -> dict[str, Domain]:
-        """The choices, one for each fault that can happen at once."""
+        """The domains of the choices, one choice for each fault that can happen at once."""
         chosen = Categorical("none", *(fault.name for fault in self.faults))
         return {str(i + 1): chosen for i in range(min(self.count, len(self.faults)))}
 
     def weakest(self, name: str) -> str:
-        """Return the choice of no fault."""
+        """Return the choice without a fault."""
         return "none"
 
 

@@ -1,4 +1,4 @@
-"""Faults in the loop of a system: links through which observations or actions pass."""
+"""Faults in the loop of a system, as links that observations or actions pass through."""
 
 import operator
 import zlib
@@ -23,15 +23,17 @@ from verifai_jax.systems.any_lane import changed_if_needed
 from verifai_jax.systems.channels import Channels, Entries, Instant, Link, Passing, Side
 
 SLACK = 1e-3
-"""Periods by which an instant may be rounded: a fault with onset 0.3 acts at 30 times 0.01 s."""
+"""Tolerance for rounded instants, in periods: onset 0.3 includes the instant 30 * 0.01 s."""
 
 
 @dataclass(frozen=True)
 class Injected(Link):
     """A fault at its channel, in the loop of a system; `inject` makes it.
 
-    - `entries`: the numbers of the channel; `other`: those that it has instead, if it does.
-    - `choice`: the feature of `AtMost` that decides whether it happens, and its number there.
+    - `entries`: indices of the channel's entries; `other`: indices of the entries that replace them
+      in `WrongChannel`.
+    - `choice`: the feature of `AtMost` that decides whether the fault happens, and the fault's
+      number in it.
     """
 
     fault: Fault
@@ -97,7 +99,7 @@ class Injected(Link):
         return jax.tree.unflatten(form, leaves), (seed, memory)
 
     def _severe(self, number: Mapping[str, Any]) -> Any:
-        """Return whether it acts at any time."""
+        """Return whether the fault acts at any time."""
         off = {self.fault.severity: self.fault.off, "duration": 0.0}
         differs = (number[name] != off[name] for name in off if name in number)
         return reduce(operator.and_, differs, np.bool_(True))
@@ -105,7 +107,7 @@ class Injected(Link):
     def _faulty(
         self, now: Instant, passing: tuple[list[Any], PyTree], given: tuple[Any, ...]
     ) -> tuple[list[Any], PyTree]:
-        """Return the parts of a value as the fault makes them, and what it remembers then."""
+        """Return the parts of a value with the fault applied, and the new memory of the fault."""
         xp, (parts, memory), (time, ended, possible, number, seed, other) = now.xp, passing, given
         within = self.entries._replace(
             parts=tuple((i, index) for i, (_, index) in enumerate(self.entries.parts))
@@ -140,7 +142,7 @@ class Injected(Link):
 
 
 def _can_be(name: str, number: Any) -> Any:
-    """Return whether a number of a fault is finite, and a duration not negative."""
+    """Return whether a number of a fault is allowed: finite, and a duration not negative."""
     finite = abs(number) < np.inf
     return finite & (number >= 0) if name == "duration" else finite
 
@@ -155,16 +157,16 @@ def _blend(
     bad: Float[Array, " n"],
     good: Float[Array, " n"],
 ) -> Float[Array, " n"]:
-    """Return `bad` where `on` and `good` elsewhere, with derivatives by the edges.
+    """Return `bad` where `on`, else `good`, differentiable by onset and end of the fault.
 
-    A fault that begins a little earlier, between two samples, changes no value. The derivative is
-    therefore that of the line between the values at both samples: the sum over the samples grows by
-    one difference for each period by which the fault is longer.
+    Shifting the onset between two samples changes no value. The derivative is therefore taken from
+    the line between the values at both samples: each further period of the fault adds one
+    difference `bad - good` to the sum over the samples.
 
     **Arguments:**
-    - `on`: whether the fault acts; `live`: whether the instant lies in its time, so that it would
-      act if it were a little severer; `possible`: whether it happens at all.
-    - `lead`, `trail`: periods since its onset, and since its end.
+    - `on`: whether the fault acts; `live`: whether the instant lies between onset and end, where a
+      slightly severer fault would act; `possible`: whether the fault happens at all.
+    - `lead`, `trail`: periods since the onset, and since the end.
     """
     return jnp.where(on, bad, good)
 
@@ -181,7 +183,7 @@ def _(primals: tuple[Any, ...], tangents: tuple[Any, ...]) -> tuple[Array, Array
 
 
 def _uniform(seed: Any, step: Any, count: int, xp: Any) -> Float[Any, " count"]:
-    """Return numbers between 0 and 1, the same for the same seed (two words) and step.
+    """Return random numbers between 0 and 1, determined by the seed (two words) and the step.
 
     JAX's generator would cost more than a step of a small plant, even for a fault that is off. Two
     rounds of a hash over 32 bits suffice for noise, and NumPy gives the same numbers.
@@ -194,7 +196,7 @@ def _uniform(seed: Any, step: Any, count: int, xp: Any) -> Float[Any, " count"]:
 
 
 def inject(fault: Fault, passing: Passing, choice: tuple[str, int] | None = None) -> Injected:
-    """Return a fault as a link in the loop of a system.
+    """Return a link that applies a fault in the loop of a system.
 
     **Raises:** `UnknownNameError` for a channel that the system does not have; `ValueError` for one
     that cannot have this fault.
@@ -242,7 +244,7 @@ def with_faults(problem: Problem, faults: Sequence[object], by_simulator: bool =
 
 
 def _each(faults: Sequence[object]) -> list[tuple[Fault, tuple[str, int] | None]]:
-    """Return each fault, with the feature that chooses it and its number there, if one does."""
+    """Return each fault with the feature that chooses it, if any, and its number there."""
     found = []
     for each in faults:
         if isinstance(each, AtMost):
@@ -255,7 +257,7 @@ def _each(faults: Sequence[object]) -> list[tuple[Fault, tuple[str, int] | None]
 
 
 class OnHost:
-    """Faults in the loop of a simulator of one's own; made by `on_host`."""
+    """Faults in the loop of your own simulator; made by `on_host`."""
 
     def __init__(
         self, faults: Sequence[object], features: PyTree, seed: int, period: float
@@ -264,11 +266,11 @@ class OnHost:
         self._loops: dict[Side, tuple[Channels, Any]] = {}
 
     def observation(self, time: float, value: PyTree) -> PyTree:
-        """Return what the policy sees at `time` seconds; to be called once at each instant."""
+        """Return the faulty observation at `time` seconds; call it once at each instant."""
         return self._through("observation", time, value)
 
     def action(self, time: float, value: PyTree) -> PyTree:
-        """Return the action that takes effect at `time`; to be called once at each instant."""
+        """Return the faulty action at `time` seconds; call it once at each instant."""
         return self._through("action", time, value)
 
     def _through(self, side: Side, time: float, value: PyTree) -> PyTree:
@@ -289,13 +291,13 @@ class OnHost:
 def on_host(
     faults: Sequence[Fault | AtMost], features: PyTree, seed: int = 0, *, period: float
 ) -> OnHost:
-    """Apply faults in a simulator of one's own, such as a client of `remote`.
+    """Apply faults in your own simulator, such as a client of `remote`.
 
     **Arguments:**
-    - `faults`: those of `problem.with_faults(..., by_simulator=True)`, each with a channel that
+    - `faults`: the faults given to `problem.with_faults(..., by_simulator=True)`; each channel
       begins with `observation` or `action`.
-    - `features`: the features of the simulation, as the simulator gets them.
-    - `seed`: the seed of the simulation, from which random faults draw.
+    - `features`: the features of the simulation, as the simulator receives them.
+    - `seed`: the seed of the simulation, used by random faults.
     - `period`: seconds between two observations.
     """
     return OnHost(faults, features, seed, period)

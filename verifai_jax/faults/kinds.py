@@ -15,7 +15,7 @@ from verifai_jax.systems.delays import entry, moved_up
 
 
 class Dropout(Fault):
-    """The channel reads `value` instead of what it should: a sensor that is disconnected."""
+    """The channel reads `value` instead of its true value, such as a disconnected sensor."""
 
     value: Number = number(default=0.0)
 
@@ -24,13 +24,13 @@ class Dropout(Fault):
 
 
 class Stuck(Dropout):
-    """The channel is stuck at `value`, such as a valve that is open."""
+    """The channel is stuck at `value`, such as an open valve."""
 
     value: Number = number()
 
 
 class Freeze(Fault, holds=True):
-    """The channel repeats its last value before the onset."""
+    """The channel repeats the last value that it had before the onset."""
 
     def corrupt(self, good: Vector, memory: PyTree, at: Moment) -> tuple[Vector, PyTree]:
         held = at.xp.where(at.live & ~at.first, memory, good)
@@ -38,7 +38,7 @@ class Freeze(Fault, holds=True):
 
 
 class HeldAction(Fault, severity="hold", holds=True):
-    """The channel changes only every `hold` seconds, and is held between."""
+    """The channel changes only every `hold` seconds and keeps its value in between."""
 
     channel: str = field(default="action", kw_only=False)
     hold: Number = number(0)
@@ -54,7 +54,7 @@ class HeldAction(Fault, severity="hold", holds=True):
 class Delay(Fault, severity="seconds", late=("seconds", "swing")):
     """The channel is `seconds` late, in whole periods.
 
-    The delay swings up and down by `swing` seconds, once in `cycle` seconds.
+    The delay oscillates by `swing` seconds with the period `cycle` in seconds.
     """
 
     seconds: Number = number(0)
@@ -102,7 +102,7 @@ class Bias(Fault, severity="offset", choices=False):
 
 
 class Drift(Fault, severity="rate", choices=False):
-    """An offset is added that grows by `rate` in each second since the onset."""
+    """The added offset grows by `rate` per second from the onset on."""
 
     rate: Number = number()
 
@@ -121,7 +121,7 @@ class Noise(Fault, severity="std", choices=False, draws=True):
 
 
 class Spikes(Fault, severity="height", choices=False, draws=True):
-    """Single values are off by `height`, up or down, `rate` times a second on average."""
+    """Single values are shifted by `height`, up or down, on average `rate` times a second."""
 
     height: Number = number(0)
     rate: Number = number(0, default=1.0)
@@ -159,7 +159,7 @@ class Saturation(Fault, severity="limit", off=math.inf, choices=False):
 
 
 class LossOfAuthority(Fault, severity="loss", choices=False):
-    """The share `loss` of the channel has no effect, of an actuator above all."""
+    """The channel loses the share `loss` of its value; meant for actuators."""
 
     channel: str = field(default="action", kw_only=False)
     loss: Number = number(0, 1)
@@ -186,7 +186,7 @@ class WrongChannel(Fault):
 
 
 def _late(good: Vector, line: Any, seconds: Any, at: Moment) -> tuple[Vector, Any]:
-    """Return the value of some seconds ago, in whole periods, and the line with the newest."""
+    """Return the value from some seconds ago, in whole periods, and the updated delay line."""
     xp, line = at.xp, moved_up(line, good, at.xp)
     if not at.acts:
         # The line begins with the first observation; before the first action there is none.

@@ -1,4 +1,4 @@
-"""Feature spaces: what varies from simulation to simulation, and how."""
+"""Feature spaces: the inputs that vary between simulations, and their distributions."""
 
 from verifai_jax.features.arrays import Array as Array
 from verifai_jax.features.arrays import Items as Items

@@ -175,9 +175,9 @@ class Items:
 class VariableArray(Domain):
     """From `shortest` to `longest` values of one domain: `Array(domain, length=(1, 3))`.
 
-    A value is an `Items`; a person may write a list of as many items as there are. The first
-    coordinate is the length, all equally likely (without it if `shortest == longest`). In a table
-    the column `cars.length` holds the length; the entries of absent items are empty (NaN or None).
+    A value is an `Items`; users may write a list of items. The first coordinate is the length, with
+    equally likely values; there is none if `shortest == longest`. In a table the column
+    `cars.length` holds the length; the entries of absent items are empty (NaN or None).
     """
 
     domain: Domain

@@ -335,7 +335,7 @@ class Automaton(Domain):
         return taken, nodes
 
     def _wanted(self, taken: jax.Array, nodes: jax.Array) -> jax.Array:
-        """Return the length that stands for this sequence; the greatest where it had to end."""
+        """Return the coordinate's length of this sequence; the greatest if it had to end."""
         count = jnp.sum(taken >= 0).astype(jnp.int32)
         ended = jnp.asarray(self.graph.last)[nodes[jnp.minimum(count, self.max_events - 1)]] < 0
         forced = (count < self.max_events) & ended

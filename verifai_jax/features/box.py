@@ -74,7 +74,7 @@ class Box(_Between):
 
     `Box(-1, 1)`, `Box([0, 0], [10, 5])`, `Box(0, 1, closed="left")`. A value is a real number, or
     an array with shape `[entries]`. It never lies outside the interval, even in single precision:
-    the greatest value of `Box(0, 61.2)` is 61.199997 then, since 61.2 itself would be rounded up.
+    there the greatest value of `Box(0, 61.2)` is 61.199997, since 61.2 would be rounded up.
 
     **Arguments:**
     - `low`, `high`: the ends, two finite numbers or two sequences of one length; `low < high`.

@@ -36,7 +36,7 @@ from verifai_jax.features.english import number
 from verifai_jax.features.facts import Facts
 
 MAX_CHOICES = 12
-"""Choices that English lists one by one: more make no sentence that anybody reads."""
+"""Maximum number of choices that an English sentence lists one by one."""
 
 
 @dataclass(frozen=True, init=False, repr=False)
@@ -236,7 +236,7 @@ class Categorical(Domain):
         raise ValueError(f"{name} must be one of {format_choices(self.choices)}; got {shown!r}")
 
     def _index_of(self, value: object) -> int | None:
-        """Return the index of what a person writes, a choice or the text that the table shows.
+        """Return the index of a value as users write it: a choice, or the text in the table.
 
         An integer is an index, as systems see it, only where no choice can be read as a number.
         """

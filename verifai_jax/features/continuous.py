@@ -1,7 +1,7 @@
-"""Real numbers whose unit coordinate is their cumulative probability: what all distributions have.
+"""Real numbers whose unit coordinate is their cumulative probability: the base of distributions.
 
-Coordinates are float32 numbers between 0 and 1. The outermost of them stand for the probabilities
-that float32 tells from 0 and 1, so that no quantile is taken where a distribution has no value.
+Coordinates are float32 numbers between 0 and 1. Coordinates 0 and 1 stand for the outermost
+probabilities that float32 distinguishes from 0 and 1, so all quantiles are finite.
 """
 
 import abc
@@ -61,7 +61,7 @@ class Continuous(Domain):
     @property
     @abc.abstractmethod
     def support(self) -> tuple[float, float]:
-        """The interval that holds all values; its ends may be infinite."""
+        """The interval that contains all values; its ends may be infinite."""
 
     @abc.abstractmethod
     def quantile(self, u: Float[Array, ""]) -> Float[Array, ""]:

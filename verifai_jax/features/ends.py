@@ -4,8 +4,8 @@
     clip_to_ends(x, first, last)                            # jax.grad sees x itself
     round_inwards(np.float32(61.2), 0.0, 61.2)              # 61.199997
 
-Nearest to 61.2 in single precision is 61.20000076. A model that switches at 61.2 would be in its
-other mode there, and so would a replay in double precision, which takes the values of the table.
+The single-precision number nearest to 61.2 is 61.20000076. With it a model that switches at 61.2
+would be in the wrong mode, also in a double-precision replay, which uses the table's values.
 """
 
 from functools import lru_cache

@@ -1,4 +1,4 @@
-"""Sequences of timed events: what an environment may do, and in which order.
+"""Sequences of timed events that an environment may produce.
 
     traffic = events.Automaton("cruise", {
         ("cruise", "cut_in"): dict(to="crowded", wait=Box(0.5, 4), gap=Box(5, 20)),

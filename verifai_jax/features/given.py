@@ -1,11 +1,11 @@
-"""Features that somebody gives: the one way in for all forms, and rows that carry them exactly.
+"""User-given features: their conversion from all forms, and rows that carry them exactly.
 
     features = given_features(space, {"x": 5.0}, "float32")     # checked, stacked [1, ...]
     rows = given_rows(space, features)                  # [n, dim + width], points and values
     space.unflatten_given(rows[0, :1], rows[0, 1:])     # {"x": 5.0}, not what the point stands for
 
-A point of the unit cube in float32 cannot address every value, so a given value travels with its
-point. The point serves searches, which know nothing else; the value is what is simulated.
+A float32 point of the unit cube cannot represent every value, so a row contains both the point and
+the given values. Searches use the point; simulations use the values.
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence

@@ -5,10 +5,10 @@
     improbability.departure(points)                 # [n, d], signed, of the likeliest value
     improbability.point_at(departures)              # and back
 
-The features are independent, so the logarithm of the prior's density is a sum over coordinates. One
-whose density lies `loss` below its greatest departs by `sqrt(2 loss)`: of a normal distribution
-that is the number of standard deviations, and of any other the number at which a normal one is as
-improbable. Values of a box are all as likely, and depart by next to nothing.
+The features are independent, so the logarithm of the prior's density is a sum over coordinates. A
+coordinate whose log density lies `loss` below its maximum departs by `sqrt(2 loss)`: for a normal
+distribution this is the number of standard deviations, for any other the number at which a normal
+one is as improbable. All values of a box are equally likely, so they hardly depart.
 """
 
 from collections.abc import Iterator

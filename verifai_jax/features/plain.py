@@ -1,7 +1,7 @@
 """Plain data of domains, for JSON: `to_plain(domain)` and back.
 
-Data holds a `kind`, the name of a domain, and the `arguments` of that domain. Code, that is the
-functions of a `Distribution`, is not data: it has to be given again by name.
+Data holds a `kind`, the name of a domain, and the `arguments` of that domain. Code, such as the
+functions of a `Distribution`, is not data: give it again by name.
 """
 
 from collections.abc import Iterator, Mapping

@@ -1,7 +1,7 @@
 """The maps between the points of the unit cube and the features of a space, in JAX.
 
-`FeatureSpace` is what a person makes of them; searches, engines and tables use what is here. Rows
-of a table become features, too, and features move by one rounding.
+Users create a `FeatureSpace`; searches, engines and tables use the maps here. Other functions
+convert rows of a table to features, and move features by one rounding.
 """
 
 import math
@@ -141,7 +141,7 @@ class PointMaps:
         Pure JAX for values of `unflatten`; also takes plain Python values, unchecked.
 
         **Arguments:**
-        - `features`: features by name; constant and fixed ones and events may be left out.
+        - `features`: features by name; constant and fixed features and events may be left out.
         **Returns:** the point, `[dim]`.
         """
         return self.root.to_unit(self.root.coerce(self.completed(features)))

@@ -3,7 +3,7 @@
     ranges = FeatureRanges(space, "float32")
     for low, high, depends in ranges(first, last): ...    # corners of boxes, [n, dim] each
 
-They hold for each number that `space.unflatten` gives within a box, its rounding included, if the
+They contain every number that `space.unflatten` gives within a box, including rounding, if the
 domain is `monotone`.
 """
 

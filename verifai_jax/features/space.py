@@ -107,7 +107,7 @@ class FeatureSpace(PointMaps, ForUsers):
         """Check features as a user writes them, and convert them to those that a system receives.
 
         **Arguments:**
-        - `features`: numbers, lists, choices, dictionaries by name; constant and fixed ones and
+        - `features`: numbers, lists, choices, dictionaries by name; constant and fixed features and
           events may be left out.
         **Returns:** the features in the form of `unflatten`.
         **Raises:** the errors of `check`.
@@ -143,7 +143,7 @@ class FeatureSpace(PointMaps, ForUsers):
         return converted
 
     def check(self, features: Mapping[str, Any]) -> None:
-        """Check concrete features; constant and fixed ones and events may be left out.
+        """Check concrete features; constant and fixed features and events may be left out.
 
         **Raises:** `ValueError` that names the first feature that is missing, unknown or outside
         its domain, and for features that break the constraint.
@@ -210,8 +210,8 @@ class FeatureSpace(PointMaps, ForUsers):
 
         **Arguments:**
         - `one`, `other`: features as returned by `unflatten`, or as a user writes them (numbers,
-          lists, choices, dictionaries by name; constant and fixed ones and events may be left out),
-          or rows of a table.
+          lists, choices, dictionaries by name; constant and fixed features and events may be left
+          out), or rows of a table.
         **Raises:** `ValueError` that names the first feature that is missing, unknown or outside
         its domain, for values as a user writes them.
         """

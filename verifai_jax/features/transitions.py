@@ -1,11 +1,11 @@
-"""The graph of an automaton, with guards unfolded: who follows whom, by which probability.
+"""The graph of an automaton with unfolded guards: possible successors and their probabilities.
 
     graph = unfold("cruise", transitions, 6)
     graph.edges[node]                                   # cumulative probabilities of transitions
     graph.pairs                                         # all that can follow each other
 
-Guards look at what has happened before. They are asked here, once for each state and past that can
-be reached, so that a simulation only looks up tables, and what can be covered is counted exactly.
+Guards depend on past events. They are evaluated here, once for each reachable state and past, so
+that a simulation only looks up tables, and all coverable items are counted exactly.
 """
 
 import difflib

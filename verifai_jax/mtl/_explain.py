@@ -5,8 +5,8 @@
     why.predicate, why.time, why.robustness
     draw(why)                                         # see `plot.py`
 
-The hard robustness is the value of one predicate at one instant. Walking from the root to the
-operand that decides each minimum or maximum finds it.
+The hard robustness is the value of one predicate at one instant, found by walking from the root to
+the operand that decides each minimum or maximum.
 """
 
 import functools
@@ -68,7 +68,7 @@ class Node:
 
 @dataclass(frozen=True)
 class Instant:
-    """A predicate at an instant with influence, and its share of the robustness.
+    """A predicate at an influential instant, and its share of the robustness.
 
     Shares are computed from the gradient of the smooth robustness; those of all predicates and
     instants sum to 1.

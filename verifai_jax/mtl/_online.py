@@ -1,4 +1,4 @@
-"""A monitor that is fed sample by sample, in memory that does not grow with the trace.
+"""A monitor that processes samples one by one, in memory that does not grow with the trace.
 
     monitor = online("G (req > 0 -> F[0,0.5] (gnt > 0))", dt=0.1)
     state = monitor.init()
@@ -8,10 +8,10 @@
 
 It steps through a `Plan` of `streams` in JAX; `watch` does the same on the host.
 
-Source: the interval is that of J. Deshmukh et al., "Robust online monitoring of signal temporal
-logic", RV 2015: unknown predicates are anything from -inf to +inf.
+Source: the interval is from J. Deshmukh et al., "Robust online monitoring of signal temporal
+logic", RV 2015; unknown predicates range from -inf to inf.
 
-A step, `advance`, reads whole windows, which is quick for a batch; a step of `watch` updates them.
+The step, `advance`, reads whole windows, fast for batches; the step of `watch` updates them.
 """
 
 import functools

@@ -1,11 +1,11 @@
 """The parser of formulas: `parse("always[0, 4] (abs(x) <= 2.4 & F[0,500ms] safe)")`.
 
-One LALR grammar covers Boolean and arithmetic expressions, because two would collide on
-parentheses; what may stand where is checked afterwards, on the tree, by `FormulaBuilder`. It reads
-more than it accepts, so that an error can say what is meant.
+One LALR grammar covers Boolean and arithmetic expressions, because two would conflict on
+parentheses; types are checked afterwards, on the tree, by `FormulaBuilder`. The grammar reads more
+than is accepted, so that errors can suggest a correction.
 
-`FormulaBuilder` refuses chains and mixtures of operators on which tools disagree, and offers the
-parentheses that make them clear.
+`FormulaBuilder` refuses chains and mixtures of operators that tools read differently, and suggests
+parentheses.
 """
 
 import math
@@ -233,13 +233,13 @@ class FormulaBuilder(ExpressionBuilder):
         part = parts[first]
         offer = self._offered("write ", far, near)
         raise self._fail(
-            f"how far {operator!r} reaches is ambiguous: {offer or 'say so by parentheses'}",
+            f"the scope of {operator!r} is ambiguous: {offer or 'use parentheses'}",
             part.start,
             part.end,
         )
 
     def _operator(self, tree: Tree, part: Part) -> tuple[str, str]:
-        """Return the operators in front of a part, with their intervals, and what they stand for.
+        """Return the operators before a part, with their intervals, and their operand.
 
         The grammar's own tree says where one ends: a text has blanks anywhere, or none.
         """

@@ -4,10 +4,10 @@
     jax.vmap(lambda t: robustness(f, t))(traces)              # many traces
     jax.grad(lambda x: robustness(f, Trace({"x": x}, dt=0.1), smooth(0.1)))(x)
 
-Under `jax.vmap` the lanes are worked on together, time-major, whatever axis they came on, a cache's
-worth of lanes at a time (`on_lanes`). The
-derivative of the scalar is a reverse sweep through the monitor offered as a `custom_jvp`: the
-tangent is its product with the gradient, so forward and reverse mode both cost one sweep.
+Under `jax.vmap` all lanes are evaluated together, time-major, as many at a time as fit into the
+cache (`on_lanes`). The derivative of the scalar is one reverse sweep through the monitor, provided
+as a `custom_jvp`: the tangent is the product of gradient and input tangent, so forward and reverse
+mode both cost one sweep.
 """
 
 import functools
@@ -100,7 +100,7 @@ def satisfied(
 
 
 def first_nan(formula: Formula, trace: Trace) -> str:
-    """Return a message that says where a signal is NaN, or that the formula's value is."""
+    """Return a message that names the signal with a NaN and its time, or the NaN of the formula."""
     trace = trace.trim().finely()
     clock = np.asarray(trace.clock())
     for name in formula.signals():
@@ -311,7 +311,7 @@ def in_chunks(
     out_axes: tuple[int, ...],
     *arguments: PyTree,
 ) -> tuple[PyTree, ...]:
-    """Compute `function(*arguments)` over the first lane axis, a cache's worth at a time.
+    """Compute `function(*arguments)` over the first lane axis, in chunks that fit into the cache.
 
     Arguments have their lanes on `axes`, results on `out_axes`.
     """

@@ -1,7 +1,7 @@
 """The greatest distance of the smooth robustness from the hard one, in temperatures.
 
-A smooth maximum of n values exceeds the hard one by at most tau log n, a smooth minimum falls short
-of it by as much. Along a path of sub-formulas these add up; adjacent maxima count as one.
+A smooth maximum of n values exceeds the hard one by at most tau log n, a smooth minimum lies as far
+below. Along a path of sub-formulas these errors add up; adjacent maxima count as one.
 """
 
 import functools

@@ -1,4 +1,4 @@
-"""Monitors as C99 in one header: no allocation, and memory that the windows decide.
+"""Monitors as C99 in one header, without allocation and with memory fixed by the windows.
 
     Path("gap.h").write_text(export_c("always (gap > 2)", dt=0.1, name="gap"))
 

@@ -1,4 +1,4 @@
-"""Monitors that learn from runs, and whose alarms are false with a chosen probability at most.
+"""Monitors that learn from runs, with a bound on the probability of a false alarm.
 
     ahead = predictive_monitor("always gap > 2", traces, horizon=1.0)    # of simulations
     step = ahead.start()
@@ -7,9 +7,10 @@
     known = domain_monitor(traces)        # is this input unlike all that was tested?
     known.start()({"gap": 4.0, "speed": 9.0})
 
-Half of the runs teach, the other half calibrate. The guarantees are for a further run of the same
-distribution (independent samples of one feature space, not the rows of a search that learns), over
-all its samples at once, and over the calibrating runs and the further one together.
+Half of the runs train the model, the other half calibrate it. The guarantees hold for a further run
+of the same distribution (independent samples of one feature space, not the rows of a search that
+learns), for all its samples at once. Their probability is over the calibration runs and the further
+run.
 
 Source: L. Lindemann et al., "Conformal prediction for STL runtime verification", ICCPS 2023.
 """
@@ -55,7 +56,7 @@ class Forecast(NamedTuple):
 
     - `robustness`: the least robustness expected within the horizon.
     - `low`: a lower bound on it; with probability `1 - alpha` it holds at every sample of the run.
-    - `p_value`: share of the runs without violation in which some prediction was as low.
+    - `p_value`: share of the runs without violation in which some prediction was as low or lower.
     - `alarm`: whether the p-value is at most `alpha`. In a further run without violation an alarm
       is raised with probability at most `alpha`.
     """

@@ -5,10 +5,10 @@
     goals.values(trace, smooth(0.05))                   # differentiable, temperature without unit
 
 A formula is broken by breaking one of its goals (the parts of a conjunction), and a goal by
-breaking all of its clauses (the parts of a disjunction). With a number for each, a search can lower
-one clause without losing another; the maximum of both shows only one. Predicates are divided by how
-much they vary along the trace, so that clauses in miles per hour and in revolutions per minute can
-be compared; that keeps all signs.
+breaking all of its clauses (the parts of a disjunction). A separate value for each clause lets a
+search lower one without raising another; their maximum shows only one. Predicates are divided by
+their variation along the trace, so that clauses in different units can be compared; signs do not
+change.
 """
 
 from collections.abc import Iterable

@@ -1,4 +1,4 @@
-"""Columns of a recording as numbers: valid cells, and errors for the others.
+"""Conversion of a recording's columns to numbers, with errors for invalid cells.
 
 numbers_of("flight.csv", "x", column)               # [time], or [time, k] of a column of lists
 seconds_of("flight.csv", "time", column)            # from the first, and when that was

@@ -1,7 +1,7 @@
 """Recordings of several clocks: MCAP, NetCDF, Zarr and HDF5 as Arrow tables, LeRobot's episodes.
 
-A table is what has one clock: a topic of MCAP, the variables of one dimension, a group with its own
-times. Its column of times is called as the caller says. Nothing in a file is unpickled.
+Each table has one clock: a topic of MCAP, the variables of one dimension, or a group with its own
+times. The caller names its column of times. Nothing in a file is unpickled.
 """
 
 import json

@@ -1,10 +1,10 @@
-"""The predicate and the instant that decide the robustness of formulas, under `jit` and `vmap`.
+"""The predicate and the instant that decide the robustness of formulas, for `jit` and `vmap`.
 
     predicate, sample = deciding_instant([formula], trace)
 
-The hard robustness is the value of one predicate at one instant, so that its derivative by that
-value is 1, or -1, and zero by all others: one reverse sweep of the monitor alone finds it.
-`explain` says more of one concrete trace.
+The hard robustness is the value of one predicate at one instant. So its derivative is 1 or -1 by
+that value and zero by all others, and one reverse sweep of the monitor finds it. `explain` gives
+more details on one concrete trace.
 """
 
 from collections.abc import Sequence

@@ -1,10 +1,10 @@
-"""Formulas judged between the samples, too, where signals are held or go straight on.
+"""Formulas judged also between samples, where signals are held or interpolated linearly.
 
     dense_robustness("always[0, 4] x <= 2.4", trace)            # straight between samples
     dense_signal("eventually[0, 0.3] x > 0", trace, "hold")     # at every time
 
-Times of intervals are any numbers. A value is the greatest or least that is approached within a
-window, whose ends belong to it, so the robustness at the samples alone is no guarantee of it.
+Ends of intervals may be any times. A value is the supremum or infimum over a closed window, which
+the robustness at the samples alone does not bound.
 
 Values are computed on `Piecewise` functions of time: linear between breakpoints, where they may
 jump. Everything is exact up to rounding: breakpoints are added where two functions cross.

@@ -1,4 +1,4 @@
-"""A trace that tells two formulas apart: one holds on it, and the other does not.
+"""A trace that distinguishes two formulas: one holds on it, and the other does not.
 
 found = distinguish("always[0, 5] a > 1", "always[0, 6] a > 1")       # over free signals
 found = distinguish(one, other, problem, budget=2000)                 # by search

@@ -1,8 +1,8 @@
-"""The value of a formula over a range of instants, computing no instant that is not needed.
+"""The value of a formula over a range of instants; only needed instants are computed.
 
-Signals are time-major `[time, *lanes]`. Under `hold` a trace goes on for ever with its last sample,
-so every sub-formula is constant from some instant on (where it *settles*): asking for later
-instants costs nothing, and an unbounded window need only reach that far.
+Signals are time-major `[time, *lanes]`. Under `hold` a trace continues for ever with its last
+sample, so every sub-formula is constant from some instant on (where it *settles*). Later instants
+therefore cost nothing, and unbounded windows end there.
 """
 
 import math
@@ -49,7 +49,7 @@ def samples(time: float, dt: float, interval: Interval) -> float:
 
 
 def seconds_held(truth: Any, n: int, dt: float, xp: Any) -> Any:
-    """Return for how many seconds of the last `n` samples truth values were above zero.
+    """Return the seconds, among the last `n` samples, in which truth values were above zero.
 
     **Arguments:**
     - `truth`: `[time, *lanes]`; the result is NaN while one of the values is.

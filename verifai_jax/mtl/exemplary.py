@@ -1,12 +1,12 @@
-"""Traces that show what a formula says: one satisfies it, one barely does, one breaks it.
+"""Traces that illustrate a formula: one satisfies it, one barely does, one breaks it.
 
     found = examples("always[0, 5] (x > 1 -> eventually[0, 2] y > 3)")
     found.satisfying, found.barely, found.breaking
     found.plot("examples.png")
 
-Signals are free: a search over steps finds a trace on either side, and the gradient of the smooth
-robustness moves it away from the limit and smooths it. The trace between the two on which the truth
-changes is the one that barely satisfies.
+Signals are free: a search over piecewise constant signals finds a satisfying and a violating trace,
+and the gradient of the smooth robustness moves them away from the limit and smooths them. Between
+the two lies the trace that barely satisfies the formula.
 """
 
 import functools

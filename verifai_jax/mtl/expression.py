@@ -218,7 +218,7 @@ class Duration(Signal):
     def __post_init__(self) -> None:
         if not (self.window > 0 and math.isfinite(self.window)):
             raise ValueError(
-                f"a duration is counted in a window of some seconds; got {self.window}"
+                f"the window of a duration must be a positive number of seconds; got {self.window}"
             )
         for part in self.operand.subformulas(valued=True):
             if part.side == "ahead":

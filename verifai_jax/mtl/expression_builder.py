@@ -1,7 +1,7 @@
 """From the tree of a text to expressions: numbers, signals, arithmetic, comparisons.
 
-What may stand where is checked here and in `formula_builder`, on the tree, where the position is
-known. An error offers texts that settle it, each of which was read before it is offered.
+Types are checked here and in `formula_builder`, on the tree, where the position is known. Errors
+suggest corrected texts; each suggestion was parsed before it is shown.
 """
 
 import itertools

@@ -130,7 +130,7 @@ NOTHING = (
     "SetupExperiment, int a, double tolerance, double start, int b, double stop",
     "EnterInitializationMode", "ExitInitializationMode", "Terminate",
 )  # fmt: skip
-"""Functions that have nothing to do, with what they are given."""
+"""Functions without effect, with their parameters."""
 _MANY = "const unsigned *r, size_t n"
 REFUSED = (
     *(f"{verb}{kind}, {_MANY}, {'const ' * (verb == 'Set')}{c} *values"

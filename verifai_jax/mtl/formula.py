@@ -4,9 +4,10 @@
     always((abs(x) <= 2.4) & (theta.abs() <= 0.2095), 0, 4)
     (x > 1).until(signal("y") >= 0, 0.2, 0.6)
 
-A formula is a frozen tree, hashable and equal by value, so that `jax.jit` takes it as static. The
-table `OPERATORS` of `words` describes an operator; its kind of node gives its meaning: `Join`,
-`Window`, `Witness`, or `Derived`. Implication and weak until are these, but print as written.
+A formula is a frozen tree, hashable and equal by value, so that `jax.jit` accepts it as static. The
+table `OPERATORS` of `words` describes each operator, and its class of node defines its meaning:
+`Join`, `Window`, `Witness`, or `Derived`. Implication and weak until are built from these, but
+print as written.
 """
 
 import abc
@@ -26,7 +27,7 @@ from verifai_jax.mtl.tree import Term as Term
 from verifai_jax.mtl.words import COMPARISONS, OPERATORS, Text, operator_text
 
 Formulaic: TypeAlias = Union["Formula", Term]
-"""What stands for a formula: a formula, or an expression that is its own robustness."""
+"""A formula, or an expression that is its own robustness."""
 
 
 class Formula(Tree):

@@ -1,11 +1,12 @@
-"""Traces of signals that move freely, among which one is sought that makes formulas true or false.
+"""Search among free signals for a trace that makes formulas true or false.
 
     free = FreeTraces.of([formula])
     signals = free.drawn(1024, rng)                       # [time, lanes], piecewise constant
     found = free.search(lambda values: values(formula)[0], rng)     # one that maximizes it
 
 A signal moves between few levels: the numbers that predicates compare it with, and others between
-and beyond. So the corners at which a formula changes its truth are met, equality among them.
+and beyond. So the search reaches all points where the formula changes its truth, including
+equality.
 """
 
 import math
@@ -38,7 +39,7 @@ BLEND = 0.02
 """Share of the sum of operands that do not decide. Five of `a > 0 & b > 0 & c > 0 & d > 0 & e > 0`
 were made true with it, and not without."""
 KEPT, GENERATIONS = 32, 12
-"""Traces that each generation of a search goes on from, and generations."""
+"""Number of traces kept in each generation of a search, and of generations."""
 MAX_SAMPLES = 20_000
 """Samples of a free trace at most: one of more has a clock much finer than its windows."""
 Signals = dict[str, Values]

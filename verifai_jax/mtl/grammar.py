@@ -1,4 +1,4 @@
-"""The text grammar of formulas: its parser, and what its errors say."""
+"""The text grammar of formulas: its parser, and its error messages."""
 
 import difflib
 import functools

@@ -4,8 +4,8 @@
     values(formula)                 # [time], the robustness at every sample
     values.truth(formula)           # [time], +1 where it holds, -1 where not, NaN where unknown
 
-For many formulas on few recordings, as mining and mutants ask: JAX would compile each formula. The
-meaning is that of `Evaluator` (tests compare them). Arrays are time-major, `[time, *lanes]`.
+For many formulas on few recordings, as in mining: JAX would compile each formula. Values equal
+those of `Evaluator` (tests compare them). Arrays are time-major, `[time, *lanes]`.
 """
 
 import functools
@@ -261,7 +261,7 @@ def _span(interval: Interval, dt: float, stride: int) -> tuple[int, float]:
 
 
 def _in_order(e: Term) -> tuple[Term, ...]:
-    """Return an expression and what is below it, children first; it remembers them."""
+    """Return an expression and all expressions below it, children first; cached."""
     if "_order" not in e.__dict__:
         object.__setattr__(e, "_order", tuple(postorder(e)))
     return e.__dict__["_order"]

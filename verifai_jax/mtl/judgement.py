@@ -1,4 +1,4 @@
-"""The verdicts of many requirements on many recordings, and what they say of the fleet."""
+"""The verdicts of many requirements on many recordings, and statistics over the fleet."""
 
 import functools
 import math
@@ -158,7 +158,7 @@ class Judgement(InNotebook):
         return table.sort_values("distance", ascending=False, ignore_index=True)
 
     def summary(self) -> str:
-        """Return the summary as text: what fails, what has no verdict, how close the others are."""
+        """Return the summary as text: failures, missing verdicts, and the margins of the others."""
         failing, missing = self.failing, self.without_verdict
         asked = (
             f"{counted(len(self.requirements), 'requirement')} on "

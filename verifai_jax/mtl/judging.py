@@ -4,8 +4,8 @@
     print(found)                                      # which fail, and where
     found.table, found.quantiles(), found.outliers()
 
-Nothing is compiled, as a fleet has recordings of many lengths: `HostValues` computes requirements
-on a recording with NumPy, what they share once.
+Nothing is compiled, as a fleet has recordings of many lengths: `HostValues` evaluates requirements
+on a recording with NumPy, and common parts only once.
 """
 
 import functools

@@ -4,8 +4,8 @@
     print(found)                    # the left side never holds in the recording; ...
     found.table
 
-The formula alone tells what has no effect and what cannot be true; recordings tell what never
-holds, what is never near, and what looks beyond their end.
+The formula alone shows parts without effect and parts that cannot be true; recordings show parts
+that never hold, are never near to a change, or look beyond the end.
 """
 
 import math
@@ -96,7 +96,7 @@ class _Linter:
         return self.requirement.formalized
 
     def findings(self) -> list[Finding]:
-        """Return what all checks find, one finding for each kind and part."""
+        """Return the findings of all checks, one for each kind and part."""
         found = [*self._signals(), *self._judged(), *self._dimensions()]
         dt = self.recordings[0].values.dt if self.recordings else 0.0
         spans = self.formula.asked(dt).items()

@@ -1,13 +1,13 @@
-"""The tightest numbers and times with which recordings satisfy a formula with parameters.
+"""The tightest values of a formula's parameters for which recordings satisfy it.
 
     mined = mine("always (distance > ?d)", ["drive-1.csv", "drive-2.csv"])
     mined.values, mined.formula             # {'d': 4.217}, always (distance >= 4.217)
     mine("always[0, ?T] (distance > ?d)", recordings).front
     mine("always (distance > ?d)", problem, budget=2000)
 
-What is satisfied is a lower or an upper set of each parameter, as the formula is monotone in it. So
-bisection finds the last double, and the last instant, that is satisfied: there is no grid. A front
-of two parameters is walked from corner to corner by the same bisection.
+The formula is monotone in each parameter, so its satisfying values are all those up to, or from, a
+limit. Bisection finds this limit to the last double, and to the last instant for times. A front of
+two parameters is followed from corner to corner by the same bisection.
 
 Source: E. Asarin, A. Donze, O. Maler, D. Nickovic, "Parametric identification of temporal
 properties", RV 2011.
@@ -72,7 +72,7 @@ class Mined(Drawn, InNotebook):
     _picture: ClassVar[tuple[str, str]] = ("requirements", "plot_mined")
 
     def summary(self) -> str:
-        """Write the parameters that were found, and what they rest on."""
+        """Write the parameters that were found, and the data that they rest on."""
         lines = [f"{self.text}"]
         for name, side in self.tightest.items():
             value = number_text(self.values[name])

@@ -4,8 +4,8 @@
     print(found)                      # which changes no recording notices
     found.surviving[0].example        # a trace that would
 
-A mutant is killed by a recording on which its verdict is not that of the formula. One that no
-recording kills says that a mistake of that kind would go unnoticed.
+A recording kills a mutant if their verdict differs from that of the formula. A surviving mutant
+shows that such a mistake in the formula would go unnoticed.
 """
 
 import functools

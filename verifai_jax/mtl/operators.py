@@ -1,4 +1,4 @@
-"""Temporal operators as functions; times are in seconds, and an interval's ends belong to it.
+"""Temporal operators as functions; times are in seconds, and intervals are closed.
 
 always(abs(signal("x")) <= 2.4, 0, 4)
 until(signal("request") > 0, signal("grant") > 0, 0.2, 0.6)

@@ -5,8 +5,8 @@
     template.formula({"T": 4.0, "d": 2.0})
     template.direction("d")               # -1: a larger d is harder to satisfy
 
-A text is parsed once. In the tree a number is a signal named `?d`, and a time is a float that no
-text has, so values are put in by a walk over the tree.
+A text is parsed once. In the tree a numeric parameter is a signal named `?d`, and a time parameter
+is a float that no text contains; a walk over the tree substitutes values for them.
 
 The file `templates.toml` is a library of requirements that people often write, with their sources:
 

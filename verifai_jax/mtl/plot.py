@@ -1,9 +1,9 @@
-"""The picture of an explanation: the formula's tree, and next to it what each part does over time.
+"""The picture of an explanation: the formula's tree, and next to it each part over time.
 
     draw(explain(formula, trace), path="why.png")
 
 Each row is a sub-formula: green where it holds, red where it fails. Predicates show their signal
-and its bound. The line from the top joins the instants that decide, down to the one to blame.
+and its bound. The line from the top joins the deciding instants, down to the deciding predicate.
 """
 
 import itertools

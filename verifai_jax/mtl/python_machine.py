@@ -4,7 +4,8 @@
     machine.step([1.0, 0.0])                          # the numbers of one sample
     machine.out                                       # one number a formula
 
-Each operation has a list of numbers as its memory, and does what its namesake in `c_monitor` does.
+Each operation has a list of numbers as its memory, and corresponds to the operation of the same
+name in `c_monitor`.
 """
 
 import math

@@ -1,4 +1,4 @@
-"""Recordings that a formula is asked about: traces, files, tables, or simulations of a problem.
+"""Recordings on which formulas are evaluated: traces, files, tables, or simulations of a problem.
 
 named_recordings("logs/")                       # the files in and below a folder, unread
 named_traces(["drive-1.csv", trace, frame])

@@ -111,7 +111,7 @@ def read(
         raise ValueError(f"{name} has no column of numbers")
     if dt is not None:
         if len(parts) > 1:
-            raise ValueError(f"{name} has {len(parts)} clocks, for which one period dt cannot do")
+            raise ValueError(f"{name} has {len(parts)} clocks, so one period dt is not enough")
         times, values = None, parts[0]
     else:
         stamps = [seconds_of(name, time, clock) for clock in clocks]

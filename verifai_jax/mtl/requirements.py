@@ -1,4 +1,4 @@
-"""Files of requirements: demands in words, with formulas.
+"""Files of requirements: sentences with their formulas.
 
     read_requirements("requirements.toml")              # tables [[requirement]]
     read_requirements("requirements.yaml")              # a list `requirements`
@@ -7,8 +7,7 @@
     write_requirements(requirements, "requirements.csv")
 
 Source of ReqIF: OMG, Requirements Interchange Format 1.2, formal/2016-07-01. A file with a document
-type is refused before anything of it is read, since its entities could read other files or expand
-without end.
+type is refused unread, since its entities could read other files or expand without end.
 """
 
 import csv

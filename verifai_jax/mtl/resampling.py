@@ -2,8 +2,8 @@
 
 resample(Trace({"x": xs}, times=ts), dt=0.1, method="hold")
 
-What was recorded between two samples of the new clock stays with the trace (`Trace.between`), and
-verdicts count it: a spike between two samples is not lost.
+Samples recorded between two samples of the new clock are kept (`Trace.between`) and used for
+verdicts, so a spike between two samples is not lost.
 """
 
 from collections.abc import Mapping, Sequence

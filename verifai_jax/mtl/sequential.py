@@ -1,8 +1,8 @@
 """Running maxima by scans over time with all lanes side by side: the form for a CPU.
 
-The windows follow van Herk and Gil-Werman: cut time into blocks of the window's length; then every
-window is the end of one block and the beginning of the next, so one scan each way suffices.
-A minimum is a maximum of negated samples; the `sign` (-1 for it) is applied within the scans,
+The windows follow van Herk and Gil-Werman: time is divided into blocks of the window's length, so
+every window is the end of one block and the beginning of the next, and one scan in each direction
+suffices. A minimum is a maximum of negated samples; its `sign` -1 is applied within the scans,
 because negated copies cost memory. Smooth maxima are carried as pairs `(m, s)`: the greatest value
 and the sum of `exp((x - m) / tau)`.
 

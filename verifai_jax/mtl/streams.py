@@ -1,11 +1,11 @@
-"""Formulas as streams: what a monitor computes at each sample, in memory that does not grow.
+"""Formulas as streams: the operations of a monitor at each sample, in constant memory.
 
     plan = streams(formula, dt=0.1)                   # operations over the margins of the leaves
     plan.ops, plan.outputs                            # each reads results of earlier ones
 
-After sample k a stream gives the value at instant k - delay, where the delay is how far it looks
-ahead. What is asked only at time 0 is *anchored*: it accumulates a stream and stores none of it.
-Negations are moved into the leaves, so every operation grows with each of its inputs.
+After sample k a stream gives the value at instant k - delay, where the delay is the distance that
+it looks ahead. A part needed only at time 0 is *anchored*: it accumulates a stream without storing
+it. Negations are moved into the leaves, so every operation is increasing in each of its inputs.
 """
 
 import math
@@ -67,7 +67,7 @@ class Output(NamedTuple):
 
 
 class Count(NamedTuple):
-    """A duration that leaves use: the plan of its formula, counted over `n` samples, `dt` apart."""
+    """A duration used by leaves: the plan of its formula, and `n` samples with period `dt`."""
 
     duration: Duration
     plan: "Plan"

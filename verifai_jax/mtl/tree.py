@@ -1,8 +1,8 @@
-"""Trees of operators: what the table says of a node, and how far a formula looks.
+"""Trees of operators: the table entry of a node, and the distances that a formula looks.
 
-Everything here is of nodes in general: `formula` has the nodes themselves. They are compared,
-hashed and walked without recursion. A sub-tree may occur several times (`f <-> g` holds each side
-twice), so nothing here takes longer than there are different nodes, whatever paths lead to them.
+This file handles nodes in general; `formula` defines the kinds of nodes. They are compared, hashed
+and walked without recursion. A sub-tree may occur several times (`f <-> g` holds each side twice),
+so all walks visit each different node once.
 """
 
 import abc
@@ -209,7 +209,7 @@ class Tree(Node):
         return self._total_reach(dt, "ahead")
 
     def history(self, dt: float = 0.0) -> float:
-        """Return how many seconds before an instant the formula's value there depends on.
+        """Return the number of seconds before an instant on which its value there depends.
 
         **Arguments:**
         - `dt`: sampling period in seconds, by which `prev` looks back.

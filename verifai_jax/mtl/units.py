@@ -1,4 +1,4 @@
-"""Units of signals and of what formulas compute with them.
+"""Units of signals and of expressions over them.
 
 units_of(["speed (m/s)", "dist"], {"dist": "m"})        # {'speed (m/s)': 'm/s', 'dist': 'm'}
 unit_of(term, units, faults)                            # 'm', and what does not go together

@@ -1,4 +1,4 @@
-"""The way from a formula to the predicate and the instant that its robustness comes from.
+"""The walk from a formula to the predicate and the instant that decide its robustness.
 
     walk = Walk(values_of, span, length, end="hold", stride=1)
     walk.operands(formula, 0)                         # The operands at the instants that matter

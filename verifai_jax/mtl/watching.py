@@ -5,8 +5,8 @@
     monitor.interval()                                # whatever may still come
     monitor.finish()                                  # if this was the last sample
 
-The machine's own compiler makes the step, from the code of `export_c`. Without a compiler, Python
-does the same, in some microseconds. `online` is the monitor within JAX.
+The machine's own C compiler compiles the step from the code of `export_c`. Without a compiler,
+Python performs the step in some microseconds. `online` is the monitor for JAX.
 """
 
 import ctypes

@@ -1,12 +1,12 @@
-"""Running maxima along time, hard and smooth, in a time that does not depend on the window.
+"""Running maxima along time, hard and smooth, at a cost independent of the window.
 
     extreme(x)                                        # over everything
     windowed(x, n, tau=0.1)                           # over the n samples from each instant on
     until(f, g)                                       # max over j of min(g[j], f before j)
 
-Arrays are time-major `[time, *lanes]`; a minimum is asked for by sign -1. With a temperature `tau`
-a maximum is `tau log sum exp(x / tau)`. Two forms of everything: `sequential` scans, which a CPU
-likes best, and `parallel` ones for a GPU, where depth is what costs.
+Arrays are time-major `[time, *lanes]`; sign -1 selects a minimum. With a temperature `tau` a
+maximum is `tau log sum exp(x / tau)`. Every function has two forms: `sequential` scans, which are
+fastest on a CPU, and `parallel` ones for a GPU, where the depth of the computation matters.
 """
 
 from types import ModuleType

@@ -1,10 +1,10 @@
-"""The table of operators, the words of the text grammar, and how texts are put together.
+"""The table of operators, the words of the text grammar, and the composition of texts.
 
     number_text(2.0), name_text("theta")                          # '2', 'theta'
     operator_text("always", "[0,4]", [Text("x <= 2", "leaf")])    # 'always[0,4] (x <= 2)'
     OPERATORS["always"].latex                                     # a backslash and 'Box'
 
-Nothing here knows formulas: they hand over their operator's word and the text of their operands.
+This file does not depend on formulas, which pass their operator's word and their operands' texts.
 """
 
 import math

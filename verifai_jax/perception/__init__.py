@@ -1,7 +1,7 @@
-"""A differentiable camera, and small networks that look through it.
+"""A differentiable camera, and small networks for its images.
 
-`abstract` falsifies a loop with such a network compositionally. It stands on `vj.falsify`, so its
-folder, `compositional`, is imported when it is first used.
+`abstract` falsifies a loop with such a network compositionally. It uses `vj.falsify`, so its
+folder, `compositional`, is imported on first use.
 """
 
 from typing import Any

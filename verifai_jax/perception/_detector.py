@@ -1,4 +1,4 @@
-"""Small convolutional networks: is the object there, which kind is it, where is it.
+"""Small convolutional networks that detect an object, its kind and its position.
 
     network = detector(jax.random.key(0), shape=(24, 48), values=1)
     seen = network(image)                     # Detection: presence (a logit), kinds, values
@@ -7,7 +7,7 @@
     network = load_detector("wide.npz")
 
 Convolutions are nine strided slices and a product (im2col): on CPUs the gradient of XLA's own
-convolution within a loop of JAX takes twenty times as long as outside of it.
+convolution takes twenty times as long inside a loop of JAX as outside.
 """
 
 import dataclasses

@@ -3,10 +3,10 @@
     Camera(24, 48, field_of_view=0.6, position=(0.0, 0.0, 1.3))                # looks along +x
     Camera(32, 32, position=(x, y, 10.0), pitch=-math.pi / 2, yaw=heading)     # looks down
 
-World axes: x forward, y to the left, z up, in metres. All boundaries of what is drawn here (edges
-of boxes, outlines of cones, markings on the ground) are planes or quadratic cones through the eye,
-so their signed distance from a pixel's centre, in pixels, is a function of the pixel that is
-linear, or linear and a norm of linear ones: a sum of a column and a row. That makes images cheap.
+World axes: x forward, y to the left, z up, in metres. All drawn boundaries (edges of boxes,
+outlines of cones, markings on the ground) are planes or quadratic cones through the eye. So the
+signed distance of a boundary from a pixel's centre, in pixels, consists of linear functions of the
+pixel and their norms, each a sum of a column and a row. That makes images cheap.
 """
 
 import dataclasses

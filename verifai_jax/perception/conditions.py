@@ -1,11 +1,11 @@
-"""Weather, lens and sensor: what happens between a scene and its image.
+"""Weather, lens and sensor: the effects between a scene and its image.
 
     Conditions(fog=0.02, brightness=0.7, blur=0.8)
     Conditions(rain=0.6, glare=0.5, glare_at=(0.7, 0.2), noise=0.02, dead=0.01, dirt=0.4)
 
-A field that is None costs nothing. Blur is a product with two band matrices, glare, rain and dirt
-are products of rows and columns: XLA fuses sums of shifted images with what makes the image, and
-computes it once for each shift.
+A field that is None costs nothing. Blur is a product with two band matrices; glare, rain and dirt
+are products of rows and columns. Sums of shifted images are avoided, because XLA would fuse them
+with the rendering and compute it once for each shift.
 """
 
 import jax
@@ -115,8 +115,8 @@ def taken(
 def _needed(key: Key[Array, ""] | None, effect: str, argument: str) -> Key[Array, ""]:
     if key is None:
         raise ValueError(
-            f"Conditions({effect}=...) is drawn at random: "
-            f"render(..., {argument}=jax.random.key(0)) says from which key"
+            f"Conditions({effect}=...) is drawn at random and needs a key: render(..., "
+            f"{argument}=jax.random.key(0))"
         )
     # Noise and rain, or dirt and dead pixels, have keys of their own.
     return jax.random.fold_in(key, {"noise": 0, "rain": 1, "dirt": 0, "dead": 1}[effect])

@@ -1,4 +1,4 @@
-"""The ground, and what is painted on it.
+"""The ground, and its painted markings.
 
     Ground(colour=(0.3, 0.3, 0.32), markings=(
         Line(position=(0.0, 1.75), width=0.15),                             # along the x axis

@@ -1,4 +1,4 @@
-"""Boxes, cones, cylinders and spheres: descriptions, and how they look from an eye.
+"""Boxes, cones, cylinders and spheres: descriptions, and their appearance in an image.
 
     Box(position=(20.0, 0.0, 0.0), size=(4.5, 1.8, 0.8), colour=(0.9, 0.4, 0.1), yaw=0.1)
     Cone(position=(15.0, 1.0, 0.0), radius=0.2, height=0.75, colour=(1.0, 0.35, 0.0))
@@ -291,10 +291,9 @@ def _between_ends(
 ) -> Float[Array, "n height width"]:
     """Return the share of each pixel in the part of the outline between both ends.
 
-    A plane tangent to the mantle at the angle phi contains the eye where
-    `towards . (cos phi, sin phi) = across`. Two such planes and the chords between their points of
-    contact bound the part. With a `sun`, the same for planes parallel to its rays, and for the
-    ground: the shadow.
+    A plane tangent to the mantle at the angle phi contains the eye where `towards . (cos phi, sin
+    phi) = across`. Two such planes and the chords between their points of contact bound the part.
+    With a `sun`, the same for planes parallel to its rays, and for the ground: the shadow.
     """
     norm = jnp.sqrt(dot(towards, towards) + TINY)
     cosine = across / norm

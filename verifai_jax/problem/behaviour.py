@@ -1,4 +1,4 @@
-"""Behaviour of a trace as numbers: cells that its signals visit, the clause nearest to breaking.
+"""Behaviour of a trace as numbers: visited cells of signals, and the clause nearest to breaking.
 
 behaviour = Behaviour({"mode": (0, 4, 5), "speed": (0, 40, 4)})
 behaviour(trace)                                    # [ids], -1 for what it does not show

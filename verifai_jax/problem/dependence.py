@@ -1,20 +1,19 @@
-"""The dependence of a problem's robustness on its features and its key, without simulating.
+"""The dependence of a problem's robustness on its features and its key, found without simulation.
 
     has_gradient(problem)                           # can slopes by features say anything?
     without_derivative(problem)                     # None, or "pure_callback of road (sim.py, ..."
     depends_on_key(problem)                         # does a point fail with a probability?
 
-A signal that is a whole number (a gear, a count) or a truth value is constant between its jumps:
-its derivative is zero wherever there is one. Where formulas speak of nothing else, slopes would
-cost simulations and say nothing. JAX knows: what does not depend differentiably on the features has
-a derivative that does not depend on them either.
+An integer or Boolean signal (a gear, a count) is constant between its jumps, so its derivative is
+zero wherever it exists. If formulas use only such signals, derivatives cost simulations and give no
+information. JAX shows this: the derivative of such a signal does not depend on the features.
 
-To differentiate a simulation takes JAX many times as long as to trace it. So a sweep over the steps
-of the traced simulation finds what depends on the features through steps that have derivatives.
-Only steps that bring a derivative of their own are differentiated, each for itself.
+Differentiating a simulation takes JAX many times as long as tracing it. So a sweep over the steps
+of the traced simulation finds the values that depend on the features through differentiable steps.
+Only steps with a custom derivative are differentiated, one at a time.
 
-Some steps have none at all: a call of Python on the host, an operation of somebody's own. Where a
-feature reaches the robustness through one, JAX differentiates nothing of the simulation.
+Some steps have no derivative: a call of Python on the host, or a user's own operation. If a feature
+reaches the robustness through one, JAX cannot differentiate the simulation.
 """
 
 from collections.abc import Sequence, Set

@@ -3,12 +3,12 @@
     Guide("always distance > 10")                       # its robustness
     Guide(lambda trace, features: trace["speed"].min(), weight=0.8, scale=5.0)
 
-Where the robustness says little, somebody may know what leads to a failure. A search receives a
-weighted sum of both, as in ATheNA, which joins fitness that is made of the requirement with fitness
-that an engineer defines (Formica, Fan, Menghi, Search-based software testing driven by
-automatically generated and manually defined fitness functions, ACM Transactions on Software
-Engineering and Methodology, arXiv:2207.11016, 2022). Verdicts, the robustness of the table,
-confirmation and estimates know nothing of it.
+If the robustness gives little guidance, users may know what leads to a failure. A search receives a
+weighted sum of robustness and term, as in ATheNA, which combines fitness generated from the
+requirement with fitness defined by an engineer (Formica, Fan, Menghi, Search-based software testing
+driven by automatically generated and manually defined fitness functions, ACM Transactions on
+Software Engineering and Methodology, arXiv:2207.11016, 2022). The term does not affect verdicts,
+the robustness of the table, confirmation or estimates.
 """
 
 from collections.abc import Callable, Mapping

@@ -1,4 +1,4 @@
-"""The identity of what a problem simulates, apart from the formulas that judge it."""
+"""The identity of a problem's simulation, without its formulas."""
 
 import jax
 

@@ -1,4 +1,4 @@
-"""The order of several rules, compared where a sum would mislead.
+"""The order of several rules, for comparisons in which a sum would mislead.
 
     rulebook = Rulebook(("safe", "legal", "comfort"), [("safe", "comfort"), ("legal", "comfort")])
     rulebook.graver([1, 0, 0], [0, 0, 1])                    # True: breaking safety is worse
@@ -29,7 +29,7 @@ MAX_RULES = 30
 
 @dataclass(frozen=True)
 class Rulebook:
-    """Rules by name, with pairs `(higher, lower)` of which the first matters more.
+    """Rules by name, with pairs `(higher, lower)`: the first rule of a pair matters more.
 
     `order` lists each rule after all those that matter more: a topological order, which follows
     `names` where the edges leave it open.

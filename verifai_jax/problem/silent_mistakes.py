@@ -2,9 +2,9 @@
 
     silent_mistakes(problem)                            # ("feature 'wind' influences no ...",)
 
-A formula that looks beyond the end of the trace, a feature that nothing reads, a system that is not
-a function of its features and its key. Nothing compiles: the system is traced twice, which takes a
-fraction of a second. Only certain mistakes are reported.
+Examples are a formula that looks beyond the end of the trace, an unused feature, and a system that
+is not a function of its features and its key. Nothing compiles: the system is traced twice, which
+takes a fraction of a second. Only certain mistakes are reported.
 """
 
 import math

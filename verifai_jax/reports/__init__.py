@@ -1,4 +1,4 @@
-"""Evidence reports: one file that says what was shown, what was not, and how to repeat it."""
+"""Evidence reports: one file with the findings, their limits, and the commands to repeat them."""
 
 from typing import TYPE_CHECKING
 

@@ -3,8 +3,8 @@
     with_assessment(page)                           # the page with three sections more
 
 The steps are those of FDA, Assessing the Credibility of Computational Modeling and Simulation in
-Medical Device Submissions (November 2023). What the report says to a step is referred to, and the
-rest is an empty box with its question: a tool cannot know it, and does not make it up.
+Medical Device Submissions (November 2023). A step refers to the parts of the report that answer it.
+All other questions get an empty box, since the tool cannot know the answers.
 
 The claims are drawn as a tree in Goal Structuring Notation. Source: Goal Structuring Notation
 Community Standard, version 3 (SCSC-141C, 2021): goals are rectangles, a strategy is a

@@ -1,4 +1,4 @@
-"""Claims of a report: what is claimed, on what evidence, under which assumptions.
+"""Claims of a report, with their evidence and assumptions.
 
 claim = Claim("C1", "604 of 20000 simulations violate the property", ("table.parquet",), (...))
 claims_json("balance", claims)                      # plain data that a safety case can cite

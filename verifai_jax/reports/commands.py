@@ -1,4 +1,4 @@
-"""Commands that repeat what a report shows."""
+"""Commands that repeat the results of a report."""
 
 import json
 import shlex

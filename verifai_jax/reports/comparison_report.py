@@ -1,4 +1,4 @@
-"""The report on a comparison: which candidate fails more often, by how much, and where."""
+"""The report on a comparison: differences of failure rates, and the features where they occur."""
 
 from verifai_jax.core.messages.text import format_percent
 from verifai_jax.estimation.comparison.result import BETTER, SAME, WORSE, Comparison

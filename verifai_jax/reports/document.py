@@ -71,10 +71,9 @@ def write_report(
       in `vj.modes`; none when left out.
     - `problem`: the problem of an estimate, of a verification, or of a failure table without a
       failure, or the baseline of a comparison; the report shows its property and prior.
-    - `errors`: a result of `vj.error_budget`, for a section and a claim on how wrong the number can
-      be.
-    - `odd`: the operational design domain, from `vj.read_odd`; adds a section on how much of it a
-      run covers. Features without their own units and reasons take those of the domain.
+    - `errors`: a result of `vj.error_budget`, for a section and a claim on the error of the number.
+    - `odd`: the operational design domain, from `vj.read_odd`; adds a section on the part of it
+      that a run covers. Features without their own units and reasons take those of the domain.
     - `assessment`: whether to add sections for an assessor: the claims as a tree, the nine steps of
       credibility with boxes to fill in, and a page to sign.
     - `progress`: whether to show one line of progress; see `core.display.progress` for the default.
@@ -93,8 +92,8 @@ def write_report(
         case Run():
             if result.table.changed:
                 raise ValueError(
-                    f"no report is written on the run of {result.name!r}, whose rows would be its "
-                    f"evidence: {result.damage}"
+                    f"no report can be written on the run of {result.name!r}, because its rows "
+                    f"are the evidence: {result.damage}"
                 )
             space = result.problem.space if result.problem else None
             _check(about, space, result.table.features)

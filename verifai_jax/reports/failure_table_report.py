@@ -1,4 +1,4 @@
-"""The report on a failure table: what each fault does, how probable that is, and its replay."""
+"""The report on a failure table: the effect of each fault, its probability, and its replay."""
 
 from verifai_jax.core.messages.text import format_percent, format_seconds
 from verifai_jax.faults.failure_table.result import Effect, FailureTable

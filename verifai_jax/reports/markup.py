@@ -3,8 +3,8 @@
     str(element("p", "less than ", element("b", "<script>")))
     # <p>less than <b>&lt;script&gt;</b></p>
 
-Texts come from people: names of features, messages of systems, notes. Only a `Markup` is HTML; any
-other text is escaped where it is put in.
+Texts are untrusted: names of features, messages of systems, notes. Only a `Markup` is HTML; any
+other text is escaped when it is inserted.
 """
 
 import base64

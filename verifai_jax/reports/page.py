@@ -1,10 +1,10 @@
-"""A page from its sections: one HTML file that needs nothing else, with or without JavaScript.
+"""A page from its sections: one self-contained HTML file, usable with or without JavaScript.
 
 render(page)                                        # the text of the file
 write_page(page, "report.html")
 
-Its policy of content allows the pictures inside of it, and one style sheet and one script by their
-hashes: nothing is loaded, nothing is sent, and no text that came into the page can run.
+Its content security policy allows only embedded pictures, and one style sheet and one script by
+their hashes: nothing is loaded or sent, and no inserted text can run.
 """
 
 import base64
@@ -35,7 +35,7 @@ class Page:
 
     - `title`: the title of the page.
     - `headline`: the finding in a sentence.
-    - `tone`: how the headline is marked: `"fails"`, `"holds"` or `"open"`.
+    - `tone`: the marking of the headline: `"fails"`, `"holds"` or `"open"`.
     - `sections`: the sections in order.
     - `claims`: the claims as plain data.
     - `view`: data of the interactive table; None without one.

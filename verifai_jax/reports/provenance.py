@@ -1,10 +1,10 @@
-"""The inputs of a report with their hashes, chained, and the versions of what made it.
+"""The inputs of a report with a chain of their hashes, and the versions of the software.
 
     inputs = folder_inputs(folder, FILES) + Model.of(run.sources).inputs
     chained(inputs)[-1].chain                       # one hash that all inputs decide
 
-A link of the chain is the SHA-256 of the link before, the name of the input and its content's hash,
-so that the last link stands for all inputs in their order.
+A link of the chain is the SHA-256 of the previous link, the name of the input and its content's
+hash, so the last link identifies all inputs in their order.
 """
 
 import hashlib

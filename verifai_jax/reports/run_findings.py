@@ -1,4 +1,4 @@
-"""Findings of a run: numbers, failures with pictures, the reason, the least form, the analysis."""
+"""Findings of a run: numbers, failures with pictures, reasons, smallest departure, analysis."""
 
 import math
 from collections.abc import Iterable
@@ -250,7 +250,7 @@ def limits(run: Run, studies: Studies, assumptions: list[str]) -> Section:
 
 
 def not_sampled(run: Run, studies: Studies) -> list[str]:
-    """Say which inputs no simulation covered."""
+    """Write which inputs no simulation covered."""
     items = [
         "Values outside of the ranges above: nothing is known of them.",
         "Whatever the system does not take from the features, such as other disturbances, parts "

@@ -63,9 +63,7 @@ FROM_DATA = "Verdicts are those of the robustness of the formulas, in {}; of exa
 
 @dataclass(frozen=True)
 class Reproduction:
-    """The ground of a report: the `links` of the chain of its inputs, the `command` for it, and
-    the `model` that ran.
-    """
+    """The basis of a report: the `links` of its chain of inputs, its `command`, and the `model`."""
 
     links: tuple[Link, ...]
     command: str | None

@@ -1,4 +1,4 @@
-"""Sections that reports on all kinds of results share: claims, inputs, versions, what was asked."""
+"""Sections common to reports on all kinds of results: claims, inputs, versions, the question."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -59,7 +59,7 @@ def model_warnings(model: Model, findings: Sequence[str] = ()) -> tuple[Markup, 
     **Arguments:**
     - `model`: the files of the model. `findings`: sentences on rows that did not reproduce their
       numbers.
-    - `findings`: rows that did not give their numbers again, as sentences.
+    - `findings`: sentences on rows that did not reproduce their numbers.
     """
     content: list[Markup] = []
     if model.changes:

@@ -1,4 +1,4 @@
-"""Studies that a report adds to a run: failures with pictures, their reason, least form, analysis.
+"""Studies that a report adds to a run: failures with pictures, explanation, shrinking, analysis.
 
 studies = study(run, traces=24)
 studies.failures[0].replay                      # the worst one, simulated again

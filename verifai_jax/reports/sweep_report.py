@@ -1,4 +1,4 @@
-"""The report on a sweep: which trainings are certified safe, and what was not shown of them."""
+"""The report on a sweep: the trainings certified as safe, and the limits of these certificates."""
 
 from typing import Any
 

@@ -1,4 +1,4 @@
-"""The report on one policy in two engines: where they differ, by how much, and what makes it."""
+"""The report on one policy in two engines: their differences and the causes."""
 
 from typing import Any
 

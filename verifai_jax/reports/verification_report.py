@@ -1,4 +1,4 @@
-"""The report on a verification: what is proved, broken and undecided, and by which boxes."""
+"""The report on a verification: the proved, broken and undecided parts, and their boxes."""
 
 from typing import Any
 

@@ -1,4 +1,4 @@
-"""The table of a run as data that a page or a notebook looks at: thinned rows, and traces.
+"""The table of a run as data for a page or a notebook: thinned rows, and traces.
 
 data = view_data(run, traces)                       # plain data for `view.js`
 trace_data(run.replay(17))                          # one trace of it

@@ -1,11 +1,11 @@
-"""Returns of policies on a task: their most likely actions, without exploration.
+"""Returns of policies on a task, with their most likely actions and without exploration.
 
     evaluate(task, policy, seed=0, episodes=100).mean()  # the returns of one policy
     mean_returns(task, policies, seed=0)                 # one number a policy
 
-An episode ends where the task says so, or at its time limit. The same seed gives all policies the
-same episodes. Policies of one structure go through one program of fixed width: a mean return does
-not depend on the other policies that are measured along with it.
+An episode ends when the task terminates it, or at its time limit. The same seed gives all policies
+the same episodes. Policies of one structure share a program of fixed width, so a mean return does
+not depend on which other policies are measured.
 """
 
 from collections.abc import Callable, Hashable, Iterator, Sequence
@@ -26,9 +26,9 @@ from verifai_jax.rl.task.task import State, Task
 POLICIES_PER_DEVICE = 8
 """Policies that a device simulates at a time."""
 EPISODES = 32
-"""Episodes of a mean return, when nothing else is said."""
+"""Default number of episodes of a mean return."""
 Totals = tuple[State, Float[Array, "..."], Bool[Array, "..."]]
-"""States, rewards so far, and the episodes that are over."""
+"""States, rewards so far, and flags of the episodes that are over."""
 
 
 @shows_progress("simulating episodes of", "episodes")
@@ -38,7 +38,7 @@ def evaluate(
     """Simulate episodes with the policy's most likely actions and return their returns.
 
     **Arguments:**
-    - `task`: the task. An episode ends where the task says so, or at its time limit.
+    - `task`: the task. An episode ends when the task terminates it, or at its time limit.
     - `policy`: the policy to measure.
     - `seed`: the seed of the episodes' starts and of random steps.
     - `episodes`: number of episodes.

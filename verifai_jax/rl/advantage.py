@@ -14,7 +14,7 @@ from verifai_jax.rl.algorithm import Number
 
 
 class Ends(NamedTuple):
-    """The ends of episodes at each time: terminated for good, or terminated or truncated."""
+    """The ends of episodes at each time: terminated only, and terminated or truncated."""
 
     terminated: Bool[Array, "*time"]
     truncated: Bool[Array, "*time"]

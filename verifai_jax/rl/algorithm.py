@@ -5,9 +5,9 @@
     state, progress = algorithm.step(task, state)
     policy = algorithm.policy(task, state)
 
-An algorithm is a frozen dataclass that JAX knows as a pytree: hyper-parameters that change no
-shape are its leaves, so one compiled program serves all their values; those that do are static
-fields (`static_field`), and each combination of them is compiled once.
+An algorithm is a frozen dataclass that JAX knows as a pytree: hyper-parameters that change no shape
+are its leaves, so one compiled program serves all their values. Hyper-parameters that change a
+shape are static fields (`static_field`); each combination of them is compiled once.
 """
 
 import dataclasses

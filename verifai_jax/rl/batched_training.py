@@ -6,11 +6,11 @@
     for number in training.advance({0: 10_000, 1: 10_000}):
         training.policy(number), training.curve(number)
 
-Hyper-parameters that change no shape are arguments of the program; those that do group the
-configurations. On CPUs one training runs on each core, each exactly as it would alone; on an
-accelerator many of them run under one `vmap`. The result depends on the configuration and its
-seed, not on the other runs: bit for bit on one machine where runs are not vmapped, and to the
-rounding of float32 in each update where they are.
+Hyper-parameters that change no shape are arguments of the program; the others divide the
+configurations into groups. On CPUs one training runs on each core, exactly as it would alone; on an
+accelerator many run under one `vmap`. The result depends on the configuration and its seed, not on
+the other runs: bit for bit on one machine without `vmap`, and up to float32 rounding in each update
+with it.
 """
 
 import time
@@ -38,9 +38,9 @@ from verifai_jax.rl.task.task import Task
 RUNS_PER_ACCELERATOR = 64
 """Training runs under one `vmap` on an accelerator; a CPU core is busy with one."""
 SLICE_SECONDS = 2.0
-"""Seconds that a call into compiled code lasts at most, about; one can interrupt between calls."""
+"""Approximate maximum seconds of a call of compiled code; interrupts act between calls."""
 PyTreeDef: TypeAlias = jax.tree_util.PyTreeDef  # pyright: ignore[reportInvalidTypeForm]
-"""The structure of a pytree; its own name of the class is a variable to type checkers."""
+"""The structure of a pytree; type checkers take JAX's name of the class for a variable."""
 Shapes = tuple[tuple[tuple[int, ...], str], ...]
 """Shape and dtype of each array."""
 
@@ -81,7 +81,7 @@ class Configuration:
 
 
 class _Batch(NamedTuple):
-    """States and learning curves of runs that went on side by side, still stacked."""
+    """States and learning curves of runs that advanced together, as stacked arrays."""
 
     states: AlgorithmState
     curves: Float[Array, "lanes capacity"]
@@ -89,7 +89,7 @@ class _Batch(NamedTuple):
 
 @dataclass(eq=False)
 class _Lane:
-    """A run on its way: the batch that it was last part of, and its index there."""
+    """An unfinished run: the last batch that it was part of, and its index there."""
 
     batch: _Batch
     index: int
@@ -98,7 +98,7 @@ class _Lane:
 
 
 class _Structure(NamedTuple):
-    """Properties that runs which share a program have in common."""
+    """Properties common to all runs that share a program."""
 
     task: Hashable
     algorithm: Hashable
@@ -245,7 +245,7 @@ class BatchedTraining:
             self._lanes[number] = _Lane(batch, index, done, share + earlier)
 
     def _gather(self, numbers: list[int], devices: tuple[Device, ...]) -> _Batch:
-        """Stack the states of runs that go on side by side from now on."""
+        """Stack the states of runs that advance together from now on."""
         lanes = [self._lanes[n] for n in numbers]
         first = lanes[0].batch
         width = len(first.curves)

@@ -4,8 +4,8 @@
     episodes, transition = advance(task, episodes, actions, key)
     progress(transitions)                      # the episodes that ended in an update
 
-A transition keeps the observation that its step led to *before* the reset: an episode that only
-the time limit cut off goes on to have a value, and that is where it has it.
+A transition keeps the observation after its step and *before* the reset. The value of an episode
+that the time limit truncated is estimated from this observation.
 """
 
 from typing import NamedTuple
@@ -37,7 +37,7 @@ class Transition(NamedTuple):
 
     - `reward`: the reward of the step.
     - `next_observation`: the observation of the state that the step led to, before any reset.
-    - `ends`: which episodes it ended.
+    - `ends`: the episodes that the step ended.
     - `total`: the episode's return including this step.
     """
 

@@ -14,7 +14,7 @@ class ObservationStatistics(NamedTuple):
     """Statistics of the observations so far.
 
     - `count`: number of observations.
-    - `mean`, `variance`: those of each of the `k` numbers of an observation.
+    - `mean`, `variance`: mean and variance of each of the `k` numbers of an observation.
     """
 
     count: Float[Array, ""]

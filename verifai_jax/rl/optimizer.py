@@ -1,4 +1,4 @@
-"""The optimizer of all training algorithms: Adam at a rate that may fall to 0 over the training.
+"""The optimizer of all training algorithms: Adam with a constant or linearly falling rate.
 
 optimizer = adam(max_gradient=0.5)
 rate = annealed(1e-3, done, updates, enabled=True)

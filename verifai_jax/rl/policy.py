@@ -52,8 +52,8 @@ class Policy:
     """A network with the normalisation of its observations and the kind of its actions.
 
     - `layers`: weights `[inputs, outputs]` and biases `[outputs]`, first layer first.
-    - `mean`, `scale`: `[k]`; the network receives `(observation - mean) / scale`. None: it receives
-      the observation itself.
+    - `mean`, `scale`: `[k]`; the network receives `(observation - mean) / scale`, or the
+      observation itself if they are None.
     - `log_std`: `[size]`, logarithm of the standard deviation for exploration; None for discrete
       actions, and if the deviation depends on the observation.
     - `action`: the kind of action.
@@ -85,8 +85,8 @@ class Policy:
     ) -> Float[Array, "*batch outputs"]:
         """Return logits or values `[n]` of the actions, or the mean action `[size]`.
 
-        A continuous action is in units of half its range around the middle of it. A batch of
-        observations gives a batch of outputs.
+        A continuous action is scaled: 0 is the middle of its range, and -1 and 1 are the ends. A
+        batch of observations gives a batch of outputs.
         """
         if self.mean is not None and self.scale is not None:
             observation = (observation - self.mean) / self.scale
@@ -139,9 +139,9 @@ def scalar_network(
 ) -> list[Float[Array, ""]]:
     """Evaluate the same network with scalars, for a few hundred weights that are constants.
 
-    Under `vmap` each scalar becomes a row of lanes, and all fuse into straight-line vector code: in
-    a rollout of hundreds of lanes it is 1.5 times as fast as small matrix products, but takes
-    longer to compile. Not for weights that are traced themselves.
+    Under `vmap` each scalar becomes a row of lanes, and all operations fuse into straight-line
+    vector code. In a rollout of hundreds of lanes this is 1.5 times as fast as small matrix
+    products, but takes longer to compile. Do not use it for traced weights.
     """
     values, between = list(inputs), ACTIVATIONS[activation]
     for i, (weight, bias) in enumerate(layers):
@@ -259,7 +259,7 @@ def load_policy(path: str | Path) -> Policy:
 def _action_of(data: object) -> Action:
     """Return the kind of action that a file describes.
 
-    **Raises:** `ValueError` for data that describes none.
+    **Raises:** `ValueError` for data that describes no action.
     """
     if not isinstance(data, dict) or data.get("kind") not in list(_KINDS):
         raise ValueError(f"its action must be an object of kind {' or '.join(_KINDS)}")
@@ -280,7 +280,7 @@ def _action_of(data: object) -> Action:
 def _layers_of(arrays: Mapping[str, np.ndarray]) -> tuple[Layers, dict[str, np.ndarray]]:
     """Return the layers of a file whose shapes fit together, and the other arrays.
 
-    **Raises:** `KeyError` for one that is missing, `ValueError` for one that no policy has.
+    **Raises:** `KeyError` for a missing layer, `ValueError` for shapes that do not fit.
     """
     for name, array in arrays.items():
         if array.dtype.kind != "f" or not np.all(np.isfinite(array)):
@@ -301,7 +301,7 @@ def _layers_of(arrays: Mapping[str, np.ndarray]) -> tuple[Layers, dict[str, np.n
 
 
 def _check_fits(policy: Policy) -> None:
-    """Check that the network gives the actions that the policy is said to have.
+    """Check that the network's outputs fit the policy's kind of action.
 
     **Raises:** `ValueError` for another number of outputs, or a scale that does not fit.
     """

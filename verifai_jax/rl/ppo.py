@@ -313,7 +313,7 @@ def _loss(weights: Weights, ppo: PPO, action: Action, part: Minibatch) -> Float[
 
 
 def _noise(action: Action, key: Key[Array, ""]) -> Float[Array, " outputs"]:
-    """Draw what an action is made random by: the same whatever the network says."""
+    """Draw the noise of an action, which does not depend on the network."""
     if isinstance(action, Discrete):
         return jax.random.gumbel(key, (action.n,))
     return jax.random.normal(key, (action.size,))

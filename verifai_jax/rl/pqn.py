@@ -7,9 +7,9 @@
 The policy's outputs are the values of the actions (times `reward_scale`).
 
 Source: Gallici et al., Simplifying deep temporal difference learning (2024), algorithm 1. Their
-layer normalisation is left out: on low-dimensional observations bounded units (tanh) do without,
-and a policy stays a plain network. Exploring by holding random actions: Dabney et al., Temporally
-extended epsilon-greedy exploration (2021), with geometric durations.
+layer normalisation is left out: with low-dimensional observations bounded units (tanh) do not need
+it, and a policy stays a plain network. The exploration, which holds random actions, is from Dabney
+et al., Temporally extended epsilon-greedy exploration (2021), with geometric durations.
 """
 
 from dataclasses import dataclass

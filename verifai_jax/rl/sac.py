@@ -1,10 +1,10 @@
-"""Soft actor-critic: a random policy for continuous actions that earns much and stays random.
+"""Soft actor-critic: a stochastic policy for continuous actions, trained for return and entropy.
 
     sac = SAC(learning_rate=1e-3, hidden=(32, 32))
     state = sac.init(task, key, updates=200)
     state, progress = sac.step(task, state)
 
-The policy that comes out is the mean action through tanh, without the noise.
+The resulting policy is the mean action after tanh, without the noise.
 
 Source: Haarnoja et al., Soft actor-critic algorithms and applications (2018). Exploration with
 noise that lasts: Eberhard et al., Pink noise is all you need (2023), here an autoregressive
@@ -29,7 +29,7 @@ from verifai_jax.rl.task.task import Continuous, Task
 LOG_STD = (-10.0, 2.0)
 """Bounds of the logarithm of the deviation.
 
-Beyond them a Gaussian under tanh is a constant, or a coin that shows only the two ends.
+Outside these bounds a Gaussian after tanh is nearly constant, or takes almost only -1 and 1.
 """
 
 

@@ -3,8 +3,8 @@
     Split({"wind": CrossEntropy(), "cars": "halton"}, rest="uniform")
     Split({"x0": Grid(5), "alg": Grid()}, rest=Uniform())
 
-Every part sees its own coordinates and the robustness of the whole simulation. A part that learns
-takes the others for noise, so that what belongs together belongs into one part.
+Every part receives its own coordinates and the robustness of the whole simulation. For a part that
+learns, the other coordinates are noise, so put interacting features into one part.
 """
 
 import operator

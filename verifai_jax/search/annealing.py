@@ -1,11 +1,11 @@
 """Simulated annealing as parallel tempering: chains from cold to hot that exchange their points.
 
-Each chain is a Metropolis walk over the cube that has, at temperature T, the density
-exp(-max(rho, 0) / T) (Kirkpatrick, Gelatt, Vecchi, Optimization by simulated annealing, Science
-220, 1983). Pairs of chains exchange their points with the probability that leaves these densities
-as they are (replica exchange: Swendsen, Wang, 1986; Geyer, Markov chain Monte Carlo maximum
-likelihood, 1991), so that what the hot ones find sinks to the cold ones, while a schedule that
-cools down once could only be followed to its end. The hottest chains draw from the prior.
+Each chain is a Metropolis walk over the cube that has, at temperature T, the density exp(-max(rho,
+0) / T) (Kirkpatrick, Gelatt, Vecchi, Optimization by simulated annealing, Science 220, 1983). Pairs
+of chains exchange their points with the probability that keeps these densities invariant (replica
+exchange: Swendsen, Wang, 1986; Geyer, Markov chain Monte Carlo maximum likelihood, 1991). So
+discoveries of hot chains move to the cold ones, without a cooling schedule of fixed length. The
+hottest chains draw from the prior.
 
 Proposals are symmetric: Gaussian steps, some in all and some in a few coordinates, with a scale
 that follows the acceptance rate of each temperature and a random factor, and steps along the
@@ -198,7 +198,7 @@ class Annealing(Search[AnnealingState]):
 
 
 def best_to_median(energy: Float[Array, " n"]) -> Float[Array, ""]:
-    """Return the spread of the finite entries in a way that a few large ones do not affect."""
+    """Return a robust spread of the finite entries, which a few large ones do not affect."""
     known = jnp.sum(jnp.isfinite(energy))
     ranked = jnp.sort(energy)
     return jnp.where(known > 0, ranked[jnp.maximum(known - 1, 0) // 2] - ranked[0], 0.0)

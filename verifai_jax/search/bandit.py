@@ -1,22 +1,22 @@
-"""Bandits: each coordinate is a bandit of its own, whose arms are intervals.
+"""Bandits: each coordinate has its own bandit, whose arms are intervals.
 
-An arm is drawn the more, the higher its upper confidence bound is: its mean reward plus a bonus
-that shrinks as it is drawn (UCB1: Auer, Cesa-Bianchi, Fischer, Finite-time analysis of the
+Arms with a higher upper confidence bound are drawn more often. The bound is the mean reward plus a
+bonus that shrinks with each draw (UCB1: Auer, Cesa-Bianchi, Fischer, Finite-time analysis of the
 multiarmed bandit problem, Machine Learning 47, 2002). VerifAI has such a search; this one works in
 batches and learns before the first failure:
 
-- rewards come from ranks: the best point of those remembered has 1, points outside of the best
-  share have 0, so that any robustness will do. All failures are equally good and share their
-  ranks: the more of them there are, the less is one worth, and the search looks elsewhere too;
+- rewards come from ranks, so the scale of the robustness does not matter: the best remembered point
+  gets 1, and points outside of the best share get 0. All failures are equally good and share their
+  ranks: with more failures each gets less reward, and the search explores more;
 - only the last points are remembered (sliding-window UCB: Garivier, Moulines, On upper-confidence
-  bound policies for switching bandits, 2011), as what a coordinate is worth changes while the
-  others learn;
+  bound policies for switching bandits, 2011), as the value of an arm changes while other
+  coordinates learn;
 - arms split: under each of them is another bandit, whose arms start at the mean of their parent's
-  (UCT: Kocsis, Szepesvari, 2006). Where points are few the bonus is large and the draws are even,
-  so that splitting sharpens the search exactly where it has gone to;
-- within a batch each draw counts at once, without its reward. In the limit of small draws the
-  bounds of all arms that are drawn become equal, at a level that bisection finds. The shares of
-  the arms make a density, and the rows are a Latin hypercube in it.
+  (UCT: Kocsis, Szepesvari, 2006). With few points the bonus is large and the draws are even, so
+  that splitting refines the search only where it has many points;
+- within a batch each draw counts at once, before its reward is known. In the limit of small draws
+  the bounds of all drawn arms become equal, at a level found by bisection. The shares of the arms
+  define a density, and the rows are a Latin hypercube sample of it.
 """
 
 from dataclasses import dataclass

@@ -41,8 +41,8 @@ class Observations(NamedTuple):
       values fill up to `CLAUSES`.
     - `clause_gradients`: their gradients by `u`; zero in rounds that do not differentiate.
     - `outcomes`: a description of what happened (`core.values.clauses`), NaN if unknown.
-    - `coverage_ids`: ids of the items that each simulation covered, -1 for none; `coverage_ids //
-      KIND` is the kind of item.
+    - `coverage_ids`: ids of the items that each simulation covered, padded with -1; `coverage_ids
+      // KIND` is the kind of item.
 
     Fields after `valid` are None unless the search's `Wants` name them.
     """
@@ -192,7 +192,7 @@ class Wants:
 
 
 class Plan(NamedTuple):
-    """The simulations of its last proposals that a search with clauses asks for.
+    """The simulations of its last proposals that a search with clauses requests.
 
     - `rows`: number of proposals to simulate, counted from the first; the others are returned as
       rows that are not valid.
@@ -245,7 +245,7 @@ class Search(ForUsers, abc.ABC, Generic[State]):
 
     @property
     def origin(self) -> Origin:
-        """The origin of the points, which determines what their rows are evidence of."""
+        """The origin of the points, which determines the conclusions that their rows allow."""
         if self.samples_prior:
             return "prior"
         if not self.learns:
@@ -254,7 +254,7 @@ class Search(ForUsers, abc.ABC, Generic[State]):
 
     @property
     def sequence(self) -> tuple[str, str]:
-        """The words for the points of a finite search, and for their order, in a note."""
+        """The words that a note uses for the points of a finite search and their order."""
         return "search", "in its order"
 
     @property
@@ -338,7 +338,7 @@ class PointSequence(Search[State]):
 class SlopeSearch(Search[State]):
     """A search that follows gradients of clauses, and can also start from suggested points.
 
-    Its state has the points `offered` as next starts, and `near`, how near each is to failing.
+    Its state has the points `offered` as next starts, and `near`, the closeness of each to failing.
     """
 
     @property

@@ -1,19 +1,20 @@
-"""Bayesian optimization: a Gaussian process guesses the robustness, and says how sure it is.
+"""Bayesian optimization: a Gaussian process predicts the robustness and its uncertainty.
 
-Each round asks for a batch of points that might fail, by one of two rules.
+Each round proposes a batch of points that might fail, by one of two rules.
 
 - Thompson sampling: each point minimizes a function drawn from the posterior (Thompson 1933; in
   batches Hernandez-Lobato et al., Parallel and distributed Thompson sampling for large-scale
-  accelerated exploration of chemical space, ICML 2017). The functions are whole ones, so the minima
-  are sought in two steps: over candidates that all share, then around each function's best.
+  accelerated exploration of chemical space, ICML 2017). The drawn functions can be evaluated
+  anywhere, so the minima are sought in two steps: among candidates common to all functions, then
+  around each function's best candidate.
 - Expected improvement (`improvement`).
 
-While no failure is known, every fourth point refines the best one: by a process of the points near
-it alone, over the box around them, almost without regard to what it does not know. Where
-simulations had no verdict another process says how likely one is.
+While no failure is known, every fourth point refines the best one: a second process is fitted to
+the points near it, and its mean is minimised over their box almost without regard to its
+uncertainty. If simulations had no verdict, another process predicts the probability of a verdict.
 
-All failures are equally good: below zero the target is flat. Above it is logarithmic in the
-robustness over its lower quartile, and capped, so that huge values do not hide the rest.
+All failures are equally good: below zero the target is flat. Above zero the target is logarithmic
+in the robustness divided by its lower quartile, and capped, so that huge values do not dominate.
 """
 
 from collections.abc import Callable

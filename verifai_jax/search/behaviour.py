@@ -1,11 +1,11 @@
-"""Distances between what happens in simulations, and a memory of what has happened.
+"""Distances between the outcomes of simulations, and a memory of outcomes.
 
     seen = SeenBehaviour.nothing(capacity=256, batch=16)
     seen = seen.widened(outcomes).recorded(outcomes)
     seen.unlike(outcomes, others)                       # [n, m], from 0 to 1
 
-Outcomes are those of `core.values.clauses`: the predicate that decides, the instant, the trace's
-shape.
+Outcomes are those of `core.values.clauses`: the deciding predicate, its time, and the shape of the
+trace.
 """
 
 from typing import NamedTuple
@@ -103,7 +103,7 @@ class SeenBehaviour(NamedTuple):
     def familiarity(
         self, outcomes: Float[Array, "n outcome"], radius: Float[Array, ""]
     ) -> Float[Array, " n"]:
-        """Return 1 for outcomes that are often seen, falling to 0 at a radius from all seen.
+        """Return 1 for outcomes seen often, falling to 0 at a given distance from all seen ones.
 
         It is a mean over the nearest outcomes, as in novelty search, so an outcome seen once is not
         familiar.

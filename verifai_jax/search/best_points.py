@@ -1,4 +1,4 @@
-"""Memory of the best points so far, of which the newest of equal ones comes first."""
+"""Memory of the best points so far; among equal ones the newest comes first."""
 
 import jax
 import jax.numpy as jnp
@@ -15,7 +15,7 @@ def newest_first(
 
     **Arguments:**
     - `u`, `new`: points and scores of the round; a score is infinite if there is nothing to learn.
-    - `points`, `score`: those of the memory; a score is infinite in an empty row.
+    - `points`, `score`: points and scores of the memory; a score is infinite in an empty row.
     """
     u = jnp.where(jnp.isinf(new)[:, None], 0.5, u)
     return jnp.concatenate([u, points]), jnp.concatenate([new, score])
@@ -27,7 +27,7 @@ def keep_best(
     points: Float[Array, "k d"],
     score: Float[Array, " k"],
 ) -> tuple[Float[Array, "k d"], Float[Array, " k"]]:
-    """Return the best points of a round and a memory, sorted; of equal ones the newest first.
+    """Return the best points of a round and a memory, sorted; the newest first among equal ones.
 
     **Arguments:** those of `newest_first`.
     """

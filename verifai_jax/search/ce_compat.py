@@ -1,9 +1,9 @@
-"""VerifAI's cross-entropy: one histogram a coordinate, updated by one sample at a time.
+"""VerifAI's cross-entropy: one histogram for each coordinate, updated by one sample at a time.
 
-After each point that fails, `rho < threshold`, every histogram is multiplied by `alpha` and gets
-`1 - alpha` in the point's bucket, in the order of the rows (Dreossi et al., VerifAI: a toolkit for
-the formal design and analysis of artificial intelligence-based systems, CAV 2019). Before the
-first failure it learns nothing: `CrossEntropy` is the search to use, this one is for comparisons.
+After each point that fails, `rho < threshold`, every histogram is multiplied by `alpha` and gets `1
+- alpha` in the point's bucket, in the order of the rows (Dreossi et al., VerifAI: a toolkit for the
+formal design and analysis of artificial intelligence-based systems, CAV 2019). Before the first
+failure it learns nothing. It is meant for comparisons; otherwise use `CrossEntropy`.
 """
 
 import math

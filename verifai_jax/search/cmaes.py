@@ -4,8 +4,8 @@ Hansen, The CMA Evolution Strategy: A Tutorial, 2016; one step of it is in `evol
 
 Additions for falsification:
 
-- a run begins with a generation of the prior. As long as all of it has the same robustness there is
-  nothing to learn, and the next generation is another one;
+- a run begins with a generation from the prior. If all of its points have the same robustness,
+  another generation from the prior follows;
 - points are clipped to the cube, and the run learns from the clipped ones;
 - a coordinate with ordered cells keeps a standard deviation that reaches the next cell (as Hamano
   et al., CMA-ES with margin, GECCO 2022); one with unordered cells has probabilities instead;
@@ -13,9 +13,9 @@ Additions for falsification:
   no progress. The next one begins alternately with small steps, at the best of the points that
   exploration has found meanwhile, and with large ones, from the prior (as Hansen, Benchmarking a
   BI-population CMA-ES on the BBOB-2009 function testbed, alternates between two regimes);
-- after runs without a failure the prior is sampled for half as long as the last one took, times
-  their number, and the next run begins at the best of these points: where the robustness misleads,
-  most simulations are those of the prior in the end;
+- after `k` runs without a failure the prior is sampled for `k / 2` times as long as the last run
+  took, and the next run begins at the best of these points. So if the robustness misleads, most
+  simulations finally sample the prior;
 - how long a run waits for progress follows from its dimension, by the learning rates of the
   covariance: in ten dimensions a narrow valley is learned in hundreds of points.
 """

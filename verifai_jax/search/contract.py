@@ -1,9 +1,10 @@
-"""Checks of a search of the user's own: what it returns, before anything compiles, and its points.
+"""Checks of a user's search: its return values, before anything compiles, and its points.
 
     check_contract(search, cube)                        # shapes and types, abstractly
     check_points(search, cube, points)                  # values, round by round
 
-`verifai_jax.testing.check_search` tests all laws; these are the ones that a run would break on.
+`verifai_jax.testing.check_search` tests all laws; here only those are checked on which a run would
+fail.
 """
 
 from dataclasses import fields, is_dataclass
@@ -38,7 +39,7 @@ def is_user_defined(search: Search) -> bool:
 
 
 def check_contract(search: Search, cube: Cube) -> None:
-    """Refuse a user's search whose functions return values of other shapes than they must.
+    """Refuse a user's search whose functions return values of wrong shapes.
 
     Nothing compiles and nothing is simulated.
 

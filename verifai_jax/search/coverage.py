@@ -1,12 +1,12 @@
-"""Coverage-guided fuzzing: mutations of points that did what few others did.
+"""Coverage-guided fuzzing: mutations of points with rarely covered items.
 
 Each simulation has coverage ids, numbers of what it covered: transitions of an automaton, cells of
 behaviour, the clause nearest to breaking. For each coverage id the search keeps the point with the
 lowest robustness among those that have it (an archive of elites: Mouret, Clune, Illuminating search
-spaces by mapping elites, 2015), and mutates those of seldom coverage ids more often (Boehme, Pham,
+spaces by mapping elites, 2015), and mutates points with rare coverage ids more often (Boehme, Pham,
 Roychoudhury, Coverage-based greybox fuzzing as Markov chain, IEEE Transactions on Software
-Engineering 45(5), 2019). So it climbs by what is new where the robustness says nothing. Each kind
-of coverage id gets the same share, so that many pairs of transitions do not drown a few cells.
+Engineering 45(5), 2019). So new coverage guides the search where the robustness is flat. Each kind
+of coverage id gets the same share, so that many pairs of transitions do not dominate a few cells.
 """
 
 from dataclasses import dataclass

@@ -8,9 +8,9 @@ all failures are equally good, and the fit covers their region instead of its de
 Three departures, all for small batches of expensive simulations:
 
 - the elite is kept over the rounds rather than taken from the last batch alone;
-- the family is a mixture with one component an elite point, shrunk towards the mean so that the
-  components do not add to the elite's variance (West, Approximating posterior distributions by
-  mixture, 1993): it follows several failure regions and narrow valleys, as one Gaussian cannot;
+- the family is a mixture with one component for each elite point, shrunk towards the mean so that
+  the components do not add to the elite's variance (West, Approximating posterior distributions by
+  mixture, 1993). Unlike one Gaussian it follows several failure regions and narrow valleys;
 - Gaussians are projected to the cube, not truncated: failures are often in its corners.
 """
 
@@ -61,8 +61,8 @@ class CrossEntropy(Search[CrossEntropyState]):
     - `focus`: in `[0, 1]`; 0 draws from one Gaussian, 1 from the neighbourhoods of elite points.
     - `exploration`: share of each batch that is always drawn from the prior.
     - `widening`: factor on the elite's standard deviation; above 1 it reaches beyond the elite.
-    - `min_std`: minimum standard deviation of a coordinate, in unit coordinates; less in more than
-      four coordinates, since a point must be near in all of them.
+    - `min_std`: minimum standard deviation of a coordinate, in unit coordinates; smaller in more
+      than four dimensions, since a point must be near in every coordinate.
     - `patience`: rounds without progress after which it restarts elsewhere; 30 simulations more for
       each coordinate beyond four.
     **Raises:** `ValueError` for values out of range.

@@ -1,14 +1,14 @@
-"""Quasi-Newton steps inside the cube, for many descents side by side.
+"""Quasi-Newton steps inside the cube, for many simultaneous descents.
 
     state = begin(descents, dim)
     state, points = advance(state, points, value, slope, fresh, radius)
 
 Each descent keeps the last differences of its points and of its slopes, and takes the step of
-L-BFGS (Nocedal, Wright, Numerical Optimization, 2006, algorithm 7.4) from its best point, no
-longer than a trust region, which shrinks where a step is no better and grows where one at its edge
-is (ibid., algorithm 4.1). Coordinates at a face of the cube that the slope presses against rest
-there (projected Newton: Bertsekas, SIAM Journal on Control and Optimization 20, 1982). A step that
-is no better still tells how the slope turns.
+L-BFGS (Nocedal, Wright, Numerical Optimization, 2006, algorithm 7.4) from its best point. A trust
+region limits the step; it shrinks after a step without improvement and grows after an improvement
+at its edge (ibid., algorithm 4.1). Coordinates at a face of the cube that the slope presses against
+rest there (projected Newton: Bertsekas, SIAM Journal on Control and Optimization 20, 1982). A step
+without improvement still updates the curvature.
 """
 
 from typing import NamedTuple

@@ -3,25 +3,24 @@
     vj.falsify(problem, "descent")
     vj.falsify(problem, search.Descent(rate=0.03, steps=80))
 
-Failures need not lie at corners: a network that was trained to fail rarely does so in small regions
-anywhere. Each descent follows the gradient of the greatest clause (of several, their gradients
-weighted by a softmax) with quasi-Newton steps inside the cube (`curvature`), which get down a
-curved valley, while the temperature falls.
+Failures need not lie at corners: a well-trained network fails in small regions anywhere. Each
+descent follows the gradient of the greatest clause (or of several, weighted by a softmax) with
+quasi-Newton steps inside the cube (`curvature`), which can follow a curved valley, while the
+temperature falls.
 
-Most starts lead to minima that are no failures, and which ones is seen early. So a descent goes on
-only where it is among the best of those that came as far: at 1, 2, 4 ... times `trial` steps the
-better share `kept`, decided one by one as they come (asynchronous successive halving: Li,
-Jamieson, Rostamizadeh et al., A system for massively parallel hyperparameter tuning, MLSys 2020,
-algorithm 2). Each start is a new point of a sequence that fills the space evenly, or a good
-point of another search; the latter are not compared, since they would always be ahead.
+Most starts lead to minima that are no failures, which shows early. So after 1, 2, 4 ... times
+`trial` steps only the better share `kept` of the descents continues; each is decided on arrival
+(asynchronous successive halving: Li, Jamieson, Rostamizadeh et al., A system for massively parallel
+hyperparameter tuning, MLSys 2020, algorithm 2). Each start is a new point of a sequence that fills
+the space evenly, or a good point of another search. Descents from the latter are not compared,
+since they would always be ahead.
 
-A portfolio spends an account of its own on these descents, in `begin`, `waits`, `propose` and
-`learn`. Corners and the surroundings of the best points are where most failures are, and the other
-members look there. So descents begin when these have had `EARLY` simulations, and go on while they
-lower the robustness of all: down a curved valley, say. If they do not they wait. Later their share
-grows while the others make no progress, and falls with how far what they reach lies above what the
-others have; it is nothing where these have failures. Every second descent starts from one of the
-best points of all, apart from where earlier ones began and ended.
+A portfolio has a separate budget for these descents, in `begin`, `waits`, `propose` and `learn`.
+Its other members search corners and the surroundings of the best points, where most failures are.
+So descents begin after `EARLY` simulations of the others, and continue while they lower the least
+robustness; otherwise they wait. Later their share grows while the others make no progress, and
+shrinks if their own results are worse; it is zero once the others have failures. Every second
+descent starts from one of the best points, away from the starts and ends of earlier ones.
 """
 
 from dataclasses import dataclass

@@ -1,22 +1,22 @@
-"""Failures of many kinds: a search that is kept away from the failures that it has found.
+"""Failures of many kinds: a search that is kept away from its earlier failures.
 
     Diverse(CrossEntropy())
     Diverse(Gradient(), radius=0.3, capacity=100)
     Diverse(Portfolio(), by="behaviour")
     Diverse.count(state), Diverse.archive(state)        # how many distinct failures, and where
 
-An archive holds failures no two of which are within a radius. The search inside learns that what
-is near an archived failure is worse than safe, and where the robustness is differentiated that it
-rises towards it (deflation, as in Farrell, Birkisson and Funke, Deflation techniques for finding
-distinct solutions of nonlinear partial differential equations, SIAM Journal on Scientific Computing
-37(4), 2015). What it had learned on the way to an archived failure leads back there, so that it
-begins afresh from the best points that lie elsewhere. When it comes no nearer to a new one the
-radius shrinks, so that first the modes are found and then the insides of them filled.
+An archive holds failures that are farther than a radius from each other. The wrapped search
+observes points near an archived failure as worse than safe, with a robustness that rises towards
+the failure if it is differentiated (deflation, as in Farrell, Birkisson and Funke, Deflation
+techniques for finding distinct solutions of nonlinear partial differential equations, SIAM Journal
+on Scientific Computing 37(4), 2015). After an archived failure the search restarts from the best
+points elsewhere, since its state would lead back to that failure. Without progress towards a new
+failure the radius shrinks, so that first the modes are found and then filled.
 
-By behaviour, failures are apart in what happens (`search/behaviour.py`), wherever their inputs are.
-Where the robustness of all safe points is the same, it says nothing; then what it learns of them
-rises with how well known their behaviour is (novelty search: Lehman, Stanley, Abandoning
-objectives: evolution through the search for novelty alone, Evolutionary Computation 19(2), 2011).
+With `by="behaviour"` the distance is that of outcomes (`search/behaviour.py`), for any inputs. If
+all safe points have the same robustness, the search observes a value that rises with the
+familiarity of their behaviour (novelty search: Lehman, Stanley, Abandoning objectives: evolution
+through the search for novelty alone, Evolutionary Computation 19(2), 2011).
 """
 
 from collections.abc import Sequence

@@ -1,4 +1,4 @@
-"""Random numbers of searches, few calls of the generator: each takes long to compile."""
+"""Random numbers of searches, with few calls of the generator, which takes long to compile."""
 
 import math
 

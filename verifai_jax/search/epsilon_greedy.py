@@ -1,13 +1,13 @@
-"""Epsilon-greedy: mostly go to the surroundings of the best points known, now and then anywhere.
+"""Epsilon-greedy: mostly draw near the best known points, sometimes anywhere.
 
 The rule of bandits (Sutton, Barto, Reinforcement Learning, 2nd edition, 2018, section 2.2) with the
 best points instead of the best arm. A greedy draw starts at one of them, takes some coordinates
-from another, as evolution strategies recombine parents (Beyer, Schwefel, 2002), and adds noise
-that is as wide as they lie apart: the search narrows as they come together.
+from another, as evolution strategies recombine parents (Beyer, Schwefel, 2002), and adds noise as
+wide as their distances, so the search narrows as they converge.
 
-Greed has to pay: the best points are given up for new ones when they stop improving, and also when
-the draws around them are not clearly better than those of the prior, of which half would be better
-than the median. So it is hardly worse than random where the robustness says nothing.
+The best points are replaced by new ones when they stop improving, and also when the draws around
+them are not clearly better than the median of the prior. So the search is hardly worse than random
+sampling if the robustness gives no direction.
 """
 
 from dataclasses import dataclass

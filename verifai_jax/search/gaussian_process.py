@@ -7,8 +7,8 @@ two codes are the same. Samples of the posterior are whole functions, drawn by p
 (Wilson et al., Efficiently sampling functions from Gaussian process posteriors, ICML 2020): a
 random function of the prior, plus the update that takes it to the observations.
 
-Everything keeps its shape whatever the number of observations is: rows that are not there have the
-covariance of independent noise and the target zero, which changes nothing.
+Shapes do not depend on the number of observations: absent rows have the covariance of independent
+noise and the target zero, so they have no effect.
 """
 
 import math
@@ -197,7 +197,7 @@ class GaussianProcess:
     def basis(
         self, posterior: Posterior, paths: Paths, x: Float[Array, "m d"]
     ) -> Float[Array, "m terms"]:
-        """Return basis functions at these points; times the paths' weights they give values."""
+        """Return basis functions at these points, to be multiplied by the weights of paths."""
         waves = self._waves(posterior.hyper, paths, x)
         return jnp.concatenate([waves, self.cross(posterior, x)], axis=1)
 

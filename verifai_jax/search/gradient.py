@@ -1,25 +1,25 @@
 """Descent on the gradients of the clauses to violate, from many starts.
 
-A system fails where all clauses of a goal are negative at once (`mtl.clauses`). Around a point
-where their values and gradients are known, each clause is taken for linear, and the next point is
-where the greatest of them is lowest: a corner of the cube or of a box around the point, or where
-two clauses meet. That is sequential linear programming for a minimax problem (Fletcher, Practical
-Methods of Optimization, 1987, section 14.6); for one clause it is a jump along the signs of its
-gradient, which often ends in a corner that fails. A maximum of clauses does not stall it, as it
-does a plain gradient, because the gradients of all clauses count.
+A system fails where all clauses of a goal are negative at once (`mtl.clauses`). Around a point with
+known values and gradients each clause is linearised, and the next point minimises the greatest of
+them: a corner of the cube or of a box around the point, or a point where two clauses are equal.
+That is sequential linear programming for a minimax problem (Fletcher, Practical Methods of
+Optimization, 1987, section 14.6); for one clause it is a jump along the signs of its gradient,
+which often ends in a corner that fails. Unlike a plain gradient it does not stall at a maximum of
+clauses, because it uses the gradients of all of them.
 
-The first descent starts in the middle, and its box is the whole cube. It shrinks while points
-turn out no better, several sizes in one batch where there is room, and grows again on success. A
-corner that nothing points out of is left by its weakest coordinates, one at a time, since a small
-derivative says little about the other end of the range. After that, or when gradients are zero or
-not finite, the descent starts again elsewhere.
+The first descent starts in the middle, and its box is the whole cube. It shrinks while points turn
+out no better, several sizes in one batch where there is room, and grows again on success. If no
+gradient points out of a corner, the coordinates with the weakest effect are flipped one at a time,
+since a small derivative says little about the other end of the range. After that, or when gradients
+are zero or not finite, the descent starts again elsewhere.
 
 The descents from there on are many and short: their box is smaller, it does not grow, their
 temperatures are higher, and those whose first jump is no better are given up at once. From random
 starts this took fewer simulations a failure than longer descents on eight of nine requirements of
 the ARCH competition (`benchmarks/RESULTS.md`), and more on CC2, which fails in corners; so every
-second descent begins with the whole cube. From a start that somebody offers, which is a good point
-already, the first box is smaller still.
+second descent begins with the whole cube. From an offered start, which is already a good point, the
+first box is even smaller.
 """
 
 from dataclasses import dataclass

@@ -1,10 +1,10 @@
 """The regular grid: every combination of evenly spaced values, once, and then an end.
 
-The order is a random permutation of the grid, drawn with the seed: a run that is cut short has seen
-points from everywhere, where rows in order would have stayed in one corner. The permutation is not
-stored, but computed point by point, by a Feistel network over numbers in two digits that leaves out
-what lies beyond the grid (Black, Rogaway, Ciphers with arbitrary finite domains, CT-RSA 2002,
-methods "generalized Feistel" and "cycle walking").
+The order is a random permutation of the grid, drawn with the seed: a shortened run has points from
+everywhere, while rows in order would stay in one corner. The permutation is not stored, but
+computed point by point, by a Feistel network over numbers in two digits that leaves out what lies
+beyond the grid (Black, Rogaway, Ciphers with arbitrary finite domains, CT-RSA 2002, methods
+"generalized Feistel" and "cycle walking").
 """
 
 import math

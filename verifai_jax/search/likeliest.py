@@ -1,10 +1,10 @@
-"""Failures as likely as they come: a search that learns how likely what it found is.
+"""Search for likely failures: the objective includes the likelihood of the features.
 
     Likeliest(CrossEntropy())
     vj.falsify(problem, objective="likelihood")         # the same, around the default search
 
-The loop gives it another objective than the robustness (`falsification/likelihood.py`); the search
-inside goes on as ever.
+The loop replaces the robustness by another objective (`falsification/likelihood.py`); the wrapped
+search is unchanged.
 """
 
 from dataclasses import dataclass, replace

@@ -1,4 +1,4 @@
-"""Steps to where linear clauses are lowest: inside a box, or at the other end of one coordinate."""
+"""Steps that minimise linear clauses: inside a box, or to the other end of one coordinate."""
 
 from itertools import combinations
 

@@ -1,4 +1,4 @@
-"""Moves from one point to another, of the searches that step from the points that they know."""
+"""Moves from known points to new ones, shared by several searches."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -17,7 +17,7 @@ def has_fine_cells(cube: Cube) -> Bool[np.ndarray, " discrete"]:
 
 
 def all_or_some(coin: Float[Array, "n 1"], mask: Float[Array, "n d"]) -> Bool[Array, "n d"]:
-    """Return which coordinates move: all in every second row, else a third, or one on average.
+    """Select the coordinates to move: all in every second row, else a third, or one on average.
 
     **Arguments:**
     - `coin`, `mask`: uniform random numbers.

@@ -7,11 +7,11 @@ are. Some proposals explore: with coordinates drawn towards the ends of their ra
 that change seldom, coarse before fine (Fainekos et al., ARCH competition reports: tools that draw
 from the corners and with few control points need the fewest simulations).
 
-Among failures it goes on from any of the best known ones, and as often from the worst: these are
-deeper in the region of failures, so that more of what is next to them fails.
+Once failures are known it starts from any of them, and equally often from the one with the lowest
+robustness, which lies deeper in the failure region, so that more neighbours fail.
 
-Nothing is fitted, so that it works from the first few simulations on, where cross-entropy has yet
-to fill its elite.
+Nothing is fitted, so it works from the first few simulations on, when cross-entropy still has to
+fill its elite.
 """
 
 from dataclasses import dataclass

@@ -1,18 +1,18 @@
 """A portfolio of searches that share their observations, with a budget that follows success.
 
-The members are complementary: gradients of clauses jump to corners and along where clauses meet,
-mutations need few simulations and no gradients, cross-entropy fills the region of failures in large
-batches. A bandit learns on the way which one helps: it gives each a share of the simulations by the
-rate at which its points come among the best so far, discounted, and never less than a little; a
-member whose gradients turn out zero or not finite gets next to nothing at once. Where rounds are
-large it decides between descents and the other two alone. All learn of every point, and descents
-start from the best points of all as often as from new ones.
+The members are complementary: gradients of clauses lead to corners and to points where clauses are
+equal, mutations need few simulations and no gradients, and cross-entropy fills the region of
+failures in large batches. A bandit divides the simulations: a member's share follows the discounted
+rate at which its points are among the best so far, with a small minimum; a member whose gradients
+are zero or not finite drops to that minimum at once. In large rounds the bandit only decides
+between descents and the other two. All members learn from every point, and descents start equally
+often from the best points and from new ones.
 
-Where these have found no failure for long, a fourth member joins them, with an account of its own:
-descents into the interior of the space (`descent`).
+If they find no failure for long, a fourth member with its own budget joins them: descents into the
+interior of the space (`descent`).
 
-Rounds of many simulations begin without gradients, which take longer to compile than these to run,
-until they have found no failure for a while (`PortfolioStage`).
+Large rounds begin without gradients, whose compilation would take longer than the rounds, until no
+failure was found for a while (`PortfolioStage`).
 """
 
 from dataclasses import dataclass, replace

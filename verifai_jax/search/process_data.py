@@ -1,10 +1,10 @@
-"""Points of the cube and their robustness, as a Gaussian process takes them.
+"""Points of the cube and their robustness, as training data of a Gaussian process.
 
     process_of(cube)                                    # which coordinates are codes
     training_data(u, score, cube)                       # rows whose score is not finite are absent
     memory.with_rows(u, score).refitted(cube, 12, 8)    # what two searches keep of their rounds
 
-All failures are equally good, and huge values do not hide the rest.
+All failures are equally good, and huge values do not dominate.
 """
 
 from typing import NamedTuple
@@ -108,7 +108,7 @@ class ProcessMemory(NamedTuple):
         )
 
     def emptied(self, cube: Cube) -> "ProcessMemory":
-        """Return the memory without its points; rows are still counted on."""
+        """Return the memory without its points; the count of rows continues."""
         return ProcessMemory.nothing(len(self.score), cube)._replace(
             results=self.results, u=self.u, luck=self.luck
         )
@@ -140,7 +140,7 @@ class ProcessMemory(NamedTuple):
         )
 
     def refitted(self, cube: Cube, initial: int, steps: int) -> "ProcessMemory":
-        """Refit the hyper-parameters from the last ones, if there are a quarter more rows."""
+        """Refit the hyper-parameters, starting from the last ones, if there are 25 % more rows."""
 
         def fit() -> Hyper:
             some = rows_to_keep(self.score, self.luck, min(FIT_POINTS, len(self.score)))

@@ -6,10 +6,10 @@
     proposals.differentiate, proposals.temperature      # the derivatives that the search wants
 
 A constraint (`where=`) refuses points; only accepted ones are simulated. A search that does not
-learn is asked until there are enough, so that the accepted points are a subsequence of its own,
-whatever the batch. One that learns is asked again for the refused rows only, which leaves each
-row with the distribution it would have, given acceptance; rows that stay refused are not
-valid in what it learns. A point that was simulated before is not simulated again (`repetition`).
+learn is asked until there are enough points, so that the accepted points are a subsequence of its
+sequence for any batch size. A search that learns is asked again only for the refused rows, so each
+row has its distribution conditional on acceptance; rows that stay refused are not valid when it
+learns. A point that was simulated before is not simulated again (`repetition`).
 """
 
 from collections.abc import Callable, Mapping

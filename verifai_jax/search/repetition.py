@@ -1,8 +1,8 @@
-"""Memory of the points that were simulated, so that none of them is simulated again.
+"""Memory of the simulated points, so that none is simulated again.
 
-A search that learns may propose a point twice: a corner to which two descents lead, a known point
-whose gradients it wants. The same simulation once more says nothing new, so that such a point is
-moved by `NUDGE`, or another one takes its turn.
+A search that learns may propose a point twice: a corner reached by two descents, or a known point
+whose gradients it wants. Repeating a simulation gives no information, so such a point is moved by
+`NUDGE` or replaced by another one.
 """
 
 import jax

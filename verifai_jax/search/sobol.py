@@ -1,11 +1,11 @@
-"""Sobol' sequences: points that fall evenly into the dyadic boxes of the cube.
+"""Sobol' sequences: points spread evenly over the dyadic boxes of the cube.
 
 Point i is the sum over the set bits of the Gray code of i, without carry, of direction numbers
-(Sobol' 1967; Antonov, Saleev 1979), with the primitive polynomials and initial numbers of Joe,
-Kuo, Constructing Sobol' sequences with better two-dimensional projections, SIAM J. Sci. Comput.
-30, 2008, as SciPy ships them. Scrambled by random lower triangular matrices and a digital shift
-(Matousek, On the L2-discrepancy for anchored boxes, J. Complexity 14, 1998), which keeps how even
-they are and makes each point uniform on the cube.
+(Sobol' 1967; Antonov, Saleev 1979), with the primitive polynomials and initial numbers of Joe, Kuo,
+Constructing Sobol' sequences with better two-dimensional projections, SIAM J. Sci. Comput. 30,
+2008, as SciPy ships them. Scrambled by random lower triangular matrices and a digital shift
+(Matousek, On the L2-discrepancy for anchored boxes, J. Complexity 14, 1998), which keeps their
+evenness and makes each point uniform on the cube.
 """
 
 import importlib.util

@@ -1,4 +1,4 @@
-"""Suggestions of a person or of a language model, from which another search works on.
+"""Suggestions of a person or of a language model, from which another search continues.
 
     Suggested(ask_me)
     Suggested(ask_a_model, CMAES(), times=6, every=500, points=4, units={"mass": "kg"})
@@ -7,9 +7,9 @@
         print(question["problem"], question["worst"])
         return [{"mass": 1.2, "wind": "strong"}]
 
-`falsify` asks at the start and between rounds, simulates what is suggested, and tells the search
-inside, whose descents then start from there; see `falsification/suggestions.py` for what a question
-holds.
+`falsify` asks at the start and between rounds, simulates the suggestions, and passes them to the
+wrapped search, whose descents then start there; see `falsification/suggestions.py` for the content
+of a question.
 """
 
 from collections.abc import Callable, Iterable, Mapping
@@ -101,7 +101,7 @@ class Suggested(Wrapper[PyTree]):
 
 @dataclass(frozen=True)
 class Absent:
-    """The function of a loaded run, of which the record only has the name."""
+    """The function of a loaded run; the record only has its name."""
 
     source: str
 

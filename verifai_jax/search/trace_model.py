@@ -6,11 +6,11 @@
 
 Traces are means plus a few principal components, whose coefficients are Gaussian processes over the
 points with one covariance: constant, linear, quadratic and Matern-5/2 parts over shared length
-scales. What is nearly linear in its inputs is so learned from about as many rows as it has inputs,
-and the rest as by any other process (for traces of simulators: Higdon, Gattiker, Williams,
-Rightley, Computer model calibration using high-dimensional output, JASA 2008). Functions are drawn
-by pathwise conditioning, as in `gaussian_process`; the quadratic part by random products
-(Kar, Karnick, Random feature maps for dot product kernels, AISTATS 2012).
+scales. So a nearly linear system is learned from about as many rows as it has inputs, and any other
+system as by a usual process (for traces of simulators: Higdon, Gattiker, Williams, Rightley,
+Computer model calibration using high-dimensional output, JASA 2008). Functions are drawn by
+pathwise conditioning, as in `gaussian_process`; the quadratic part by random products (Kar,
+Karnick, Random feature maps for dot product kernels, AISTATS 2012).
 """
 
 import math

@@ -1,10 +1,10 @@
 """Search on a model of the traces, for simulators that take seconds.
 
-A robustness is one number of a simulation; its trace is thousands. Where simulations are dear this
-search learns the traces (`trace_model`), and asks the monitor, on the model and with gradients,
-where the property would be broken. Whoever runs it gives it the traces and the monitor
-(`falsification/surrogates.py`); learning from robustness alone it is `TuRBO`, whose points are
-among its own in any case, in case the model is wrong.
+A simulation has only one robustness, but its trace has thousands of numbers. For slow simulations
+this search learns a model of the traces (`trace_model`), and descends on the robustness of modelled
+traces with gradients. The loop provides the traces and the monitor (`falsification/surrogates.py`);
+without them the search is `TuRBO`. Some points always come from `TuRBO`, in case the model is
+wrong.
 """
 
 from dataclasses import dataclass, replace

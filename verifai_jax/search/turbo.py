@@ -1,4 +1,4 @@
-"""Trust-region Bayesian optimization (TuRBO): a Gaussian process that is believed only nearby.
+"""Trust-region Bayesian optimization (TuRBO): a Gaussian process used only near its best point.
 
 Eriksson, Pearce, Gardner, Turner, Poloczek, Scalable global optimization via local Bayesian
 optimization, NeurIPS 2019, with one region at a time. The process knows the points since the last
@@ -8,7 +8,8 @@ box, which differ from the best point in about twenty coordinates. The box doubl
 rounds with progress in a row and halves after many without; when it is very small, all begins anew
 at points of the prior.
 
-All failures are equally good: after one the region closes in on it, and the next one is elsewhere.
+All failures are equally good: after a failure the region shrinks around it, and the next region
+lies elsewhere.
 """
 
 import math

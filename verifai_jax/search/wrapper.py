@@ -1,4 +1,4 @@
-"""A search around another one, which does whatever the wrapper does not do otherwise.
+"""A search around another one; members that the wrapper does not override are forwarded.
 
     @dataclass(frozen=True)
     class Rounded(Wrapper):                             # points with two digits
@@ -8,7 +8,7 @@
             u, state = super().ask(state, cube, batch)
             return jnp.round(u, 2), state
 
-Every member of `Search` is forwarded here, so that no wrapper forwards any by hand.
+Every member of `Search` is forwarded here, so no wrapper has to do it.
 """
 
 from collections.abc import Callable

@@ -5,9 +5,9 @@
 >>> simulations_without_failure(0.001)
 2995
 
-An exact interval of a fixed number of samples is wrong once the outcomes decide when to stop: who
-looks after every batch sees it exclude the true rate at some time, sooner or later. For that there
-is `confidence_sequences`.
+An exact interval for a fixed number of samples is invalid if the outcomes decide when to stop:
+checked after every batch, it excludes the true rate sooner or later. Use `confidence_sequences` in
+this case.
 """
 
 import math

@@ -1,27 +1,27 @@
-"""Failure rates with intervals that hold at all sample sizes together, for one rate or many.
+"""Failure rates with intervals that hold for all sample sizes simultaneously, for one rate or many.
 
     anytime_interval(failures=3, simulations=512)                    # one rate, stopped at any time
     simultaneous_interval(0, 768, confidence=0.95, among=32)         # one of 32 such rates
     verdict(rate, p=0.01)                                            # "safe@0.01"
 
-Sampling that is stopped, or shared out among policies, by its own outcomes needs such intervals: a
-Clopper-Pearson bound of the final number of samples would be wrong, because who looks often enough
-sees it exclude the truth.
+Such intervals are needed if outcomes decide when sampling stops, or how it is divided among
+policies: a Clopper-Pearson bound for the final number of samples would be invalid, because with
+enough checks it excludes the truth at some time.
 
 A rate `q` is rejected once a likelihood ratio against it, mixed over other rates, has grown to the
 reciprocal of the error allowed. For another rate `t`, the factor of one sample, `t/q` for a failure
 and `(1-t)/(1-q)` for none, has expectation 1 if `q` is the true rate. So a mixture over any fixed
-distribution of `t` is a nonnegative martingale that starts at 1, and by Ville's inequality it ever
-reaches `1 / error` with probability `error` at most. The bound holds at all sample sizes together,
-whatever decided them, be it other policies' outcomes in the very samples to come (Robbins,
-Statistical methods related to the law of the iterated logarithm, Annals of Mathematical Statistics
-41, 1970; Howard, Ramdas, McAuliffe and Sekhon, Time-uniform, nonparametric, nonasymptotic
-confidence sequences, Annals of Statistics 49, 2021).
+distribution of `t` is a nonnegative martingale that starts at 1, and by Ville's inequality the
+probability that it ever reaches `1 / error` is at most `error`. The bound holds for all sample
+sizes simultaneously, however they were decided, even by other policies' outcomes on later samples
+(Robbins, Statistical methods related to the law of the iterated logarithm, Annals of Mathematical
+Statistics 41, 1970; Howard, Ramdas, McAuliffe and Sekhon, Time-uniform, nonparametric,
+nonasymptotic confidence sequences, Annals of Statistics 49, 2021).
 
 `anytime_interval` mixes over all rates at once. `simultaneous_interval` has a mixture for each
-side, and that for upper bounds has an atom at rate 0, which safe policies often have: without a
-failure it costs `ln(1/ATOM) / q` samples more than the exact bound of a fixed number of samples,
-29 at 0.01, where a mixture without an atom costs hundreds.
+side. The mixture for upper bounds has an atom at rate 0, which is often the rate of safe policies:
+without a failure it needs `ln(1/ATOM) / q` samples more than the exact bound for a fixed number of
+samples (29 at 0.01); a mixture without an atom needs hundreds.
 """
 
 import math
@@ -50,9 +50,9 @@ def anytime_interval(
 ) -> Rate:
     """Compute an interval that is valid at any time, even if outcomes decide when sampling stops.
 
-    It contains the rates whose likelihood is not exceeded `1 / (1 - confidence)` times by the
-    mixture of binomial likelihoods over a Beta(1/2, 1/2) prior. It is wider than `clopper_pearson`,
-    by a factor of 1.5 to 2.
+    It contains the rates whose likelihood, times `1 / (1 - confidence)`, is at least the mixture of
+    binomial likelihoods over a Beta(1/2, 1/2) prior. It is wider than `clopper_pearson`, by a
+    factor of 1.5 to 2.
 
     **Arguments:** those of `clopper_pearson`, but the number of simulations may depend on their
     outcomes.
@@ -158,7 +158,7 @@ def verdict(rate: Rate | None, p: float) -> str:
     """Return `"safe@p"`, `"unsafe"` or `"undecided"`, for an interval below, above or around `p`.
 
     So "unsafe" is a statement about the probability of failure. A single counterexample does not
-    make a policy unsafe: one that fails once in a million is safe at 0.01.
+    make a policy unsafe: a policy that fails once in a million is safe at 0.01.
     """
     if rate is None:
         return UNDECIDED

@@ -5,11 +5,11 @@
 >>> f"{radius_of(0.001, 0.01):.4f}"             # nats that make 1 % of 0.1 %
 '0.0141'
 
-Near means: a Kullback-Leibler divergence `KL(Q || P)` of at most `radius` nats. Of a number with
-finitely many values, the worst `Q` reweights `P` by `exp(value / t)` for one temperature `t`, so
-that the bound has one dual variable: `inf_t t radius + t log E_P exp(value / t)` (Hu and Hong,
+Near means a Kullback-Leibler divergence `KL(Q || P)` of at most `radius` nats. For a number with
+finitely many values, the worst `Q` reweights `P` by `exp(value / t)` with one temperature `t`, so
+the bound has one dual variable: `inf_t t radius + t log E_P exp(value / t)` (Hu and Hong,
 Kullback-Leibler divergence constrained distributionally robust optimization, 2013, theorem 1). For
-an event, whose value is 0 or 1, that is the greater root `q` of `KL(q || p) = radius`.
+an event, whose value is 0 or 1, the bound is the greater root `q` of `KL(q || p) = radius`.
 """
 
 import math

@@ -1,4 +1,4 @@
-"""The step that raises the least of several linear functions most: a linear program.
+"""The step that maximises the minimum of several linear functions: a linear program.
 
     max_min_step(theta, rho, gradients, radius=0.1, free=free, bounded=True)
 

@@ -3,8 +3,8 @@
 >>> print(paired_difference([8.1, 7.9, 8.4], [11.0, 10.5, 12.4]))
 -3.17 (95 % t interval of 3 paired differences -5.17 to -1.16)
 
-Differences are paired where the same data, initial weights or disturbances served both values of a
-pair: what is common to both cancels, and far fewer pairs tell two treatments apart.
+Differences are paired if both values of a pair use the same data, initial weights or disturbances:
+common effects cancel, and far fewer pairs distinguish two treatments.
 """
 
 import math

@@ -3,14 +3,14 @@
 >>> print(paired_rates(only_first=2, only_second=31, pairs=5_000))
 0.58 points more (95 % interval 0.123 to 1.23, whenever stopped)
 
-Both systems are simulated under the same features and random numbers. Only pairs tell them apart in
-which one fails and the other does not; what is common to both cancels. Let `q` be the probability
-of such a pair, and `s` the share of them in which the second fails: the difference is
-`q (2 s - 1)`. Each of the two has a confidence sequence (`confidence_sequences`), with half of the
-error that is allowed, and the interval is the range of the product. Its sign is that of
-`s - 1/2`, which the discordant pairs decide alone, however rare they are: eight of eight will do
-(McNemar, Note on the sampling error of the difference between correlated proportions or
-percentages, Psychometrika 12, 1947, with a test that may be looked at after every pair).
+Both systems are simulated with the same features and random numbers. Only discordant pairs, in
+which exactly one fails, distinguish them. Let `q` be the probability of a discordant pair, and `s`
+the share of them in which the second fails: the difference is `q (2 s - 1)`. Both `q` and `s` have
+a confidence sequence (`confidence_sequences`) with half of the allowed error, and the interval is
+the range of the product. Its sign is that of `s - 1/2`, which depends only on the discordant pairs,
+however rare they are: eight of eight suffice (McNemar, Note on the sampling error of the difference
+between correlated proportions or percentages, Psychometrika 12, 1947, with a test that may be
+looked at after every pair).
 """
 
 import math

@@ -1,4 +1,4 @@
-"""Exact non-dominated sorting: the points that no other dominates, then those of the rest, ...
+"""Exact non-dominated sorting: the non-dominated points, then those of the rest, and so on.
 
     fronts([[0.0, 5.0], [1.0, 1.0], [2.0, 6.0]])      # 0, 0, 1: all objectives are minimised
 

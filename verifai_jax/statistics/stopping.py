@@ -3,8 +3,8 @@
     falsify(problem, "uniform", stop_when=Within(0.005))
     falsify(problem, "uniform", stop_when=Decided(0.01))
 
-The outcomes decide when a rule is fulfilled, so the rules look at intervals that hold at all times
-together (`confidence_sequences`).
+Outcomes decide when a rule is fulfilled, so rules use intervals that hold at all times
+simultaneously (`confidence_sequences`).
 """
 
 from dataclasses import dataclass

@@ -3,17 +3,17 @@
 >>> print(stratified_rate((1, 38), (9, 12), share=0.25))
 0.223 (95 % interval 0.132 to 0.328): 50 trials, as good as 93 without strata
 
-A simulation says of each trial whether it should fail. How often that happens (`share`) is known
-from many simulations; what is left to learn is the failure rate `q0` of the trials that should
-succeed and `q1` of those that should fail. The rate of all is `(1 - share) q0 + share q1`, whatever
-the simulation is worth. Its estimate is that of prediction-powered inference, with the power that
-suits the data (Angelopoulos, Duchi, Zrnic, PPI++: efficient prediction-powered inference, 2023;
-for predictions of two values it is post-stratification).
+A simulation predicts for each trial whether it fails. The rate of predicted failures (`share`) is
+known from many simulations; unknown are the failure rates `q0` of trials predicted to succeed and
+`q1` of those predicted to fail. The total rate is `(1 - share) q0 + share q1`, for any quality of
+the simulation. Its estimate is that of prediction-powered inference, with the power that suits the
+data (Angelopoulos, Duchi, Zrnic, PPI++: efficient prediction-powered inference, 2023; for
+predictions of two values it is post-stratification).
 
 The interval is exact for few trials: outcomes are ordered by their signed likelihood ratio, and a
-rate is rejected if, for every pair `q0`, `q1` that makes it, an outcome as extreme has probability
-`(1 - confidence) / 2` at most (Berger, Boos, P values maximized over a confidence set for the
-nuisance parameter, JASA 89, 1994).
+rate is rejected if, for every pair `q0`, `q1` that gives this rate, the probability of an outcome
+as extreme is at most `(1 - confidence) / 2` (Berger, Boos, P values maximized over a confidence set
+for the nuisance parameter, JASA 89, 1994).
 """
 
 import math

@@ -1,15 +1,15 @@
-"""Parameters of a controller that fails, changed as little as removes its failures.
+"""Repair of a failing controller by the smallest sufficient change of its parameters.
 
     repair(problem, ["k_theta", "k_theta_dot"])          # from the problem's nominal features
     repair(run, ["k_theta"])                              # with the counterexamples of a run
     repair(problem, weights, system_of=closed_loop)       # a pytree of arrays, by gradients
 
-Falsification and repair take turns: attack the environment with the present parameters; add the
-counterexamples to a set; go to the parameters nearest to the nominal ones that keep the formula in
-all of the set. Along gradients this is a sequence of least-distance problems (sequential quadratic
+Falsification and repair alternate: attack the present parameters by the environment; add the
+counterexamples to a set; go to the parameters nearest to the nominal ones that satisfy the formula
+on the whole set. With gradients this is a sequence of least-distance problems (sequential quadratic
 programming: Nocedal and Wright, Numerical optimization, 2006, chapter 18), without them a
-cross-entropy search. It ends when an attack finds nothing, which proves nothing: the failure rates
-before and after are those of fresh samples, which the repair has never seen.
+cross-entropy search. It ends when an attack finds nothing. As this proves nothing, failure rates
+before and after are measured on fresh samples.
 """
 
 import time
@@ -101,7 +101,7 @@ def repair(
     whole: Any = problem.problem if isinstance(problem, Run) else problem
     if whole is None:
         assert run is not None
-        raise ValueError(f"the run of {run.name!r} was loaded without its problem; load it with it")
+        raise ValueError(f"the run of {run.name!r} has no problem: use vj.load(path, problem)")
     check_options(budget, batch, seed, max_seconds, None)
     arguments.check_numbers(margin, rounds=rounds, held_out=held_out)
     check_names("aim", [aim], arguments.AIMS)

@@ -1,4 +1,4 @@
-"""Features for which the formula holds, and holds robustly: model-parameter synthesis.
+"""Model-parameter synthesis: values of features for which the formula holds robustly.
 
     synthesize(problem, ["gain", "damping"])             # for all values of the other features
     synthesize(problem)                                   # all features are parameters
@@ -8,7 +8,7 @@ gradients. With one it is the least robustness over a set of environments that g
 (counterexample-guided inductive synthesis: Solar-Lezama, Program synthesis by sketching, 2008,
 chapter 5; for robust optimisation Blankenship and Falk, Infinitely constrained optimization
 problems, 1976, algorithm 2.1): choose parameters for the set, attack them, add the environments in
-which they do worse than in any of the set, choose again. The result is checked in fresh samples.
+which they do worse than in all of the set, and repeat. The result is checked on fresh samples.
 """
 
 import time

@@ -1,9 +1,9 @@
-"""Environments in which given parameters fail: the falsification between two choices of them.
+"""Search for environments in which given parameters fail, between two choices of parameters.
 
-A search drives the environment's own cube with the parameters held. The worst environments are then
-followed downhill, by gradients or by differences of few coordinates, with steps as far as a corner
-of the cube, where the worst of a smooth system often lies. All of it stays where the prior has its
-probability (`region.py`).
+A search explores the environment's cube with fixed parameters. Then descents start from the worst
+environments, with gradients or with differences of few coordinates. Their steps may reach a corner
+of the cube, where the worst case of a smooth system often lies. All points stay in the region where
+the prior has its probability (`region.py`).
 """
 
 from typing import NamedTuple

@@ -1,12 +1,12 @@
-"""Parameters with which the fewest samples of the prior fail: the least failure probability.
+"""Search for the parameters with the lowest failure probability under the prior.
 
     search = FailureCounts(loop, margin, limits, seed, start)
     search.run()
     search.theta, search.failing, search.samples
 
-Where no parameters keep the formula everywhere, the least robustness of an attack says little. All
-candidates are simulated in the same samples of the prior, first few samples and many candidates, by
-cross-entropy, then the best candidates in many fresh samples, which decide.
+If no parameters satisfy the formula everywhere, the least robustness of an attack is not
+informative. All candidates are simulated on the same samples of the prior: first many candidates,
+from cross-entropy, on few samples, then the best candidates on many fresh samples, which decide.
 """
 
 import numpy as np

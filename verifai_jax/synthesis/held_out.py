@@ -1,8 +1,7 @@
 """Failure rates of chosen parameters in fresh environments.
 
-An active search that finds nothing proves nothing. Environments drawn from the prior after the
-parameters are fixed are independent of how they were chosen, so that an exact binomial interval
-holds.
+A search without a failure proves nothing. Environments drawn after the parameters are fixed are
+independent of their choice, so an exact binomial interval holds.
 """
 
 from dataclasses import dataclass
@@ -27,7 +26,7 @@ class HeldOut:
     **Fields:**
     - `simulations`: number of simulations made.
     - `failures`: simulations that broke a formula.
-    - `short`: simulations that kept it by less than the required margin.
+    - `short`: simulations that satisfied the formula by less than the required margin.
     - `without_verdict`: simulations that did not end properly; the upper end of the rate's interval
       counts them as failures.
     - `lowest` robustness, None without a verdict.

@@ -1,8 +1,8 @@
 """Optimisation of parameters over a fixed set of environments.
 
-The value of parameters is their least robustness over the set. All that were evaluated are in the
-`Archive`. A `merit` orders choices: by the value alone for a synthesis, first by the value and then
-by the distance from the nominal parameters for a repair.
+The value of parameters is their least robustness over the set. The `Archive` holds all evaluated
+parameters. A `merit` orders choices: for a synthesis by value alone, for a repair by value and then
+by distance from the nominal parameters.
 """
 
 from collections.abc import Callable, Iterable, Sequence
@@ -69,15 +69,15 @@ class Archive:
 
 
 def value_merit(theta: np.ndarray, value: float) -> tuple[float, ...]:
-    """Return the merit of parameters in a synthesis: their value."""
+    """Return the merit of choices in a synthesis, which is their value."""
     return (value,)
 
 
 def worst_case(pairs: Pairs) -> Float[np.ndarray, " k"]:
     """Return the value of each choice of parameters; negative if it fails in an environment.
 
-    It is minus infinity if a simulation has no verdict in an environment in which others have one,
-    or if none of the environments is possible.
+    It is minus infinity if a simulation has no verdict in an environment where other parameters
+    have one, or if no environment is possible.
     """
     known = np.any(pairs.proper, axis=0)
     rho = np.where(pairs.proper, pairs.rho, -np.inf)[:, known]

@@ -1,13 +1,13 @@
-"""A system with parameters, simulated in environments: every pair of the two in one program.
+"""A system with parameters, simulated in environments: one program for all pairs of both.
 
     loop = FeatureParameters(problem, ["k_x", "k_theta"])          # parameters are features
     loop = ArrayParameters(problem, weights, system_of)            # parameters are arrays
     loop.evaluate(thetas, environments)  # [k, p] x [n, d] -> [k, n]
     loop.evaluate(thetas, environments, temperature=0.1)  # and d rho / d theta [k, n, p]
 
-Parameters are inputs of the compiled program, never constants in it, so that nothing compiles again
-from one candidate to the next. A pair that the constraint of the space refuses cannot happen: it
-is not simulated, and its robustness is infinite.
+Parameters are inputs of the compiled program, so new candidates need no compilation. A pair that
+the constraint of the space refuses cannot happen: it is not simulated, and its robustness is
+infinite.
 """
 
 from collections.abc import Callable, Sequence

@@ -1,12 +1,12 @@
-"""A box of parameters with which no other features make a simulation fail, for certain.
+"""A box of parameters for which provably no values of the other features cause a failure.
 
     found = prove_around(problem, point, chosen, low, high, seconds=60)
     found.ends                          # {"gain": (0.8, 1.3)}
 
-Boxes of parameters and other features are decided together, first over the whole of what may be
-chosen, then over a quarter as much around the point, and so on. Only those are looked at that lie
-in the widest box of parameters without one that is known to fail. What is found is the widest box
-that touches none which is not proved.
+Boxes of parameters and other features are decided together, first over the whole space of
+parameters, then over a quarter of it around the point, and so on. Only boxes inside the widest
+parameter box without a known failure are examined. The result is the widest parameter box in which
+all boxes are proved.
 """
 
 import time

@@ -1,13 +1,13 @@
-"""The part of the prior in which an environment is attacked: where it has most of its probability.
+"""The part of an environment's prior that is attacked: the centre with most of its probability.
 
     region = region_of(loop, mass=0.999)
     points = region.project(points)                 # [n, d] of the environment's cube
     region.describe()                               # what is varied, and how far
 
-A search that only looks for the least robustness goes to the end of every tail at once, five
-deviations out in all features, which never happens and which no parameters may keep. Features with
-tails are held together in a ball of their normal scores that has the given probability; those
-without, such as a Box, are as probable in their corners as anywhere, and stay as they are.
+A search for the least robustness alone goes to the ends of all tails at once, five deviations out
+in every feature. This never happens in practice, and perhaps no parameters withstand it. So
+features with tails are limited to a ball in normal scores with the given probability. Features
+without tails, such as a Box, are equally probable in their corners and are not limited.
 """
 
 import math

@@ -1,4 +1,4 @@
-"""Work of a step that is skipped when no lane of a batch needs it."""
+"""Work of a step that is skipped if no lane of a batch needs it."""
 
 from collections.abc import Callable
 from typing import Any

@@ -1,11 +1,11 @@
-"""The contract between a system under test and everything that simulates it.
+"""The contract between a system under test and the code that simulates it.
 
     class Pendulum(System):
         def __call__(self, features, key=None): ...     # all that a system must have
 
     as_system(lambda features, key: Trace(...))         # any function is a system, too
 
-All else has a default here: a system offers more by overriding it.
+Only the call is required; every other member has a default that a system may override.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -63,8 +63,8 @@ class System(ForUsers):
 
     - `black_box`: True for a system that runs on the host; JAX must be able to trace any other.
     - `lanes`: number of simulations that a device processes together.
-    - `effort`: how strongly XLA optimises programs that simulate it. It is the same for all numbers
-      of rows, since a row's last digits may depend on it.
+    - `effort`: XLA's optimisation effort for programs that simulate it. It is the same for all
+      numbers of rows, since a row's last digits may depend on it.
     - `forward_up_to`: number of features up to which forward mode is no slower than reverse mode.
     - `notes`: sentences for the notes of a run, on changes that the system made to its inputs.
     - `reverse_hint`: a sentence for users on how to make reverse mode work if it does not.
@@ -76,9 +76,9 @@ class System(ForUsers):
     - `backends`: names of the engines that can simulate this system, if there are several.
     - `backend`: the engine in use, or `"auto"` until a run decides; None without `backends`.
     - `likely`: the engine that is probably the fastest on a CPU.
-    - `derived`: how a verb derived this system from the given one, as plain data for the record of
-      a run; None for a user's own system.
-    - `constants`: numbers and texts of the model by name, with which two models can be compared.
+    - `derived`: the derivation of this system from the user's, as plain data for the record of a
+      run; None for a user's own system.
+    - `constants`: numbers and texts of the model by name, for comparisons of two models.
     """
 
     _internal = frozenset((
@@ -213,9 +213,9 @@ class System(ForUsers):
         **Raises:** `ValueError` for a system without a known policy or controller.
         """
         raise ValueError(
-            f"{self!r} has no loop of which observations and actions are known, so that no fault "
-            "can be put in it: make the system by vj.ode, mujoco, brax, gymnax, gymnasium or "
-            "playground, or apply the faults in the simulator and say with_faults(..., "
+            f"{self!r} has no loop with known observations and actions, so faults cannot act in "
+            "it: make the system by vj.ode, mujoco, brax, gymnax, gymnasium or "
+            "playground, or apply the faults in the simulator and use with_faults(..., "
             "by_simulator=True)"
         )
 

@@ -1,11 +1,11 @@
-"""The way of observations and actions between a system and its policy, and its links.
+"""The path of observations and actions between a system and its policy, and its links.
 
     channels = Channels(links, period, features)
     states = channels.begin(observation, action, key)
     observed, states = channels.observation(states, observation, time)
     action, states = channels.action(states, decided, time)
 
-This is the one seam in the loop of every system that has one. Delays and faults are links.
+Every system with a policy in its loop uses this path. Delays and faults are links.
 """
 
 import re

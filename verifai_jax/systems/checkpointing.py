@@ -1,10 +1,10 @@
-"""A scan over a long horizon whose reverse-mode memory grows with the root of its length.
+"""A scan over a long horizon whose reverse-mode memory grows with the square root of its length.
 
     carry, outputs = checkpointed_scan(step, carry, length)             # step(carry, k)
 
-A reverse sweep needs what every step computed. Kept for all steps at once that is soon more than
-the memory there is; here only the carry of every segment is kept, and the steps of a segment are
-taken again on the way back.
+A reverse sweep needs the intermediate results of every step, which soon exceed the memory. Here
+only the carry of every segment is kept, and the steps of a segment are computed again in the
+reverse sweep.
 """
 
 import math

@@ -3,9 +3,9 @@
 brax("hopper", policy, action_delay=2)
 brax("hopper", policy, observation_delay={"latency": 5})    # the feature `latency`, at most 5
 
-A policy decides on the observation of so many steps ago, the first one until there is one of then;
-an action takes effect so many steps after its decision, and until the first one does the
-system gets zeros (an environment the first of its choices).
+With a delay of `n` steps a policy receives the observation of `n` steps ago, or before that the
+first one. An action takes effect `n` steps after its decision; until then the system receives
+zeros, or a discrete environment its first choice.
 """
 
 from collections.abc import Mapping
@@ -30,7 +30,7 @@ FEW = 16
 
 @dataclass(frozen=True)
 class Delay(Link):
-    """A delay of `max_steps` steps, or of as many as a `feature` says, at most `max_steps`."""
+    """A delay of `max_steps` steps, or of the number given by a `feature`, at most `max_steps`."""
 
     max_steps: int = 0
     feature: str | None = None

@@ -1,4 +1,4 @@
-"""Checks of what a user's functions return, before anything compiles.
+"""Checks of the results of a user's functions, before anything compiles.
 
 States, controls and memories are pytrees; here they are compared leaf by leaf, by name.
 """

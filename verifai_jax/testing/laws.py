@@ -1,4 +1,4 @@
-"""Comparisons of the contract suites, whose errors name the law that is broken."""
+"""Comparisons of the contract suites; their errors name the broken law."""
 
 import jax
 import numpy as np

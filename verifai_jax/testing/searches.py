@@ -117,7 +117,7 @@ def check_batch_independence(search: Search, cube: Cube, *, points: int = 48) ->
 
 
 def _evaluate(u: Array, search: Search, pending: PyTree, cube: Cube) -> Observations:
-    """Evaluate a bowl whose minimum and failures lie off the middle, as the search asks."""
+    """Evaluate a quadratic with its minimum and failures off the centre, as the search wants."""
     offset = u - 0.3
     rho, gradient = jnp.sum(offset**2, axis=1) - 0.01, 2 * offset
     valid = jnp.ones(len(u), bool)

@@ -1,4 +1,4 @@
-"""Boxes of a feature space that are proved, broken, or neither: `vj.verify`."""
+"""Division of a feature space into proved, broken and undecided boxes: `vj.verify`."""
 
 from verifai_jax.verification._verify import verify as verify
 from verifai_jax.verification.result import Verification as Verification

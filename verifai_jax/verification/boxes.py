@@ -1,4 +1,4 @@
-"""The boxes of a branch and bound: a partition of the unit cube, and what is known of each box.
+"""The boxes of a branch and bound: a partition of the unit cube, with the state of each box.
 
 Coordinates are halved, so that the ends and the probabilities of boxes are exact numbers; discrete
 ones are split between their cells.

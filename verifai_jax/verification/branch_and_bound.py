@@ -1,4 +1,4 @@
-"""Looking at boxes: simulations say which may be decided, sets decide them, and the rest is split.
+"""Examination of boxes: simulations select decidable boxes, sets decide them, the rest is split.
 
 work = BranchAndBound(problem, enclosure, Boxes.whole(enclosure), seed=0)
 work.go_on(end=time.perf_counter() + 60, limit=None)

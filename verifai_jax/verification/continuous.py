@@ -1,11 +1,11 @@
-"""A problem whose signals, on sets, are those at all times between two samples.
+"""A problem whose signals on sets contain the values at all times between two samples.
 
     problem = between_samples(problem)      # of a system that `vj.ode` made
 
-Sample k of a signal stands for its values from time k `dt` until the next sample, with the control
-that is held then; the last one for the end alone. Windows of `always` and `eventually` over such
-samples contain each instant of the windows over time, and each of their samples holds an instant of
-them, so that bounds of the robustness over sets are bounds of that in continuous time.
+Sample k of a signal represents all its values from time k `dt` until the next sample, with the
+control that is held then; the last sample represents only the final time. Windows of `always` and
+`eventually` over such samples cover every instant of the windows in time, and each of their samples
+contains such an instant. So bounds of the robustness over sets also hold in continuous time.
 """
 
 from dataclasses import replace

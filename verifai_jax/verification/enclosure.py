@@ -3,9 +3,9 @@
     enclosure = Enclosure(problem, "float32")
     least, greatest, accepted = enclosure(low, high)      # of boxes [n, dim] in unit coordinates
 
-The program is the one that simulations run: system, monitor, status and constraint, traced by JAX
-and evaluated with sets. What it says holds for each simulation whose features lie between those of
-the box's corners, in real arithmetic and in the precision of the simulation.
+The program is that of simulations: system, monitor, status and constraint, traced by JAX and
+evaluated with sets. The bounds hold for each simulation with features between those of the box's
+corners, in real arithmetic and in the precision of the simulation.
 """
 
 from collections.abc import Callable, Sequence

@@ -1,4 +1,4 @@
-"""The part of a feature space that boxes leave open, to draw samples from and to search.
+"""The undecided part of a feature space, for sampling and searching.
 
 rest = Rest(boxes, (PROVED, BROKEN))
 rest.mass, rest.draw(random, 1000)      # its share of the prior, and points [1000, dim] of it
@@ -33,8 +33,8 @@ class Rest:
     - `boxes`: the partition of the cube.
     - `states`: the states that count as decided.
 
-    `mass` is its probability; `decided` that of the decided boxes, and `failing` that of those
-    among them in which every point fails.
+    `mass` is its probability, `decided` the probability of the decided boxes, and `failing` that of
+    the decided boxes in which every point fails.
     """
 
     def __init__(self, boxes: Boxes, states: Sequence[int]) -> None:
@@ -124,7 +124,8 @@ class Undecided:
 class RestSpace(FeatureSpace):
     """A feature space whose constraint also refuses decided boxes.
 
-    The constraint uses points, since features may lack coordinates, as of absent items.
+    The constraint is a function of points, since features do not determine all coordinates, such as
+    those of absent items.
     """
 
     def __init__(self, space: FeatureSpace, rest: Rest) -> None:

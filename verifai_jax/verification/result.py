@@ -56,7 +56,8 @@ class Verification(Drawn, Reported, InNotebook):
       given by a hash.
     - `confidence`: the confidence of bounds from samples.
     - `continuous`: whether it is about the differential equation.
-    - `looked_at`: number of examined boxes; `simulations`; `seconds`; `stopped`: why it ended.
+    - `looked_at`: number of examined boxes; `simulations`: number of simulations; `seconds`:
+      wall-clock time; `stopped`: the reason for ending.
     - `notes`: notes for the user; `version`; `sources`: the model's files, as a run records them.
     """
 

@@ -96,7 +96,7 @@ def test_what_is_damaged_is_computed_anew(tmp_path, caplog):
     cache = Cache(tmp_path)
     assert cache.names() == ["whole"]
     assert cache.get("piece") is None
-    assert "is damaged: what cannot be read of it is computed anew" in caplog.text
+    assert "is damaged: its unreadable parts are computed again" in caplog.text
     assert cache.remember("piece", lambda: {"x": np.arange(8.0)})["x"][7] == 7
     caplog.clear()
     np.testing.assert_array_equal(cache.get("piece")["x"], np.arange(8.0))
@@ -112,7 +112,7 @@ def test_entries_that_are_exchanged_are_noticed(tmp_path, caplog):
     changed(tmp_path / "sweep.cache", b'"two"', b'"one"')
     changed(tmp_path / "sweep.cache", b'"six"', b'"two"')
     cache = Cache(tmp_path)
-    assert "is damaged: what cannot be read of it is computed anew" in caplog.text
+    assert "is damaged: its unreadable parts are computed again" in caplog.text
     assert cache.names() == ["four"]
 
 

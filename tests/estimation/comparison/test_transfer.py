@@ -158,5 +158,5 @@ def test_what_is_wrong_is_said():
     other = plant()(policy)
     apart = vj.Problem("p", {"y": vj.Box(0, 1)}, lambda f, k: vj.Trace({"x": jnp.ones(3)}, dt=1.0),
                        "always x > 0")  # fmt: skip
-    with pytest.raises(ProblemError, match="the problems vary no feature of one name"):
+    with pytest.raises(ProblemError, match="the problems have no varying feature in common"):
         vj.transfer(policy, other, apart)

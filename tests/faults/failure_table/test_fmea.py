@@ -164,7 +164,9 @@ def test_bad_options(options, words):
 def test_faults_that_cannot_be_off_are_refused():
     one = problem(lambda s: s["a"], "always voted >= 0.5")
     always = faults.Stuck("a", value=vj.Box(0, 1))
-    with pytest.raises(ValueError, match=r"fault 'a_stuck' cannot be off, at its weakest \(value"):
+    with pytest.raises(
+        ValueError, match=r"fault 'a_stuck' cannot be switched off, not even at its weakest \(value"
+    ):
         vj.fmea(one, [always])
     with pytest.raises(ValueError, match="fmea takes faults one by one; 'fault' is AtMost"):
         vj.fmea(one.with_faults(faults.AtMost(1, dropouts("a", "b"))))

@@ -87,7 +87,9 @@ def test_a_model_of_flax_is_saved(tmp_path):
     module = Image()
     image = jax.random.normal(jax.random.key(0), (8, 8, 2))
     loaded = policy((module, module.init(jax.random.key(1), image)))
-    with pytest.raises(PolicyError, match="does not say what it observes: give observation="):
+    with pytest.raises(
+        PolicyError, match="does not define its input: give an example, observation="
+    ):
         loaded.save(tmp_path / "a.npz")
     check_again(loaded, tmp_path, [image], ".onnx", observation=image)
 

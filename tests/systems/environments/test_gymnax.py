@@ -283,7 +283,7 @@ def test_parts_that_do_not_fit_are_refused_while_tracing(name, policy, options, 
         ({"initial": lambda s: s}, r"initial is called with \(state, features, key\); got"),
         ({"signals": lambda s: s}, r"signals is called with \(state, observation, action, rew"),
         ({"signals": "x"}, r"signals must be names of the observation's entries"),
-        ({"signals": ["x", "action"]}, r"names of their own beside action and reward"),
+        ({"signals": ["x", "action"]}, r"different names, other than action and reward"),
     ],
 )
 def test_refuses_options_that_do_not_fit(options, message):

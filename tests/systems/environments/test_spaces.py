@@ -151,9 +151,7 @@ def test_problems_of_the_action_space_are_told_early():
         ValueError, match=r"action_space\['a'\] of env must be a space of Gymnasium"
     ):
         check_space(odd, "env", delayed=False)
-    with pytest.raises(
-        ValueError, match="no action that stands for none, which action_delay needs"
-    ):
+    with pytest.raises(ValueError, match="no neutral action, which action_delay needs"):
         check_space(spaces.Sequence(BOX), "env", delayed=True)
     bad = spaces.Box(-1, 1, (1,))
     bad.low = np.array([2.0], np.float32)

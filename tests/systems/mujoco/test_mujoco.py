@@ -401,7 +401,9 @@ def test_features_and_functions_that_do_not_fit_are_refused(options, features, m
 
 def test_contacts_need_a_model_that_can_be_given_a_sensor():
     compiled = mujoco.MjModel.from_xml_path(CART)
-    with pytest.raises(ValueError, match="needs a sensor that a compiled MjModel cannot be given"):
+    with pytest.raises(
+        ValueError, match="needs a sensor, which cannot be added to a compiled MjModel"
+    ):
         loop(model=compiled, signals={"hit": "contact/pole/cart"})
     with pytest.raises(UnknownNameError, match=r"unknown geom in 'contact/pole/cat': geom 'cat'"):
         loop(signals={"hit": "contact/pole/cat"})

@@ -1,4 +1,4 @@
-"""Studies of a counterexample: whether it is real, how little it takes, and why."""
+"""Studies of a counterexample: confirmation, minimisation and explanation."""
 
 from typing import TYPE_CHECKING
 

@@ -4,7 +4,7 @@
     confirm(run).table                                  # all of them, a row each
     confirm(run, engines="all").transferable            # which fail in every engine
 
-`verifai_jax.evaluation.confirmer` says what is checked.
+`verifai_jax.evaluation.confirmer` describes the checks.
 """
 
 from collections.abc import Mapping
@@ -23,7 +23,7 @@ from verifai_jax.evaluation.confirmer import Confirmer
 from verifai_jax.falsification.run import Run
 
 BLOCK = 128
-"""Rows of a run that are checked at once; what is finished survives Ctrl-C."""
+"""Number of rows that are checked at once; finished blocks survive Ctrl-C."""
 
 
 @overload

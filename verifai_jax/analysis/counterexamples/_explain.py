@@ -4,8 +4,8 @@
     print(why)                                          # a paragraph
     why.plot("why.png")                                 # the signal, and the features next to it
 
-Predicate and instant come from `mtl.explain` on the replayed trace. Features are judged by the
-robustness with each back at its nominal value, all others as they are, and by its gradient.
+Predicate and instant come from `mtl.explain` on the replayed trace. The influence of a feature is
+the robustness after resetting only this feature to nominal, and its gradient.
 """
 
 from collections.abc import Mapping
@@ -96,7 +96,7 @@ def explain(
     **Arguments:**
     - `run`: a run of a problem, with a counterexample.
     - `row`: the number of a counterexample, or its row of the table; the worst when left out.
-    - `nominal`: nominal features, if the problem has none or others are meant.
+    - `nominal`: nominal features, instead of those of the problem, if any.
     - `progress`: whether to show one line of progress; see `core.display.progress` for the default.
 
     This takes one simulation for each feature and each unit coordinate, and one gradient. Without
@@ -196,8 +196,8 @@ def slopes_of(
 ) -> tuple[Float[np.ndarray, " d"], Float[np.ndarray, " d"]]:
     """Return derivatives with respect to the features' real numbers, and the ranges of these.
 
-    Unit coordinates are probabilities, of which a hundredth changes a feature much in the tail of
-    its distribution and little in the middle, so their gradient is converted.
+    Unit coordinates are probabilities: a step of 0.01 changes a feature much in the tail of its
+    distribution and little in the middle, so their gradient is converted.
 
     **Arguments:**
     - `u`: the point at which the gradient was taken.

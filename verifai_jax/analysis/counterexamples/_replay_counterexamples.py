@@ -1,4 +1,4 @@
-"""A corpus of counterexamples against the problem as it is now.
+"""Replay of a corpus of counterexamples on the present problem.
 
 result = replay_counterexamples(problem, "counterexamples", rename={"mass": "payload"})
 result.failing, result.fixed, result.invalid
@@ -49,7 +49,7 @@ class ReplayedCounterexample:
       problem"`.
     - `robustness`: the least robustness now; NaN without a verdict.
     - `before`: the least robustness when the file was saved.
-    - `note`: a text on what has changed or is wrong.
+    - `note`: a text on changes or errors.
     - `changed`: whether the model has changed since the file was saved.
     """
 
@@ -253,7 +253,7 @@ def _replay_batch(
 
 
 def _changes(entry: SavedCounterexample, now: Sources) -> tuple[Change, ...] | None:
-    """Return what has changed since a counterexample was saved, or None if that is unknown."""
+    """Return the changes since a counterexample was saved, or None if they are unknown."""
     recorded = entry.found.get("sources")
     try:
         return Sources.from_json(recorded).changes(now) if recorded else None

@@ -1,9 +1,9 @@
-"""The least departure from nominal that still fails: a counterexample made small.
+"""Shrinking of a counterexample to the smallest departure from nominal that still fails.
 
     small = shrink(run, 17, by="distance", budget=5000)
 
-First the count, then the distance, in batches and along gradients (MacIver and Donaldson, Test-case
-reduction via test-case generation, ECOOP 2020).
+It minimises first the number of departures, then the distance, in batches and along gradients
+(MacIver and Donaldson, Test-case reduction via test-case generation, ECOOP 2020).
 """
 
 import math
@@ -66,7 +66,7 @@ def shrink(
     - `run`: a run of a problem, with a counterexample.
     - `row`: the number of a counterexample, or its row of the table; by default the worst, or the
       likeliest with `by="likelihood"`.
-    - `nominal`: nominal features, if the problem has none or others are meant.
+    - `nominal`: nominal features, instead of those of the problem, if any.
     - `by`: the measure to minimise. `"count"`: first the difference in the number of items of
       arrays of variable length, such as events; then the number of coordinates that are not exactly
       nominal, among them those of items that nominal does not have; then the distance. The result

@@ -1,4 +1,4 @@
-"""Candidates for a smaller counterexample: simulated once each, remembered, within a budget.
+"""Candidates for a smaller counterexample: each is simulated once, within a budget.
 
 candidates = Candidates(problem, nominal, budget=2000, precision="float32")
 rho, failing = candidates(points)                   # also of points that cannot be simulated

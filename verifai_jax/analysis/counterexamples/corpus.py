@@ -1,10 +1,10 @@
-"""Counterexamples kept as small readable files, so that none that was found ever comes back.
+"""Counterexamples as small readable files, for regression tests.
 
     run.save_counterexamples("counterexamples")         # a JSON file each, made for version control
     replay_counterexamples(problem, "counterexamples")  # all in one batch: failing, fixed, invalid
 
-A file holds the features of one simulation, the formulas, what it was worth, how it was found and
-how to see it again. Nothing in it is executed: the problem is given again to replay it.
+A file holds the features of one simulation, the formulas, the robustness, the search that found it
+and the data to replay it. Nothing in it is executed: a replay needs the problem.
 """
 
 import hashlib
@@ -161,7 +161,7 @@ _FORMS: dict[str, tuple[Callable[[Any], bool], str]] = {
     "changed": (lambda value: value is None or _maps_to(_is_pair)(value), "an object of pairs"),
     "found": (lambda value: isinstance(value, dict), "an object"),
 }
-"""For each entry of a file whether a value can be it, and what it must be, as text."""
+"""For each entry of a file, a check of its value, and the required form as text."""
 
 
 @shows_progress("saving counterexamples of", of_budget=False)
@@ -255,7 +255,7 @@ def save_counterexamples(
 
 
 def _sources(run: Run, row: int) -> dict[str, Any]:
-    """Return what a row was simulated with, as it belongs into a file under version control."""
+    """Return the files with which a row was simulated, in a form for version control."""
     found = sources_of_row(run.sources, row)
     # Where the project lay on this machine is nobody else's concern.
     return {} if found is None else replace(found, root="", first=0).to_json()
@@ -312,7 +312,7 @@ def _spread(points: Any, maximum: int) -> list[int]:
 
 
 def _plain(value: object) -> Any:
-    """Return an entry of a table as JSON has it; what is absent from an array is null."""
+    """Return an entry of a table for JSON; absent items of arrays are null."""
     if isinstance(value, np.ndarray | jax.Array):
         return np.asarray(value).tolist()
     if isinstance(value, np.generic):

@@ -1,4 +1,4 @@
-"""An explanation in words that somebody who knows the robot, and not the logic, can read."""
+"""Explanations of failures in English, for readers who know the system but not temporal logic."""
 
 from collections.abc import Sequence
 from dataclasses import replace

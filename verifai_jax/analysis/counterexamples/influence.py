@@ -1,4 +1,4 @@
-"""The part that each feature has in a failure."""
+"""The contribution of each feature to a failure."""
 
 from dataclasses import dataclass
 from typing import Any, NamedTuple

@@ -1,13 +1,13 @@
-"""Likelier failures than those found so far, from samples around them and from other choices.
+"""Search for likelier failures, by samples around the known ones and by other choices.
 
     draw_around_elite(candidates, rng)                  # cross-entropy, with elites by likelihood
     shift_in_time(candidates, u)
     exchange_cells(candidates, rng)                     # discrete features, two at a time
 
-Samples lie around the likeliest failures, spread as these are, with the choices of one of them. Of
-discrete features, all single changes of a failure are simulated. Of pairs, those that make it
-likelier are tried in the order of the robustness that the single changes predict for both together,
-as if they added up.
+Samples are drawn around the likeliest failures, with their spread and the choices of one of them.
+For discrete features, all single changes of a failure are simulated. Pairs of changes that make it
+likelier are tried in the order of the predicted robustness, which adds up the effects of the single
+changes.
 """
 
 import numpy as np

@@ -1,14 +1,15 @@
-"""The fewest features that have to depart from nominal for a failure, in batches.
+"""Search in batches for a failure in which the fewest features depart from nominal.
 
     points = minimize_count(candidates, starts, rng)    # failing, the least count first
 
 Three moves, in turns:
 
-- reversals: as many features as possible back to nominal, the others as they are (delta debugging:
+- reversals: reset as many features as possible to nominal, and keep the others (delta debugging:
   Zeller and Hildebrandt, Simplifying and isolating failure-inducing input, IEEE Transactions on
   Software Engineering 28(2), 2002);
-- exchanges: one feature back, the others push on until it fails again;
-- growth: from nominal, always the features by which the robustness falls most (a beam search).
+- exchanges: reset one feature, and move the others farther until the simulation fails again;
+- growth: start from nominal, and always add the features that lower the robustness most (a beam
+  search).
 """
 
 import numpy as np
@@ -22,7 +23,7 @@ Results = Float[np.ndarray, "m d"]
 LEVELS = 5
 """Values of one feature alone that growth begins with."""
 BEAM = 6
-"""Sets of features that growth goes on with."""
+"""Number of sets of features with which growth continues."""
 
 
 def revert_features(candidates: Candidates, u: Point) -> Point:
@@ -64,7 +65,7 @@ def revert_features(candidates: Candidates, u: Point) -> Point:
 
 
 def revert(candidates: Candidates, u: Point, sets: list[np.ndarray]) -> Points:
-    """Return the point with each of these sets of coordinates reset to nominal."""
+    """Return one copy of the point for each set of coordinates, with this set reset to nominal."""
     points = np.repeat(u[None], len(sets), axis=0)
     for point, coordinates in zip(points, sets, strict=True):
         point[coordinates] = candidates.nominal.u[coordinates]

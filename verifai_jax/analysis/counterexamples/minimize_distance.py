@@ -1,23 +1,23 @@
-"""The nearest failure to nominal over given features, in batches along the failure boundary.
+"""Search in batches along the failure boundary for the failure nearest to nominal.
 
     points = minimize_distance(candidates, starts, rng, keep_nominal=True)
                                                 # failing, none farther than its start
 
-Each round a batch of candidates for each point that is followed:
+Each round simulates a batch of candidates for each followed point:
 
 - on the segment to nominal (bisection, several points at once);
-- towards the nearest point of the linearised boundary, and part of the way: the iteration of
+- at the nearest point of the linearised boundary, and part of the way to it: the iteration of
   Hasofer and Lind (Exact and invariant second-moment code format, Journal of the Engineering
   Mechanics Division 100, 1974) and of Rackwitz and Fiessler (Structural reliability under combined
-  random load sequences, Computers and Structures 9, 1978), with a line search by batch; where
-  several pieces of the boundary meet, nearest to all of their half-spaces
+  random load sequences, Computers and Structures 9, 1978), with a line search in one batch; if
+  several pieces of the boundary meet, at the nearest point of the intersection of their half-spaces
   (`statistics.least_distance`);
 - sideways and nearer, at random (Brendel, Rauber and Bethge, Decision-based adversarial
   attacks, ICLR 2018), which needs no gradient and no continuity;
-- one coordinate nearer alone; a cell nearer where discrete.
+- with a single coordinate nearer to nominal, by a cell if it is discrete.
 
-The gradient is that of the smooth robustness, or where there is none a least-squares fit to the
-points simulated nearby.
+The gradient is that of the smooth robustness, or else a least-squares fit to points simulated
+nearby.
 """
 
 from dataclasses import dataclass, field
@@ -152,8 +152,8 @@ def boundary_steps(
 ) -> Departures:
     """Return departures at the nearest points of the linearised boundary, and on the way there.
 
-    - `costs`: the cost of a minimal departure of a coordinate, over its whole range; 0 for none.
-      Without such a cost a linear model would lead to an end of the range.
+    - `costs`: a small cost of a departure of each coordinate over its whole range, or 0. Without it
+      a linear model would lead to an end of the range.
     """
     nominal = candidates.nominal
     ends = np.zeros((2, len(track.u)))

@@ -1,12 +1,12 @@
-"""The nominal point, and the number and the distance of departures from it.
+"""The nominal point, and departures from it: their number and distance.
 
     nominal = Nominal.of(problem)
     nominal.count(points), nominal.distance(points)     # [n] each
 
 A departure is measured in unit coordinates, in which 1 is the whole range of the prior. Every
-coordinate counts for itself, a control point of a signal too. An item that nominal has and a point
-has not, such as an event, counts with the number of items alone; one that nominal has not counts
-with each of its coordinates, wherever they are, since nothing else says what they have to be.
+coordinate counts separately, including each control point of a signal. A missing item, such as an
+event of nominal that the point lacks, counts only in the number of items. An additional item counts
+with all of its coordinates, for which there are no nominal values.
 """
 
 from collections.abc import Callable, Mapping

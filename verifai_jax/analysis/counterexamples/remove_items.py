@@ -1,12 +1,12 @@
-"""The items, such as events, that nominal has, for a failure: before all else.
+"""The first step of shrinking: make the items of a failure, such as events, those of nominal.
 
     u = remove_items(candidates, u)                     # a failing point, often of fewer items
 
-What is not there cannot be wrong, and has no values that somebody would have to understand. So
-items go that nominal does not have, and those come back that it has. Up to
-`EXHAUSTIVE` items all subsets are tried; of more of them runs, pairs and single ones, repeatedly
-(delta debugging: Zeller and Hildebrandt, Simplifying and isolating failure-inducing input, IEEE
-Transactions on Software Engineering 28(2), 2002).
+Fewer additional items make a failure easier to understand. So items that nominal lacks are removed,
+and missing items of nominal are restored. Up to `EXHAUSTIVE` items all subsets are tried; for more
+items, consecutive runs, pairs and single items are tried repeatedly (delta debugging: Zeller and
+Hildebrandt, Simplifying and isolating failure-inducing input, IEEE Transactions on Software
+Engineering 28(2), 2002).
 """
 
 from itertools import combinations
@@ -18,7 +18,7 @@ from verifai_jax.analysis.counterexamples.candidates import Candidates
 from verifai_jax.core.compute.compilation import power_of_two
 
 EXHAUSTIVE = 8
-"""Items of which all subsets are tried."""
+"""Maximum number of items for which all subsets are tried."""
 
 
 def remove_items(candidates: Candidates, u: Float[np.ndarray, " d"]) -> Float[np.ndarray, " d"]:

@@ -1,6 +1,6 @@
-"""Cells of the feature space, of one feature and of two, that have samples in them.
+"""Cells of one feature and of pairs of features, and the samples in them.
 
-Pairs of discrete values are those of t-wise coverage in combinatorial testing (Kuhn, Kacker and
+Coverage of pairs of discrete values is 2-wise coverage in combinatorial testing (Kuhn, Kacker and
 Lei, Introduction to combinatorial testing, 2013).
 """
 
@@ -15,7 +15,7 @@ from verifai_jax.analysis.data.marginals import Marginal
 from verifai_jax.analysis.data.samples import Samples
 
 MAX_VALUES = 20
-"""Values up to which each one of a discrete feature is a cell of its own."""
+"""Maximum number of values of a discrete feature that each get a cell."""
 MAX_FEATURES = 60
 """Features up to which all of their pairs are counted."""
 MAX_UNTRIED = 1000

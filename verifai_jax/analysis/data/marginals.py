@@ -1,8 +1,8 @@
-"""Feature columns as coordinates in `[0, 1]` in which the prior is uniform, one by one.
+"""Conversion of each feature column to coordinates in `[0, 1]` in which its prior is uniform.
 
-Intervals and choices are uniform over their range, as is every column where no space is known. In
-a space with other domains each column gets its own distribution function, from the columns of 4096
-points of a Sobol sequence: any domain will do.
+Intervals and choices are uniform over their range, and so is every column without a known space. In
+a space with other domains the distribution function of each column is computed from 4096 points of
+a Sobol sequence, which works for any domain.
 """
 
 from dataclasses import dataclass

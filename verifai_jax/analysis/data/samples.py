@@ -1,4 +1,4 @@
-"""The rows of an error table that an analysis looks at, and their features as matrices.
+"""The rows of an error table selected for an analysis, and their features as matrices.
 
     samples = Samples.of(run)                            # its counterexamples
     samples = Samples.of(frame, "safe", ["x", "alg"])    # any DataFrame with feature columns
@@ -6,8 +6,7 @@
     samples.codes()                                      # unordered columns as integers, [n, m]
     samples.points()                                     # all columns, for Euclidean distances
 
-Results always speak of row numbers of the table (`samples.rows`), never of indices among the rows
-looked at.
+Results always use row numbers of the table (`samples.rows`), never indices among the selected rows.
 """
 
 from collections.abc import Sequence
@@ -81,9 +80,8 @@ class Samples:
         - `space`: the feature space, which determines the ordered columns and their ranges; a run
           has its own.
         **Raises:** `TypeError` for another source; `ValueError` for another `which`, rows of a run
-        that have changed since they were written, no rows,
-        row numbers that are not unique integers, unknown columns (with the nearest names), or
-        columns named twice.
+        that have changed since they were written, no rows, row numbers that are not unique
+        integers, unknown columns (with the nearest names), or columns named twice.
         """
         if isinstance(source, Samples):
             if columns is None:

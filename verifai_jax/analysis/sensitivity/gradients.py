@@ -1,4 +1,4 @@
-"""Gradients as sensitivities: which features cannot matter, from one gradient a simulation."""
+"""Gradients as sensitivities: upper bounds that show which features have no influence."""
 
 import numpy as np
 

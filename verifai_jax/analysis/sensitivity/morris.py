@@ -1,4 +1,4 @@
-"""Elementary effects: which features matter at all, from few simulations."""
+"""Elementary effects: a screening of influential features with few simulations."""
 
 from typing import Any
 

@@ -1,11 +1,11 @@
-"""The effect of each feature on the robustness, from new simulations: shared by the methods.
+"""Common parts of the sensitivity analyses, which simulate the effect of each feature.
 
     sobol_indices(problem, samples=4096)         sobol.py: shares of the variance
     morris(problem, trajectories=32)             morris.py: cheap screening
     gradient_sensitivity(problem, samples=1024)  gradients.py: bounds on total indices
 
-All three take features as the unit cube has them: independent and distributed by the prior.
-Simulation noise is held fixed while a feature changes, and counts as an input of its own.
+All three methods sample the unit cube: features are independent and distributed as under the prior.
+Simulation noise is fixed while a feature changes, and counts as a separate input.
 """
 
 from dataclasses import dataclass

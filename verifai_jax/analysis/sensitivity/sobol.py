@@ -1,4 +1,4 @@
-"""Sobol indices: shares of the robustness's variance, a feature alone and with all interactions."""
+"""Sobol indices: shares of the variance due to a feature alone, and including interactions."""
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -21,7 +21,7 @@ def sobol_indices(
     of: str | None = None,
     progress: bool | None = None,
 ) -> sensitivity.Sensitivity:
-    """Compute the share of the robustness's variance that each feature explains, alone and in all.
+    """Compute each feature's share of the robustness's variance, alone and with interactions.
 
     `first` is the share of the variance that vanishes when the feature is known; `total` is the
     share that remains when all other features are known, so it includes interactions. A feature

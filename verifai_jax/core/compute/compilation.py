@@ -1,4 +1,4 @@
-"""Programs compiled side by side: XLA compiles outside of Python's lock, one program a core.
+"""Concurrent compilation of programs: XLA compiles outside of Python's lock, one program per core.
 
     ask = compile_soon("the search", jax.jit(f).lower(state))   # at once, in the background
     ask(state)                                          # waits until it is compiled, and calls it
@@ -7,12 +7,12 @@
     ENGINES: Slot[EngineMode, Engine] = Slot("engines")
     engine = problem.programs.get(ENGINES, mode, lambda: Engine(problem, *mode))
 
-What a program computes does not depend on when it was compiled, so neither do results. What is
-compiled for an object is kept and freed with it, in a slot that fixes the types of keys and values.
-Each shape compiles a program of its own, so numbers of rows become powers of two.
+Results do not depend on the time of compilation. Programs compiled for an object are cached and
+freed with it, in a slot that fixes the types of keys and values. Each shape needs its own program,
+so numbers of rows are rounded up to powers of two.
 
-XLA spends most of its time on making a program fast. One that runs a few dozen times is done sooner
-with less of that (`XlaOptimization`): it is compiled in a half to a fifth of the time.
+XLA spends most of its time on optimisation. A program that runs only a few dozen times finishes
+sooner with less of it (`XlaOptimization`), as compilation then takes a half to a fifth of the time.
 """
 
 import gc
@@ -191,7 +191,7 @@ def compile_soon(
     **Arguments:**
     - `name`: the name of the program in messages, such as "the search".
     - `lowered`: the program, lowered by JAX.
-    - `effort`: how strongly XLA optimises it; accelerators always use the maximum.
+    - `effort`: XLA's optimisation effort; accelerators always use the maximum.
     - `splits`: whether its loops may be split over cores; False if it already uses all of them.
     - `wide`: whether it may use the processor's widest vectors; only for a program without XLA's
       own math functions, one of which is wrong with these.
@@ -201,7 +201,7 @@ def compile_soon(
 
 
 def while_compiling(work: Callable[[], object], after: float = LONG) -> None:
-    """Run some work once while this process next waits for a program; if it never waits, never.
+    """Run some work once, when this process next waits for a program; never if it does not wait.
 
     **Arguments:**
     - `work`: work that will be needed anyway, such as an import; no result may depend on it.
@@ -249,7 +249,7 @@ def _said(name: str) -> Iterator[None]:
 
 
 def describe_compilation() -> str:
-    """Say what is being compiled and for how long; empty if nothing is."""
+    """Describe the present compilation and its duration; empty if nothing is compiling."""
     with _lock:
         running = list(_running.values())
     if not running:

@@ -1,8 +1,8 @@
-"""The preparation of JAX, as soon as it is there and before its backend starts or compiles.
+"""The preparation of JAX when it is imported, before its backend starts or compiles.
 
-JAX gets one device for each core of the processor, a number that its backend fixes when it starts,
-and batches of factorizations that do not hang (`factorizations.py`). Importing `verifai_jax` does
-not import JAX, so both happen when JAX is first imported.
+JAX gets one device for each core of the processor, before its backend fixes their number, and
+batches of factorizations that do not hang (`factorizations.py`). Importing `verifai_jax` does not
+import JAX, so both happen when JAX is first imported.
 """
 
 import importlib.abc

@@ -1,9 +1,9 @@
 """The machine: work spread over devices, and a compile cache that outlives the process.
 
-XLA runs the small loop bodies of a rollout on one thread. Splitting the batch over one host
-device per core (`core.compute.cores`) is what keeps all cores busy.
+XLA runs the small loop bodies of a rollout on one thread, so the batch is split over one host
+device per core (`core.compute.cores`) to use all cores.
 
-Environment variables: `VERIFAI_JAX_CORES` (how many cores to use), `VERIFAI_JAX_CACHE` (a folder
+Environment variables: `VERIFAI_JAX_CORES` (number of cores to use), `VERIFAI_JAX_CACHE` (a folder
 for compiled programs, or `off`).
 """
 

@@ -1,4 +1,4 @@
-"""Work on other machines through the `submit` of any executor like those of `concurrent.futures`.
+"""Work on other machines, through any executor with the `submit` of `concurrent.futures`.
 
     check_executor(executor)
     shipment = ship(problem, executor, target="specs/cartpole.py:balance")
@@ -6,8 +6,8 @@
     gather(futures, lambda i, result: ...)              # as each ends; on errors cancels the rest
 
 Dask's `client.get_executor()`, `mpi4py.futures`, submitit's executors, a process pool and the
-adapter for Ray (`clusters.RayExecutor`) all have `submit`, and start, find and replace workers.
-Code and data reach a worker as the executor sends them; nothing here opens a socket or pickles.
+adapter for Ray (`clusters.RayExecutor`) all have `submit`, and start, find and replace workers. The
+executor sends code and data; nothing here opens a socket or pickles.
 """
 
 import concurrent.futures
@@ -28,7 +28,7 @@ T = TypeVar("T")
 USUAL_WORKERS = 8
 """Workers of an executor that does not say how many it has."""
 KEPT = 8
-"""Objects that a worker keeps, with what is compiled for them; the one unused for longest goes."""
+"""Number of objects that a worker keeps with their programs; the least recently used is dropped."""
 SECONDS = 1.0
 """Seconds of work that a call takes, about, unless the executor says `seconds_per_block`."""
 LOOK = 0.02
@@ -178,7 +178,8 @@ class Shipment(Generic[T]):
     **Arguments:**
     - `thing`: the object to send.
     - `target`: its name `FILE.py:NAME`; if given, workers load it by this name instead.
-    - `same`: a check whether an object loaded by name is this one: texts by what they describe.
+    - `same`: a function that describes an object as texts by topic, to check that an object loaded
+      by name equals this one.
 
     `made` holds the objects that a worker has made for it.
     """
@@ -233,7 +234,7 @@ def _receive_target(
         for what, text in same(thing).items():
             if text != wanted[what]:
                 raise ValueError(
-                    f"{target} on the worker is not the one here: its {what} is {text}, here "
+                    f"{target} on the worker differs from the one here: its {what} is {text}, here "
                     f"{wanted[what]}; a process pool loads it by its name, so give one that can be "
                     "pickled, or use Dask or Ray, which send it as it is"
                 )

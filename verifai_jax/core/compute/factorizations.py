@@ -1,13 +1,13 @@
 """Batches of matrix factorizations on a processor that cannot deadlock.
 
-Jaxlib 0.10.0 up to 0.11.1 cuts a large batch of matrices into parts, and the thread that asked for
-them waits until other threads of XLA's pool have done them. That thread may belong to the pool
-itself: when all its threads wait in this way, no thread is left for the parts, and the program
-hangs. One Cholesky factorization or one linear solve of 20 rows in the dynamics of a batch is
-enough. Later versions do not cut (jax-ml/jax, commit 859992407d), nor did earlier ones.
+Jaxlib 0.10.0 up to 0.11.1 divides a large batch of matrices into parts, and the calling thread
+waits until other threads of XLA's pool have computed them. The calling thread may belong to the
+pool itself: if all threads of the pool wait in this way, none is left for the parts, and the
+program hangs. One Cholesky factorization or one linear solve of 20 rows in the dynamics of a batch
+is enough. Later versions (jax-ml/jax, commit 859992407d) and earlier ones do not divide batches.
 
-`avoid_deadlock` lowers these batches as a loop over blocks that are too small to be cut. Each
-matrix is factorized by the same routine of LAPACK as before, so results are the same.
+`avoid_deadlock` lowers these batches as a loop over blocks that are too small to be divided. The
+same routine of LAPACK factorizes each matrix, so results do not change.
 """
 
 import math

@@ -1,13 +1,13 @@
-"""The identity of a traced function: all of what it computes, and of how it is differentiated.
+"""The identity of a traced function: a hash of its computation and its derivative rules.
 
     traced = jax.jit(function).trace(*arguments)
     fingerprint(traced.jaxpr)                           # a hash, or None if one cannot be taken
 
-Two functions of equal fingerprints compute the same, and so do all programs that are derived from
-them by the same rules, such as their derivatives. A user's code itself cannot be read for that:
-what it does may depend on anything. What JAX has just traced of it does not.
+Two functions of equal fingerprints compute the same, and so do all programs derived from them by
+the same rules, such as their derivatives. The text of a user's code is not enough, since its
+behaviour may depend on anything; the program that JAX has traced from it is.
 
-What JAX has traced, and single steps of it, are functions again:
+Traced programs, and single steps of them, can be called as functions again:
 
     again = as_traced(traced)                           # of the same pytrees, not traced again
     used_inputs(jax.make_jaxpr(simulate)(features, key))    # whether results use each array
@@ -208,7 +208,7 @@ class _Reader:
 
 
 def _check_rule(rule: Any) -> None:
-    """Refuse a batching rule of somebody else's: it may compute something else than the function.
+    """Refuse a foreign batching rule, which may compute something else than the function.
 
     Those of JAX and of this package compute the same for each lane.
     """
@@ -242,7 +242,7 @@ def as_traced(traced: jax.stages.Traced) -> Callable[..., Any]:
 
 
 def used_inputs(program: Any) -> list[bool]:
-    """Return which inputs of a program its results depend on."""
+    """Return, for each input of a program, whether a result depends on it."""
     results = [True] * len(program.jaxpr.outvars)
     return partial_eval.dce_jaxpr(program.jaxpr, results)[1]
 

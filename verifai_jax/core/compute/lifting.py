@@ -1,12 +1,12 @@
-"""Numbers that a compiled program reads from an argument instead of having them as constants.
+"""Numbers that a compiled program reads from an argument instead of containing as constants.
 
     numbers = LiftedNumbers()
     numbers.read_from(vector, lambda: simulate(u))      # while a program of (u, vector) is traced
     numbers.vector("float32")                           # the argument to call the program with
 
-A program with the bounds of a space as constants is compiled anew after every edit of a bound.
-Within `lifting()`, which stands around the map from the unit cube to features, a domain asks
-`lifted(self, ...)` for its numbers; elsewhere they stay constants.
+A program with the bounds of a space as constants is compiled again after every edit of a bound.
+Inside `lifting()`, which surrounds the map from the unit cube to features, a domain gets its
+numbers from `lifted(self, ...)`; elsewhere they stay constants.
 """
 
 from collections.abc import Callable, Iterator

@@ -90,7 +90,7 @@ def truncate_silently() -> Iterator[None]:
 
 @cache
 def _give_constants_their_precision() -> None:
-    """Let JAX make the constant of a NumPy array anew for each precision.
+    """Let JAX make the constant of a NumPy array again for each precision.
 
     JAX remembers the constant by the array alone: as long as a program that was traced in one
     precision is alive, the array is a constant of that precision in all others too, and they do

@@ -1,4 +1,4 @@
-"""A stopwatch whose parts add up: each moment counts for one thing that it is spent on.
+"""A stopwatch whose parts add up: each moment counts for exactly one activity.
 
     watch = Stopwatch("rest")
     with watch.on("search"):
@@ -6,7 +6,7 @@
             ...
     watch.seconds                              # {"rest": 0.1, "search": 0.2, "compile": 1.4}
 
-Nothing is the difference of two other times, so none is negative.
+No time is computed as a difference of two others, so none is negative.
 """
 
 import time

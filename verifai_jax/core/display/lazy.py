@@ -3,9 +3,9 @@
     plot_replay = lazy_import("verifai_jax.reports.plotting.replay", "plot_replay")
     plot_replay(replay, path)                           # the module is imported now, not before
 
-A result lies below the pictures and analyses of it. Its methods reach them through `lazy_import`,
-so that imports point downwards and a reader finds every exception by its name. `attach` does the
-same for all names of a package.
+Results are in a lower room than their pictures and analyses. Their methods use these through
+`lazy_import`, so that ordinary imports point downwards and a reader finds every exception by this
+name. `attach` does the same for all names of a package.
 """
 
 import importlib

@@ -1,4 +1,4 @@
-"""Results as a notebook shows them, and the names that tab completion offers.
+"""Results in notebooks, and the names that tab completion offers.
 
 class Estimate(InNotebook): ...     # `_repr_html_` is its text
 class Replay(InNotebook): ...       # ... and what `_notebook_parts` returns, such as its picture

@@ -1,4 +1,4 @@
-"""Progress: what a verb is doing, how much is done, how fast, and how much time is left.
+"""Progress of a call: its activity, the finished share, the speed, and the remaining time.
 
     @shows_progress("comparing")                        # a line for all that `compare` takes
     def compare(baseline, ..., progress: bool | None = None): ...
@@ -7,8 +7,8 @@
         progress.update(simulations, counterexamples, best)
 
 Rich draws a line on the error stream, on a terminal or in a notebook that has ipywidgets.
-Elsewhere, such as in a pipe, a line is written once a minute. What is begun within another verb
-takes its line over for as long as it lasts.
+Elsewhere, such as in a pipe, a line is written once a minute. A call inside another one takes over
+its line while it runs.
 """
 
 import contextlib
@@ -34,7 +34,7 @@ R = TypeVar("R")
 EVERY = 60.0
 """Seconds between two lines where nothing is drawn."""
 MOMENT = 2.0
-"""Seconds after which work is worth going on with: what takes less is as soon done anew."""
+"""Minimum seconds of work that is worth resuming; shorter work is simply repeated."""
 _ongoing: ContextVar["ProgressBar | None"] = ContextVar("ongoing", default=None)
 """The bar of the verb that was called; the others within it show themselves there."""
 
@@ -132,7 +132,7 @@ class ProgressBar:
         from rich.text import Text
 
         class Figures(TextColumn):
-            """The figures of a stage, or what is being compiled and for how long so far."""
+            """The figures of a stage, or the present compilation and its duration."""
 
             def render(self, task: "Task") -> "Text":
                 task.fields["shown"] = _compiling() or task.fields["figures"]
@@ -246,7 +246,7 @@ def _compiling() -> str:
 def shows_progress(
     doing: str, unit: str = "simulations", *, of_budget: bool = True
 ) -> Callable[[Callable[P, R]], Callable[P, R]]:
-    """Make a verb show in one line what it is doing.
+    """Make a function show its progress in one line.
 
     Its option `progress` works as in `ProgressBar`; if that is a function, nothing is shown. The
     total is its option `budget`, if it has one. `count_done` counts finished units.
@@ -290,13 +290,13 @@ def shows_progress(
 
 
 def count_done(amount: float) -> None:
-    """Count this many units as done by the verb that was called."""
+    """Count this many units as done by the outermost call that shows progress."""
     if (bar := _ongoing.get()) is not None:
         bar.count(amount)
 
 
 def say_done(done: float, total: float | None = None, figures: str = "") -> None:
-    """Set how much the verb that was called has done, out of how much, with figures next to it."""
+    """Set the finished units and the total of the call that shows progress, with figures."""
     if (bar := _ongoing.get()) is not None:
         bar.update(done, total, figures)
 

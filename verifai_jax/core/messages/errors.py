@@ -72,10 +72,10 @@ def _plain_number(value: object) -> object:
 
 
 def end_if_interrupted(stopped: str | None) -> None:
-    """Raise `KeyboardInterrupt` for a result that Ctrl-C cut short: a part is no finished work.
+    """Raise `KeyboardInterrupt` for a result that Ctrl-C cut short, since it is incomplete.
 
     **Arguments:**
-    - `stopped`: the reason why the verb ended that returned the result.
+    - `stopped`: the result's reason for ending.
     """
     if stopped == "interrupted":
         raise KeyboardInterrupt

@@ -143,7 +143,7 @@ def shorten(text: str, maximum: int = 60) -> str:
 
 
 MAX_MESSAGE_LENGTH = 500
-"""Characters of a message of somebody's system that are printed; the table has all of it."""
+"""Maximum printed characters of a system's message; the table has the whole text."""
 
 
 def printable(text: str, maximum: int | None = None) -> str:

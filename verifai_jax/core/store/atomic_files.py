@@ -1,4 +1,4 @@
-"""Files that are there whole or not at all, whatever ends the process that writes them.
+"""Atomic files: complete or absent, whatever ends the process that writes them.
 
 with replacing("report.html") as partial:
 partial.write_text(page)                    # takes the place of report.html at the end
@@ -90,7 +90,7 @@ def unwritable(path: str | Path, error: OSError, more: str = "") -> OSError:
     """Return the error for a file or folder that cannot be written.
 
     **Arguments:**
-    - `error`: the error of the file system; one that this function made is accepted, too.
+    - `error`: the error of the file system, or an error returned by this function.
     - `more`: a sentence on what happens to the results.
     **Returns:** an error of the same kind and `errno` that names the path, the reason and a remedy.
     """

@@ -1,12 +1,12 @@
-"""The cache of finished work: what was killed continues from it, with the same numbers.
+"""The cache of finished work, from which killed work continues with the same numbers.
 
     with Cache(path, "sweep") as cache:
         cache.claim(fingerprint)                        # refuses the cache of another sweep
         cache.remember("train/...", lambda: {"x": np.arange(3)})
 
 A cache is a log (`log.py`) that maps the name of a pure computation to the arrays that it returned.
-What is damaged is missing: it is computed anew, and a warning says so. What the cache is of is
-noted in it: one of which that cannot be read is refused.
+Damaged entries are computed again, with a warning. The cache also records its work; if this record
+cannot be read, the cache is refused.
 """
 
 import contextlib
@@ -60,7 +60,7 @@ class Cache:
         if damaged and not self._log.names():
             raise CacheError(f"{self.path} is not a cache: it is another kind of file, or damaged")
         if damaged:
-            log.warning("%s is damaged: what cannot be read of it is computed anew", self.path)
+            log.warning("%s is damaged: its unreadable parts are computed again", self.path)
 
     def claim(
         self,
@@ -99,7 +99,7 @@ class Cache:
             raise CacheError(
                 f"{self.path} holds work of the same {self.kind} with other files: "
                 f"{list_changes(changes)}. Give another folder, or restore the files; "
-                "even_if_changed=True (--even-if-changed) goes on all the same, and notes it"
+                "even_if_changed=True (--even-if-changed) continues regardless, and records it"
             )
         if changes or not known:
             about = {**about, "sources": [*known, sources.to_json()]}

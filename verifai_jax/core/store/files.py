@@ -1,4 +1,4 @@
-"""Files that are there whole or not at all, records in JSON, the checksum of all that is stored.
+"""Atomic files, records in JSON, and the checksum of all stored data.
 
 write_complete(path, content)
 write_record(path, {"seed": 0})
@@ -38,7 +38,7 @@ def checksum(content: "bytes | memoryview | pa.Buffer", before: int = 0) -> int:
 def write_complete(path: Path, content: "pa.Buffer | bytes", locked: bool = True) -> Path:
     """Write a file such that a reader never sees a part of it; return its path.
 
-    - `locked`: as in `replacing`. A missing folder is then not made again, since the files of a run
+    - `locked`: as in `replacing`; a missing folder is then not made again, since the files of a run
       are useful only together.
 
     **Raises:** the `OSError` of `replacing` if it cannot be written; the old file stays.
@@ -74,7 +74,7 @@ def replacing_all(folder: Path, names: Sequence[str]) -> Iterator[Path]:
                 if (new := Path(made) / name).exists():
                     new.replace(folder / name)
     except OSError as error:
-        raise unwritable(folder, error, "The results are in memory all the same") from error
+        raise unwritable(folder, error, "The results are still in memory") from error
 
 
 def write_record(path: Path, record: Mapping[str, Any], locked: bool = True) -> dict[str, Any]:

@@ -1,11 +1,11 @@
-"""One writer for a folder: a lock that goes with the process that holds it.
+"""One writer for a folder: a lock that ends with the process that holds it.
 
     with write_lock(folder):            # FolderInUse, where another process writes there
         ...
 
-The lock is the operating system's, on a file of the folder: it ends with the process, also one that
-is killed. The file says who holds it. Where there are no such locks (`fcntl` is missing, or the
-file system has none), nothing is locked. Reading needs no lock.
+The lock is the operating system's, on a file in the folder, so it ends with the process even after
+a kill. The file names the process. Without such locks (`fcntl` is missing, or the file system has
+none) nothing is locked. Reading needs no lock.
 """
 
 import contextlib

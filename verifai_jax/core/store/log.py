@@ -1,14 +1,14 @@
-"""A log: a file of named entries, to which is only appended.
+"""A log: an append-only file of named entries.
 
     log = Log(folder / "inflight.rows")
     log.put({"7": {"rho": np.array([0.1])}})        # with the operating system when it returns
     log.get("7")                                    # {"rho": array([0.1])}
 
-What is put together is one frame: a header, the names of entries and arrays with their types and
-shapes in JSON, and the bytes of the arrays, all under one checksum. So a process that dies at any
-moment leaves all frames but the one that it was writing; a copy of a log that is growing is a log;
-it needs no lock to be read, nor a right to write; and a frame that is damaged is one that is
-missing, since the next one is found by its mark. Nothing in a log is executed.
+Entries put together form one frame: a header, the names of entries and arrays with their types and
+shapes in JSON, and the bytes of the arrays, all under one checksum. So a process that dies loses
+only the frame that it was writing, and a copy of a growing log is a valid log. Reading needs
+neither a lock nor write permission. A damaged frame is skipped, since the next one is found by its
+mark. Nothing in a log is executed.
 """
 
 import contextlib

@@ -1,8 +1,8 @@
-"""Ready callbacks: numbers of a computation into a CSV file, or where TensorBoard reads them.
+"""Ready callbacks: they write numbers of a computation to a CSV file, or for TensorBoard.
 
     falsify(problem, callbacks=[CSVLogger("progress.csv"), TensorBoardLogger("logs/balance")])
 
-Both append, so that a computation that is resumed goes on with its file.
+Both append, so a resumed computation continues its file.
 """
 
 import csv

@@ -7,7 +7,7 @@
 
 A step is a count that grows (simulations, environment steps, policies), and values are numbers by
 name, so that most loggers' own functions fit: `lambda step, values: wandb.log(values, step=step)`.
-Nothing that a callback does changes a result; what it raises ends the computation.
+Callbacks cannot change a result; an error that one raises ends the computation.
 """
 
 from collections.abc import Callable, Iterable, Mapping

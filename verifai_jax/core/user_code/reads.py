@@ -1,12 +1,12 @@
-"""The data files that a user's modules have opened in this process, and the modules, by module.
+"""The data files and modules that each of a user's modules has opened in this process.
 
     watch()                                             # once, before they are imported
     files_read_by("/home/me/specs/car.py")              # {"/home/me/specs/gains.csv"}
     modules_loaded_by("/home/me/specs/car.py")          # {"/home/me/specs/plant.py"}
 
-Python tells its audit hooks of every file that it opens. A file counts as read by the innermost
-module of the user's that stands on the stack, and does not count where this package opens it for
-itself: its runs, caches and reports are no part of a model. What a library opens in C is not seen.
+Python reports every opened file to its audit hooks. A file counts as read by the user's innermost
+module on the stack. Files that this package opens for itself (runs, caches, reports) do not count,
+as they are no part of a model. Files opened by libraries in C are not seen.
 """
 
 import importlib.util

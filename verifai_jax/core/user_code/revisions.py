@@ -3,11 +3,10 @@
     with load_at_revision("specs/ball.py:drop@HEAD~1", Problem) as problem:
         ...                                             # its files are there until the block ends
 
-All files of the revision are written into a temporary folder, through an index of its own: neither
-the checkout nor its index nor anything else of the repository changes. Modules of the project are
-imported from there, and put back afterwards, so that both versions of one module live side by side.
-What a function imports, or reads by a relative path, when it is called and not when its file is
-loaded, is that of today.
+All files of the revision are written into a temporary folder through a separate index, so neither
+the checkout nor anything else of the repository changes. Modules of the project are imported from
+there, and the present ones restored afterwards, so that both versions of a module coexist. Imports
+and relative paths that a function uses only when it is called refer to the present files.
 """
 
 import contextlib
@@ -26,7 +25,7 @@ from verifai_jax.core.user_code.targets import Kind, TargetError, load_target
 
 _AT = re.compile(r"(?P<target>.+?\.py(?::[^@]*)?)@(?P<revision>.+)", re.DOTALL)
 _OWN = "verifai_jax"
-"""This package stays what it is, in its own repository too."""
+"""Files of this package do not count, not even in its own repository."""
 
 
 def split_revision(target: str) -> tuple[str, str | None]:

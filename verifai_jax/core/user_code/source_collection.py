@@ -1,12 +1,12 @@
-"""The files that an object is made of, found from its functions and modules.
+"""The files that define an object, found from its functions and modules.
 
     made = made_here()                                  # where a problem is made, remembered there
     sources = sources_of(problem, made)                 # taken when a run begins
     scan(Path("specs/car.py").read_bytes()).imports     # (Import(0, "envs", ("car",)), ...)
 
-Modules of the user are followed through what they import, open and name, as their text says;
-nothing is run. A text counts where it may name a file that is read: one that is handed to `save`,
-`write`, `to_csv` and their like names a result.
+The user's modules are followed through the imports, opened files and file names in their text;
+nothing is run. A text counts if it may name a file that is read; arguments of `save`, `write`,
+`to_csv` and similar functions name results and do not count.
 """
 
 import ast

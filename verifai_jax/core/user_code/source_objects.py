@@ -1,12 +1,12 @@
-"""The functions, classes and files that an object is made of, found by walking through it.
+"""The functions, classes and files that define an object, found by walking through it.
 
     for part in parts_of(problem):                      # Module, Function or OwnFiles
         ...
 
-A function of a user's file stands for its module. One that no file holds, of a notebook or an
-interpreter, stands for itself: its text, and the plain values that it takes from around it.
-`is_user_file` tells a user's own files from those of Python and of packages. Neither JAX nor
-anything else of this package is imported here, so that it may be asked at any time.
+A function of a user's file represents its module. A function without a file, from a notebook or an
+interpreter, represents itself: its text, and the plain values that it uses from its surroundings.
+`is_user_file` distinguishes a user's own files from those of Python and of packages. This file
+imports neither JAX nor other parts of this package, so it can be used at any time.
 """
 
 import functools
@@ -28,7 +28,7 @@ MAX_ENTRIES = 200
 _OPAQUE = ("numpy", "jax", "jaxlib", "mujoco", "pandas", "scipy", "torch", "builtins")
 """Packages whose objects hold no functions of a user."""
 _COMPILED = ("programs", "_problems")
-"""Attributes that hold what was made of an object, not what it is made of."""
+"""Attributes with values derived from an object, which are not its parts."""
 _PLAIN = (bool, int, float, complex, str, bytes, type(None))
 
 
@@ -152,7 +152,7 @@ def _part_of_class(kind: type) -> Module | str | None:
 
 
 def _around(function: FunctionType, deep: bool) -> list[object]:
-    """Return what a function takes from around it, from global names only where `deep`."""
+    """Return the values that a function uses from its surroundings, global ones only if `deep`."""
     around: list[object] = [function.__defaults__ or (), function.__kwdefaults__ or {}]
     around += _closure(function).values()
     if (wrapped := getattr(function, "__wrapped__", None)) is not None:

@@ -1,11 +1,11 @@
-"""The record of what a result was made of: hashes of the files of its model, and versions.
+"""The record of the origins of a result: hashes of its model's files, and versions.
 
     then.changes(now)                                   # which files are others by now
 
 The files are those of the user: the module that makes the problem, modules of the user that it
 imports and that its functions come from, and the data that they open or name. The hash of a module
-is that of the file as it was imported, so that a module which is edited and not imported again is
-what it was. Python, this package and what is installed are recorded by their versions.
+is that of the file as it was imported, so an edit without a new import does not change it. Python,
+this package and installed packages are recorded by their versions.
 """
 
 import hashlib
@@ -67,9 +67,7 @@ class Maker(NamedTuple):
 
 
 class Change(NamedTuple):
-    """A file that is another one by now: its hash then, None for one that had no part in it, and
-    its hash now, None for one that is missing.
-    """
+    """A changed file: its hash then, None if it was not used, and now, None if it is missing."""
 
     name: str
     was: str | None
@@ -213,7 +211,7 @@ class Sources:
 
 
 def _same_name(name: str, others: Mapping[str, Source]) -> str | None:
-    """Return the one of some names that stands for the same file, seen from another folder."""
+    """Return the name, among some, of the same file as seen from another folder."""
     if name in others:
         return name
     found = [other for other in others if name.endswith(f"/{other}") or other.endswith(f"/{name}")]

@@ -133,7 +133,7 @@ def target_of_project(target: object, folder: Path, *, kind: str, remedy: str) -
         if _is_of_project(location if colon else target, folder.resolve()):
             return target
     raise TargetError(
-        f"{folder} does not say which {kind} of this project it is of; give it: {remedy}"
+        f"{folder} does not record to which {kind} of this project it belongs; give it: {remedy}"
     )
 
 

@@ -7,8 +7,8 @@
                                                 # is no feature 'mas'; did you mean 'mass'? ...'
         format_user_error(error)                # the same in one bounded line, with its type
 
-Where an error comes from is read from its traceback: the innermost line that is neither of this
-package, nor of Python, nor of an installed library.
+The origin of an error is the innermost line of its traceback that belongs neither to this package,
+nor to Python, nor to an installed library.
 """
 
 import ast
@@ -31,7 +31,7 @@ from verifai_jax.core.values.waveform import IS_CALLED
 MAX_CODE = 80
 """Characters of a line of code that a message quotes."""
 MAX_MESSAGE = 300
-"""Characters of what a library or a simulator says."""
+"""Maximum characters of a message of a library or a simulator."""
 MAX_READ = 4 * MAX_MESSAGE
 """Characters of a message that are read at all: one of megabytes costs no time."""
 MAX_TRACEBACK = 100_000
@@ -241,7 +241,7 @@ def _advice_on_tracing(error: BaseException) -> str:
 
 
 def _missing_key(key: object, step: TracebackType, features: object) -> str:
-    """Write which mapping lacks a key, and what it has; empty if that is not known."""
+    """Write which mapping lacks a key, and the keys it has; empty if unknown."""
     text, mapping = _subscripted(step)
     if mapping is None:
         # Without the text of the line: features that the function holds are the likeliest.
@@ -328,7 +328,7 @@ def raised_in_callback(error: BaseException) -> str | None:
 
 
 def _said(error: BaseException) -> str:
-    """Return the type of an error and what it says, in one line of bounded length."""
+    """Return the type and message of an error in one line of bounded length."""
     if (raised := raised_in_callback(error)) is not None:
         return raised
     # JAX appends advice about its own tracebacks.

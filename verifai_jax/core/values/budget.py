@@ -1,4 +1,4 @@
-"""A budget of simulations and seconds: one count for all parts of a synthesis."""
+"""A budget of simulations and seconds, shared by all parts of a synthesis."""
 
 import time
 from collections.abc import Callable

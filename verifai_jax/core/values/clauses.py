@@ -1,10 +1,10 @@
-"""The form of what `mtl` says of one simulation to searches, in addition to its robustness.
+"""The form of the data on one simulation that `mtl` gives to searches besides the robustness.
 
 - Clauses: the parts of a requirement that have values of their own; `mtl.clauses` computes them.
 - An outcome, `OUTCOME` numbers: the number of the predicate that decides the robustness, its
-  instant as a share of the trace, and the shape of the trace, which is the mean of each of the
-  first `SIGNALS` signals (those of the formulas first) over each of `SEGMENTS` equal parts of the
-  time. Numbers of signals that do not exist are zero.
+  instant as a share of the trace, and the shape of the trace: the mean of each of the first
+  `SIGNALS` signals (those of the formulas first) over each of `SEGMENTS` equal parts of the time.
+  Numbers of signals that do not exist are zero.
 """
 
 CLAUSES = 4

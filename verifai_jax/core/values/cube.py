@@ -1,4 +1,4 @@
-"""The unit cube, as searches see a feature space: for each coordinate its cells and its name."""
+"""The unit cube, the form of a feature space for searches: cells and name of each coordinate."""
 
 import math
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""A sequence of timed events, as an `Automaton` feature gives it to a system.
+"""A sequence of timed events: the value of an `Automaton` feature in a system.
 
     events = features["traffic"]
     events.times, events.kinds, events["gap"]           # [slots] each, with `events.mask`
@@ -68,7 +68,7 @@ class Events:
         return self.parameters[name]
 
     def are(self, *names: str) -> Bool[Array | np.ndarray, " slots"]:
-        """Return which slots hold an event with one of these names; without names, any event."""
+        """Return flags of the slots with an event of these names; without names, of any event."""
         if not names:
             return self.mask
         chosen = [self._kind_of(name) for name in names]
@@ -78,7 +78,7 @@ class Events:
         return found
 
     def count(self, time: Real[Array | np.ndarray, "*times"] | float, *names: str) -> Any:
-        """Return how many events with these names have happened up to and including `time`."""
+        """Return the number of events with these names up to and including `time`."""
         return self._past(time, names).sum(axis=-1)
 
     def active(self, time: Real[Array | np.ndarray, "*times"] | float, *names: str) -> Any:

@@ -1,4 +1,4 @@
-"""Reactions to signals, as a `Reactive` feature gives them to a system: calls during the run.
+"""Reactions to signals: the values of a `Reactive` feature, called by a system during the run.
 
 push = features["push"]
 push(x=state.x, v=state.v)                          # or push(x, v): a number within bounds

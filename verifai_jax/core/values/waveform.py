@@ -1,4 +1,4 @@
-"""Functions of time by their control points, as a `Signal` feature gives them to a rollout.
+"""Functions of time with control points: the values of a `Signal` feature in a rollout.
 
 wind = Waveform(knots, hold="linear", duration=4.0)
 wind(time)                                                   # in seconds; traced or concrete

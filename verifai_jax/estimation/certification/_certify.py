@@ -4,10 +4,10 @@ certificates = certify(problem_of, policies, p=0.01)
 print(certificates)
 certificates.safest, certificates[3].verdict, certificates.counterexamples(3)
 
-Failures of policies on the host are simulated once more before a certificate shows them. One that
-does not fail again was caused by state that earlier simulations left, or by random numbers that do
-not come from the key. It counts in the failure rate, which is that of the system as simulated, and
-is not shown as a counterexample.
+Failures of policies on the host are simulated once more before a certificate shows them. A failure
+that does not recur was caused by state left by earlier simulations, or by random numbers that do
+not come from the key. It counts in the failure rate of the system as simulated, but is not shown as
+a counterexample.
 """
 
 import time
@@ -38,11 +38,11 @@ from verifai_jax.search import Search
 from verifai_jax.statistics.confidence_sequences import simultaneous_interval, verdict
 
 LANES = 64
-"""Samples of a policy in one block."""
+"""Number of samples of a policy in one block."""
 SETTLED = 3.0
 """Over `tie`: about as many samples as name a leader that never fails."""
 MAX_KEPT = 1000
-"""Counterexamples of a policy that are kept, the worst ones."""
+"""Maximum number of counterexamples kept for a policy, the worst ones."""
 ROWS = 256
 """Rows whose features are computed at a time, so that one shape compiles."""
 ProgressReport = Callable[[int, int, str], None]
@@ -71,8 +71,8 @@ def certify(
 
     **Arguments:**
     - `problem_of`: a function from a policy to its `Problem`. JAX traces it with the policy's
-      numbers as arguments, so that policies of one structure share a program; if that fails, each
-      is compiled by itself.
+      numbers as arguments, so that policies of one structure share a program; if tracing fails,
+      each policy is compiled by itself.
     - `policies`: `rl.Policy` objects, or other pytrees of numbers.
     - `p`: the failure probability below which a policy is called safe.
     - `confidence`: the probability that all intervals hold at once.
@@ -82,10 +82,10 @@ def certify(
       those of a training with this seed.
     - `budget`: samples of all policies together; four times the minimum when left out. Samples
       beyond the minimum go to policies whose verdict is open, and to those that may be the safest.
-    - `attack`: the search that looks for failures first; its failures enter no rate.
+    - `attack`: the search that looks for failures first; its failures are not part of any rate.
     - `attack_simulations`: simulations of each attack, rounded up to whole blocks; 0 for no attack.
-    - `tie`: failure rates that differ by less than this count as equally safe. When left out, `p /
-      10` or less: so small that resolving it takes about as many samples as the minimum of all
+    - `tie`: failure rates that differ by less than this count as equally safe. The default is `p /
+      10` or less, such that resolving it takes about as many samples as the minimum for all
       policies together.
     - `remember(key, compute)`: a memo of simulated blocks; it returns the arrays of `compute`, or
       those stored under this key. A key holds a hash of the model's code, so that blocks of another
@@ -172,7 +172,7 @@ def certify(
 
 
 def _chance(problem: Problem, rows: Sequence[Certificate]) -> list[str]:
-    """Return what there is to say of counterexamples of a system that draws."""
+    """Return a note on counterexamples of a system that draws random numbers."""
     if not any(row.counterexamples for row in rows) or not depends_on_key(problem):
         return []
     return [
@@ -188,7 +188,7 @@ def _sample(
     margins: np.ndarray,
     report: "_Report",
 ) -> str:
-    """Simulate what the allocation asks for until it asks for nothing; says why it ended."""
+    """Simulate the blocks of the allocation until it is done; return the reason for ending."""
     while True:
         failures, simulations = _counts(sampled)
         wanted = allocation.next(failures, simulations, margins)
@@ -337,8 +337,8 @@ def repeat_failures(
 
     **Arguments:**
     - `blocks`: the blocks that simulate the policies.
-    - `sampled`, `attacked`: its simulations, whose verdicts are replaced.
-    **Returns:** the counts; their text says what they mean for the system.
+    - `sampled`, `attacked`: simulations of the policy, whose verdicts are replaced.
+    **Returns:** the counts, with a text on their meaning for the system.
     """
     rows = [
         (float(verdicts.lowest[index]), record, block, index)

@@ -6,19 +6,19 @@
 
     race(draw, arms=64)                                 # only the name of the safest
 
-What comes next is a pure function of the counts so far: nothing is remembered, so a memo of the
-simulations is enough to go through the same decisions again.
+The next allocation is a pure function of the counts so far, so with stored simulations the same
+decisions are made again.
 
 **Naming the safest** is best-arm identification with Bernoulli arms. The posterior of each failure
-rate, from Jeffreys' prior Beta(1/2, 1/2), gives the chance that the leader (the least posterior
-mean) is the safest up to `tie`. Until that chance is high enough, half of the simulations go to the
-leader and half to its likeliest rivals (top-two sampling: Russo, Simple Bayesian algorithms for
-best-arm identification, Operations Research 68, 2020). The chance decides when to stop and is no
-bound; nothing is certified by it.
+rate, with Jeffreys' prior Beta(1/2, 1/2), gives the chance that the leader (the policy with the
+least posterior mean) is the safest up to `tie`. Until that chance is high enough, half of the
+simulations go to the leader and half to its likeliest rivals (top-two sampling: Russo, Simple
+Bayesian algorithms for best-arm identification, Operations Research 68, 2020). The chance only
+decides when to stop; it is not a bound and certifies nothing.
 
-**Verdicts** stand on bounds that hold at any time (`statistics/confidence_sequences.py`), so they
-are right whatever this file decides. An open policy is simulated further where its observed rate
-promises a decision within the budget, the nearest decisions first.
+**Verdicts** rely on bounds that hold at any time (`statistics/confidence_sequences.py`), so they
+are valid for any allocation. Undecided policies are simulated further if their observed rate
+suggests a decision within the budget, those closest to a decision first.
 """
 
 import math
@@ -46,7 +46,8 @@ class Leader(NamedTuple):
 
     - `number`: the policy with the least posterior mean.
     - `chance`: posterior probability that no other rate is below the leader's by more than `tie`.
-    - `rivals`: probability of each policy that its rate is below the leader's by more than `tie`.
+    - `rivals`: for each policy, the probability that its rate is below the leader's by more than
+      `tie`.
     """
 
     number: int
@@ -114,7 +115,7 @@ class Allocation:
         simulations: Int[np.ndarray, " n"],
         margins: Float[np.ndarray, " n"] | None = None,
     ) -> Int[np.ndarray, " n"]:
-        """Return how many blocks to simulate for each policy; all zero if nothing is left open.
+        """Return the number of blocks to simulate for each policy; all zero if all is decided.
 
         - `margins`: numbers that decide between equal leaders; see `find_leader`.
         """
@@ -234,9 +235,10 @@ def race(
     block: int = 16,
     budget: int = 1_000_000,
 ) -> RaceResult:
-    """Name the arm that fails least often.
+    """Find the arm that fails least often.
 
-    - `draw(arm, n)`: a function that returns how many of the next `n` samples of an arm fail.
+    - `draw(arm, n)`: a function that returns the number of failures in the next `n` samples of an
+      arm.
     - `first`: samples of each arm at the start; later ones come in blocks of `block`.
     - `budget`: maximum number of samples.
     """

@@ -4,8 +4,8 @@
     attack_policies(blocks, records, CrossEntropy(), rounds=4, report=report)
     records[3].lowest                                  # the least robustness that it met
 
-Each policy has a search of its own; their simulations go through one program. What a search finds
-says that a policy can fail, never how likely it is: points that it chose are no samples.
+Each policy has its own search; all simulations use one program. A search only shows that a policy
+can fail, not how likely it is, because its points are not samples of the prior.
 """
 
 from collections.abc import Callable
@@ -51,7 +51,7 @@ class PolicyRecord:
         self.not_finite += int(np.sum(~verdicts.proper))
 
     def take_out(self, block: int, index: int) -> None:
-        """Remove a row from the counterexamples and the least robustness, not from the counts."""
+        """Remove a row from the counterexamples and from `lowest`, but not from the counts."""
         verdicts = self.verdicts[block]
         rho, violated = verdicts.rho.copy(), verdicts.violated.copy()
         rho[index], violated[index] = np.nan, False

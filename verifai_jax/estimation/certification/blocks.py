@@ -1,11 +1,11 @@
-"""Blocks of simulations by name: computed together, remembered one by one.
+"""Named blocks of simulations: computed together, stored one by one.
 
     blocks = Blocks(problem_of, policies, seed=0, lanes=64, remember=store.remember)
     for (policy, block), verdicts in blocks.certificate([(0, 0), (0, 1), (5, 0)]):
         ...
 
-A piece is one policy in one block of samples. Its name holds all that its numbers depend on, so
-whatever is chosen for, in whatever order, a memo gives what a simulation would.
+Each block belongs to one policy. Its name identifies everything that its results depend on, so
+stored results can be used in any order.
 """
 
 import hashlib
@@ -172,7 +172,7 @@ class Blocks:
     def attack(
         self, chosen: Sequence[tuple[int, np.ndarray]], round_: int, search: str
     ) -> Iterator[tuple[int, Verdicts]]:
-        """Yield verdicts of each policy's points that a search chose; `chosen` holds indices."""
+        """Yield verdicts of the points that searches chose; `chosen` holds indices of policies."""
         blocks = [
             Block(
                 policy, points, round_ * self.lanes,
@@ -195,7 +195,7 @@ class Blocks:
         **Arguments:**
         - `numbers`: the numbers of the simulations, from which their random keys are derived.
         - `of_attack`: whether they are simulations of the attack, or samples.
-        **Returns:** the least robustness of each, NaN without a verdict; and whether it fails.
+        **Returns:** for each row its least robustness, NaN without a verdict, and whether it fails.
         """
 
         def compute() -> dict[str, np.ndarray]:
@@ -302,7 +302,7 @@ class Blocks:
 
 
 def _shipment(problem_of: Callable[[Any], Problem], executor: Executor) -> Shipment[Any]:
-    """Return what is sent of `problem_of`, once, so that workers keep its programs."""
+    """Return the shipment of `problem_of`, made once, so that workers keep its programs."""
     try:
         return _known_shipment(problem_of, executor)
     except TypeError:  # One of them cannot be hashed.

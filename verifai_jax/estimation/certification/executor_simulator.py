@@ -4,7 +4,7 @@
     simulator([0, 0, 1], points, first, key)            # as of `simulators.SharedSimulator`
 
 A worker keeps the program of a structure, and on a host the problem of a policy, between blocks.
-What a block gives depends on its policy and samples alone, so not on who simulates it.
+The result of a block depends only on its policy and samples, not on the worker.
 """
 
 import time
@@ -125,9 +125,8 @@ def simulate_blocks(
 ) -> dict[str, Any]:
     """Simulate blocks of policies; called by a worker.
 
-    **Arguments:** those of `ExecutorSimulator`, with the `policies` of these blocks by their
-    numbers,
-    and a `name` that distinguishes policies simulated by themselves from those of other simulators.
+    **Arguments:** those of `ExecutorSimulator`, but `policies` holds only the policies of these
+    blocks, by number; `name` identifies the simulator of separately simulated policies.
     **Returns:** `rho`, `status` and `violated` of each block; `messages` by policy; `seconds`.
     """
     indices = {number: index for index, (number, _) in enumerate(policies)}

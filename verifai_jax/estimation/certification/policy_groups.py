@@ -3,10 +3,10 @@
     group_policies(policies)        # [PolicyGroup(numbers=(0, 2, 3), ...), ...]
     digest(policy)                  # what names a policy in a memo: a hash of its arrays
 
-Hidden layers are padded with units whose weights are zero, up to a width that depends on the policy
-alone, so that policies of different widths share a program and none of them simulates differently
-in other company. Padding is exact in real numbers, since activations are 0 at 0; in float32 the
-padded sums may round differently from the policy's own.
+Hidden layers are padded with units of zero weight, so that policies of different widths share a
+program. The padded width depends on the policy alone, so its results do not depend on the other
+policies. Padding is exact in real arithmetic, since activations are 0 at 0; in float32 the padded
+sums may round differently from the policy's own.
 """
 
 import hashlib

@@ -24,7 +24,7 @@ class Certificate(InNotebook):
     - `rate`: the failure rate with an interval. The intervals of all policies hold together,
       however the number of samples was decided; None before the first sample.
     - `verdict`: `"safe@p"` if the interval is below p, `"unsafe"` if above, or `"undecided"`.
-    - `attacks`: simulations of the attack, `attack_failures` among them; they are in no rate.
+    - `attacks`, `attack_failures`: simulations and failures of the attack, which are in no rate.
     - `worst_robustness`: the least robustness of all simulations except `fragile` rows, NaN without
       a verdict; `worst_features`: the table columns of that simulation.
     - `counterexamples`: columns of features and `rho`, worst first.
@@ -116,7 +116,7 @@ class Certificates(InNotebook):
 
     @property
     def simulations(self) -> int:
-        """Number of samples of the certificates, all policies together; without the attack."""
+        """Number of samples of all policies together, without the attacks."""
         return sum(row.simulations for row in self.rows)
 
     @property
@@ -126,7 +126,7 @@ class Certificates(InNotebook):
 
     @property
     def uniform(self) -> int:
-        """Number of samples needed if every policy had as many as the one with the maximum."""
+        """Number of samples if every policy had as many as the policy with the most samples."""
         return len(self.rows) * max((row.simulations for row in self.rows), default=0)
 
     @property

@@ -3,11 +3,10 @@
     simulator = shared_simulator(problem_of, group, lanes=64, dim=3)
     simulator([0, 0, 1], points, first)         # three blocks: policies 0, 0, 1 of the group
 
-A block is one policy in some tens of samples, side by side, so that its weights are shared by one
-matrix product. Blocks are worked through one after another (on an accelerator all at once), spread
-over the devices, in a program that is compiled once for a structure: how many there are is an
-argument. What a block gives depends on its policy and samples alone, bit for bit on one machine,
-not on the other blocks or the number of devices.
+A block simulates one policy on some tens of samples together, so that one matrix product applies
+its weights to all. Blocks are spread over the devices and simulated one after another (on an
+accelerator all at once), in a program that is compiled once for a structure and any number of
+blocks. The result of a block depends only on its policy and samples, bit for bit on one machine.
 """
 
 import time

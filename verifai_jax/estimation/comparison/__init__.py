@@ -1,4 +1,4 @@
-"""Paired comparison of problems: which of two controllers fails more often, on the same samples."""
+"""Paired comparison of problems, to find which of two controllers fails more often."""
 
 from verifai_jax.estimation.comparison._compare import compare as compare
 from verifai_jax.estimation.comparison._transfer import transfer as transfer

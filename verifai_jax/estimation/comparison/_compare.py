@@ -1,11 +1,11 @@
-"""Two or more problems on common random samples, until it is known which fails more often.
+"""Comparison of two or more problems on common random samples until the result is decided.
 
     result = compare(old, new)                          # Problems of one feature space
     result = compare(old, {"wide": wide, "deep": deep}, margin=0.002)
     print(result); result.regression; result["wide"].rules()
 
-A pair is the same features and the same random key under both. Its intervals hold at any time, so
-that one may stop as soon as they decide (`statistics.paired_rates`).
+A pair simulates both problems with the same features and random key. The intervals hold at any
+time, so sampling may stop as soon as they decide (`statistics.paired_rates`).
 """
 
 import time
@@ -57,7 +57,7 @@ def compare(
     progress: bool | None = None,
     executor: Executor | None = None,
 ) -> Comparison:
-    """Compare failure rates of problems on common random samples, and stop when it is decided.
+    """Compare failure rates of problems on common random samples, until the result is decided.
 
     Each pair of simulations has the same features and the same random key. A candidate is *worse*
     if its failure rate exceeds that of the baseline by more than `margin`, *better* if it is lower

@@ -1,9 +1,9 @@
-"""The same policy in two engines: where verdicts differ, how far traces part, and what makes them.
+"""The same policy in two engines: differences of verdicts and traces, and their causes.
 
     result = transfer(policy, in_mujoco, in_brax)       # functions policy -> Problem, or Problems
     print(result); result.plot(); result.table
 
-A pair is the same features and the same random key in both. First pairs are sampled, then a search
+A pair simulates both with the same features and random key. First pairs are sampled, then a search
 looks for the greatest difference.
 """
 
@@ -67,8 +67,9 @@ def transfer(
     """Simulate the same policy in two engines, and find where they differ.
 
     Traces are compared in the signals that the formulas of both problems read, each in units of its
-    range. A gap counts if it exceeds `tolerance` and several times the effect of rounding: the gap
-    in one engine when the features move by one rounding error of single precision.
+    range. A gap counts if it exceeds both `tolerance` and several times the effect of rounding,
+    which is the gap in one engine when the features change by one rounding error of single
+    precision.
 
     **Arguments:**
     - `policy`: the policy passed to both problems; None if they contain it already.
@@ -152,7 +153,7 @@ def _names(problems: Sequence[Problem]) -> tuple[str, str]:
 
 
 def _common(a: Problem, b: Problem) -> tuple[tuple[Problem, Problem], list[str]]:
-    """Return the problems with their common features alone, and what is to be said.
+    """Return the problems with only their common features, and notes on the others.
 
     **Raises:** `ProblemError` without a common feature, and where domains differ.
     """
@@ -162,14 +163,14 @@ def _common(a: Problem, b: Problem) -> tuple[tuple[Problem, Problem], list[str]]
     both = [n for n, d in spaces[0].items() if d.size and n in spaces[1] and spaces[1][n].size]
     if not both:
         raise ProblemError(
-            "the problems vary no feature of one name: "
+            "the problems have no varying feature in common: "
             f"{', '.join(spaces[0])} in a; {', '.join(spaces[1])} in b"
         )
     for name in both:
         if spaces[0][name] != spaces[1][name]:
             raise ProblemError(
-                f"{name} is {spaces[0][name]!r} in a and {spaces[1][name]!r} in b: a pair has the "
-                "same features, so give it one domain"
+                f"{name} is {spaces[0][name]!r} in a and {spaces[1][name]!r} in b: both sides of "
+                "a pair have the same features, so give it the same domain in both"
             )
     notes, held = [], []
     for letter, problem, space in zip("ab", (a, b), spaces, strict=True):
@@ -185,7 +186,7 @@ def _common(a: Problem, b: Problem) -> tuple[tuple[Problem, Problem], list[str]]
 
 
 def _other_constants(a: Problem, b: Problem) -> list[str]:
-    """Say in which constants the models of two systems differ, where they can be compared."""
+    """Describe the constants in which the models of two systems differ, if comparable."""
     one, other = (problem.system.constants for problem in (a, b))
     said = []
     for name in one:
@@ -200,7 +201,7 @@ def _other_constants(a: Problem, b: Problem) -> list[str]:
 
 
 class _Pairs:
-    """Pairs of simulations, and what is known of them so far."""
+    """Pairs of simulations, and their results so far."""
 
     def __init__(
         self,
@@ -271,7 +272,7 @@ class _Pairs:
         return np.asarray(u + moves * (np.asarray(self.space.levels) == 0), np.float32)
 
     def _parting(self, a: Trace, b: Trace, again: Sequence[Trace | None]) -> dict[str, Any]:
-        """Return how far two traces part, when, and in which signal."""
+        """Return the largest gap of two traces, its time, and its signal."""
         times, gaps = _gaps(a, b, self._scales)
         grown = np.zeros(len(times))
         for trace, other in zip((a, b), again, strict=True):
@@ -358,7 +359,7 @@ def _scales(sides: Sequence[Verdicts]) -> dict[str, float]:
     names = [name for name in first[0] if name in first[1]]
     if not names:
         raise ProblemError(
-            "the formulas of both problems read no signal of one name: "
+            "the formulas of both problems have no signal in common: "
             f"{', '.join(first[0])} in a; {', '.join(first[1])} in b"
         )
     scales = {}

@@ -1,4 +1,4 @@
-"""The result of a comparison: how often each fails, by how much they differ, and where."""
+"""The result of a comparison: failure rates, their difference, and the differing features."""
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
@@ -50,7 +50,7 @@ class Compared:
         return judge(self.rates, self.margin)
 
     def rules(self, **options: Any) -> Any:
-        """Describe with a few boxes where only the candidate fails; see `analysis.rules`.
+        """Describe the region where only the candidate fails by boxes; see `analysis.rules`.
 
         **Raises:** `ValueError` if there is no such pair.
         """
@@ -164,12 +164,11 @@ class Transfer(Drawn, Reported, InNotebook):
     - `names`: the names of the two problems.
     - `table`: a row for each pair: its features; `robustness_a`, `violated_a` and those of b; the
       greatest `gap` of the traces in units of the range of a `signal`; `rounding`, the gap that
-      rounding can make; `parted`, the time in seconds at which the traces first differ by more;
-      `differs`, whether they do; `searched`, whether the search chose the pair; `proper`, whether
-      both simulations ended.
+      rounding can cause; `parted`, the first time in seconds at which the traces differ by more;
+      `differs`, whether they ever do; `searched`, whether the search chose the pair; `proper`,
+      whether both simulations ended.
     - `space`: the space of the common features.
-    - `influence`: each coordinate's share of the gap's variance among samples,
-      from 0 to 1.
+    - `influence`: each coordinate's share of the gap's variance among samples, from 0 to 1.
     - `worst`: the row with the largest gap, with both traces; None if no pair differs.
     - `tolerance`, `seed`: as given to `transfer`.
     - `stopped`: `"budget"` or `"interrupted"`.
@@ -208,7 +207,7 @@ class Transfer(Drawn, Reported, InNotebook):
         return simulation_key(run_keys(self.seed)[1], row)
 
     def rules(self, **options: Any) -> Any:
-        """Describe with a few boxes where only one of the two fails; see `analysis.rules`.
+        """Describe the region where only one of the two fails by boxes; see `analysis.rules`.
 
         **Raises:** `ValueError` if there is no such pair.
         """
@@ -239,7 +238,7 @@ class Transfer(Drawn, Reported, InNotebook):
         return "\n".join(lines + [f"  note: {note}" for note in self.notes])
 
     def _differences(self, sampled: "pd.DataFrame", found: "pd.DataFrame") -> list[str]:
-        """Return what is to be said of pairs that part."""
+        """Return sentences on pairs that differ."""
         lines, flips = [], self.flips
         for rows, kind in ((sampled, "sampled"), (found, "searched")):
             if not len(rows):

@@ -3,9 +3,9 @@
 budget = vj.error_budget(problem, vj.estimate(problem), pairs=20_000)
 budget = vj.error_budget(candidate, comparison["candidate"], baseline=problem)
 
-A part is measured on pairs: the same features and random numbers, simulated as they were and
-otherwise, so that what both have in common cancels, and its interval is one of the difference in
-probability. Of failures that are too rare for that, two estimates are compared.
+A part is measured on pairs with the same features and random numbers, simulated once unchanged and
+once with the change, so that common errors cancel. Its interval is that of the difference in
+probability. For very rare failures two estimates are compared instead.
 """
 
 import math
@@ -64,11 +64,11 @@ def error_budget(
     seed: int = 1,
     confidence: float = 0.95,
 ) -> ErrorBudget:
-    """Bound the error of a probability, part by part, and how wrong the prior may be.
+    """Bound the parts of the error of a probability, and the admissible error of the prior.
 
     **Arguments:**
-    - `problem`: the simulated problem: of a comparison the candidate, of a certificate the
-      policy's.
+    - `problem`: the simulated problem; for a comparison that of the candidate, for a certificate
+      that of the policy.
     - `result`: an estimate, a rate (`run.failure_rate`), a certificate, or a candidate of a
       comparison, `comparison["NAME"]`.
     - `baseline`: the baseline of a comparison.
@@ -339,7 +339,7 @@ class _Work:
         return ErrorPart("seeds", min(apart), max(apart), text, False)
 
     def randomness(self) -> ErrorPart:
-        """Return what the model's own random numbers contribute."""
+        """Return the contribution of the model's own random numbers."""
         if not depends_on_key(self.sides[0]):
             return ErrorPart("randomness", 0.0, 0.0, "The model draws no random numbers.", False)
         own, again = self.own[0], self._judge(self.sides[0], self.precision, self.seed + 1)

@@ -1,4 +1,4 @@
-"""The error of a probability: its parts, their sum, and how far the prior may be wrong.
+"""The error of a probability: its parts, their sum, and the admissible error of the prior.
 
 budget = vj.error_budget(problem, vj.estimate(problem))
 print(budget)
@@ -22,10 +22,10 @@ class ErrorPart:
 
     - `name`: `"sampling"`, `"step"`, `"precision"`, `"solver"` or a solver's name, `"seeds"`,
       `"randomness"`.
-    - `low`, `high`: the range of this error: how much greater the true number may be. For
-      `"sampling"` the ends of its interval minus the number. NaN if it was not measured.
+    - `low`, `high`: the range of the true number minus the simulated one due to this part; for
+      `"sampling"`, the ends of its interval minus the number; NaN if it was not measured.
     - `text`: a sentence on how it was measured, or why not.
-    - `counted`: whether it is part of the sum.
+    - `counted`: whether this part is in the sum.
     """
 
     name: str
@@ -48,7 +48,7 @@ class PriorError:
     - `bound`: the upper end of the number, with all parts of the error.
     - `radius`: the smallest Kullback-Leibler divergence, in nats, at which another prior raises the
       number to `limit`; 0 if the claim is not shown under this prior.
-    - `worst`: the greatest number within a divergence of 0.01, 0.1 and 1 nat.
+    - `worst`: the greatest values of the number within a divergence of 0.01, 0.1 and 1 nat.
     """
 
     limit: float
@@ -84,8 +84,8 @@ class ErrorBudget(Tabular):
     - `name`: the name of the problem; `what`: a description of the number.
     - `value`: the number as simulated; NaN if there is no estimate.
     - `parts`: the parts of its error; each interval holds with its share of the allowed error.
-    - `confidence`: the probability that all of them hold together.
-    - `prior`: how far the prior may be wrong.
+    - `confidence`: the probability that all these intervals hold together.
+    - `prior`: the admissible error of the prior.
     - `simulations`: number of simulations used.
     """
 

@@ -1,4 +1,4 @@
-"""Modes of failure: every failing region, how probable it is, and what happens there.
+"""Modes of failure: the failing regions, their probabilities and their causes.
 
 found = modes(problem)
 print(found)

@@ -4,10 +4,9 @@
     found = modes(run)                              # begins from the failures of a run as well
     print(found); found.plot("modes.png"); found[0].animate("mode.gif")
 
-Most of the budget estimates the failure probability, by searches that do not depend on one another,
-splitting and importance sampling (`estimate`). The weighted failures of its last samples are then
-divided into regions by paths of failures. So the probabilities of the modes are parts of one
-estimate, and sum to it.
+Most of the budget goes to the failure probability, estimated by independent searches, splitting and
+importance sampling (`estimate`). Its weighted failures are then divided into regions by paths of
+failures. So the probabilities of the modes are parts of one estimate and sum to it.
 """
 
 import time
@@ -93,8 +92,8 @@ def modes(
     - `max_seconds`: wall-clock seconds after which the finished simulations are divided into modes.
     - `progress`: True draws a progress bar, False none; None draws one on a terminal.
     **Returns:** the modes, the most probable first. If no failure was found, or failures could not
-    be weighted, there are none and a note says why. If the system draws random numbers,
-    probabilities are over these too, and each mode holds the random key under which its likeliest
+    be weighted, the result is empty and a note says why. If the system draws random numbers,
+    probabilities cover these too, and each mode holds a random key under which its likeliest
     failure fails.
     **Raises:** `TypeError` for a source that is not a problem or run; `ValueError` for options out
     of range, or a run that was loaded without its problem.

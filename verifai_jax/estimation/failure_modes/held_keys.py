@@ -1,14 +1,14 @@
-"""The failing regions of a system that draws random numbers: those under some of its keys, held.
+"""The failing regions of a system that draws random numbers, found under fixed keys.
 
     divided = divide_under_keys(limit_state, held_at, rng, samples, starts)
     divided.regions, divided.keys[row]              # each point fails under the key of its row
 
-Where a point fails with a probability, a path of points is no path of failures: each simulation
-draws anew. Under one key, held, the system is a function of its features, and regions are found as
-for any other. The keys are those of failures: first one under which half of the failures fail, then
-one for half of the others, and so on. A key under which all fail would be a lucky one, under which
-regions that are apart under any other run together. Regions of two keys are one where a path under
-either joins their likeliest points.
+If each simulation draws new random numbers, points on a path fail only with a probability, and
+paths do not define regions. Under a fixed key the system is a function of its features, and regions
+are found as for any other system. The keys are those of failures: first a key under which half of
+the failures fail, then one for half of the rest, and so on. A key under which all fail is avoided,
+as it may join regions that are separate under other keys. Regions of two keys are merged if a path
+under either key joins their likeliest points.
 """
 
 from collections.abc import Callable
@@ -48,9 +48,10 @@ class Divided:
     - `joined`, `tried`: the number of failures that a path joins to a region, and of those tried.
     - `under`: share of the failures that fail under one of the keys.
     - `held`: number of keys.
-    - `design`: row of the likeliest failure of each region; by default the nearest to the origin.
-    - `failing`: for a system with its own random numbers, how many of `times` simulations of each
-      likeliest failure fail.
+    - `design`: row of the likeliest failure of each region; by default the failure nearest to the
+      origin.
+    - `failing`: for a system with its own random numbers, the number of failures in `times`
+      simulations of each likeliest failure.
     """
 
     regions: Regions

@@ -1,10 +1,10 @@
-"""Names of modes in words: the conditions on features that nearly all failures of a mode fulfil.
+"""Names of modes: conditions on features that nearly all failures of a mode satisfy.
 
     name_mode(failures, prior)                      # "speed > 31.2 and gap <= 4"
 
-Each condition is one end of one feature's range, within which nearly all failures of the mode lie
-and as few samples of the prior as possible; conditions are taken one by one while they help. All of
-them are necessary for a failure of the mode; together they need not be enough for one.
+Each condition bounds one feature at one side, so that nearly all failures of the mode satisfy it
+and as few samples of the prior as possible. Conditions are added as long as they help. All are
+necessary for a failure of the mode, but together they may not be sufficient.
 """
 
 import math
@@ -47,7 +47,7 @@ def name_mode(failures: pd.DataFrame, prior: pd.DataFrame) -> str:
     **Arguments:**
     - `failures`: features of failures of the mode, one a row.
     - `prior`: features of samples of the prior.
-    **Returns:** the conditions, in increasing order of how many samples of the prior satisfy them;
+    **Returns:** the conditions, those that the fewest samples of the prior satisfy first;
     `"anywhere"` if no condition separates the failures.
     """
     varying = [name for name in failures.columns if len(set(prior[name].astype(str))) > 1]

@@ -1,12 +1,12 @@
-"""The failing regions of a system with chance of its own: where it fails about as often.
+"""The failing regions of a system whose own random numbers no key controls.
 
     divided = divide_by_chance(limit_state, rng, samples)
     divided.failing[k], divided.times           # simulations of the likeliest failure that fail
 
-No random key can be held, so no point fails for certain, and a path of single simulations says
-nothing. Points and paths are therefore simulated several times. The centre of each group of
-failures is moved outwards to where about half of the simulations fail; two groups are one region if
-the system fails all along a path between these points, and nowhere much less often.
+Such a system has no random key to fix, so no point fails for certain, and single simulations on a
+path show nothing. Points and paths are therefore simulated several times. The centre of each group
+of failures is moved outwards until about half of the simulations fail. Two groups are one region if
+the failure rate does not drop much along a path between these points.
 """
 
 import warnings

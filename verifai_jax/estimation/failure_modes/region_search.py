@@ -3,10 +3,10 @@
     regions = find_regions(limit_state, rng, failures, weights, nearest)
     joined, tried = share_explained(limit_state, rng, regions, failures, weights)
 
-A region is what paths of failures join to one local least distant failure, which is the likeliest
-point under the prior (the design point of structural reliability). Candidates are taken from the
-nearest to the farthest: one that a path of failures joins to a region already there belongs to it,
-another one begins a region. So regions that touch far out stay apart.
+A region contains all failures that paths of failures join to a local least distant failure, its
+likeliest point under the prior (the design point of structural reliability). Candidates are tried
+from the nearest to the farthest: a candidate joins an existing region if a path of failures leads
+there, else it begins a new one. So regions that touch only far out stay separate.
 
 Source: Der Kiureghian and Dakessian, Multiple design points in first and second-order reliability,
 Structural Safety 20 (1998).
@@ -94,7 +94,7 @@ def share_explained(
     z: Float[np.ndarray, "n d"],
     share: Float[np.ndarray, " n"],
 ) -> tuple[int, int]:
-    """Draw failures; return the number that a path joins to a region, and the total."""
+    """Draw failures; return the number that paths join to a region, and the total."""
     count = min(LOOKED_AT, max(2, limit_state.left // A_LOOK))
     _, joined = _look(limit_state, rng, regions, z, share, count)
     return int(joined.sum()), len(joined)

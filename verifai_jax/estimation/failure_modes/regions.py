@@ -3,10 +3,9 @@
     regions.assign(failures)                        # the region [n] of each failure
     regions.design_points                           # [k, d], the likeliest failure of each
 
-A failure belongs to the region of the nearest point. A region that is narrow in a few coordinates
-and wide in many others looks far away from its own failures where distances count all coordinates
-alike; so they are in standard deviations of the region, where these tell the known points apart
-better.
+A failure belongs to the region of the nearest point. Plain distances fail for a region that is
+narrow in a few coordinates and wide in many others. So distances are measured in standard
+deviations of the region if this separates the known points better.
 """
 
 from dataclasses import dataclass
@@ -102,9 +101,8 @@ class Regions:
     ) -> tuple[Float[np.ndarray, "n k"], Int[np.ndarray, "n k"]]:
         """Return the distance of each point from each region, and the row of the nearest point.
 
-        These are logarithms of normal densities around the points, up to sign and factor.
-        Where `z` are the points of the regions, `itself` says whether a point counts as its own
-        neighbour.
+        These are logarithms of normal densities around the points, up to sign and factor. Where `z`
+        are the points of the regions, `itself` says whether a point counts as its own neighbour.
         """
         distances = np.full((len(z), self.count), np.inf)
         rows = np.zeros((len(z), self.count), int)

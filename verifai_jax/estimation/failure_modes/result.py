@@ -35,10 +35,11 @@ class Mode(InNotebook):
     - `distance`: the distance of that point from the middle of the prior, in standard deviations of
       normal space (the reliability index).
     - `rho`: robustness at that point.
-    - `cause`: formula and predicate that decide at that point, as text; empty without a verdict.
+    - `cause`: the deciding formula and predicate at that point, as text; empty without a verdict.
     - `failures`: features of failures of this mode, distributed as under the prior, one a row.
     - `problem`: the problem.
-    - `run`: the simulations of the likeliest failure, all with its random key if the system draws.
+    - `run`: simulations of the likeliest failure, all with its random key if the system draws
+      random numbers.
     - `row`: row of `run` that fails at the likeliest failure or just beyond it; None if none does.
     - `chance`: for a system with memory or randomness of its own, the share of several simulations
       of the likeliest failure that failed; None for other systems.

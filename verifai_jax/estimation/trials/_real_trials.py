@@ -3,10 +3,10 @@
     found = real_trials(problem, "trials.csv")
     print(found); found.rate, found.rules(), found.next_trials(5)
 
-The same features are simulated, so that each trial was predicted to fail or not. How often that is
-predicted is known from simulations of the prior; how often a prediction is right is learned from
-the trials. `statistics.stratified_rate` makes an interval of both, which is valid whatever the
-simulation is worth.
+Each trial is simulated with the same features, which predicts whether it fails. The rate of
+predicted failures comes from simulations of the prior, and the accuracy of predictions from the
+trials. `statistics.stratified_rate` combines both into an interval that is valid for any quality of
+the simulation.
 """
 
 from typing import TYPE_CHECKING, Any

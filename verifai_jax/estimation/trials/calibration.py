@@ -1,11 +1,11 @@
-"""Features that nobody measured, by what trials say of them: a simulator where reality is.
+"""Calibration of unmeasured features by real trials.
 
     found = calibrate(problem, "trials.csv", ["friction"])
     print(found); found.samples; found.problem      # falsify(found.problem) is nearer to reality
 
-The posterior is that of rejection from the prior in two stages: the second draws from where the
-first left any. The likelihood of values is that of the trials they explain, integrated over the
-unknown share of trials that nothing explains, or over the unknown spread of the robustness.
+The posterior is sampled by rejection from the prior in two stages: the second draws only from the
+region that the first left. The likelihood of values is that of the trials they explain, integrated
+over the unknown share of unexplained trials, or over the unknown spread of the robustness.
 """
 
 from collections.abc import Sequence
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 POSTERIOR = 1000
 """Samples of the posterior that are returned."""
 TAIL = 1e-3
-"""Posterior probability of what the second stage leaves out, at each end of each feature."""
+"""Posterior probability outside the second stage's range, at each end of each feature."""
 TRUSTED = 9.0
 """Trials that the prior takes for explained, for one that nothing explains."""
 DRAWN = 50

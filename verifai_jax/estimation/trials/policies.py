@@ -1,9 +1,10 @@
-"""Two policies in reality, compared in pairs of trials, whenever one stops.
+"""Comparison of two policies by pairs of real trials, valid after any number of pairs.
 
     print(compare_trials("pairs.csv", "old", "new"))
 
 Both policies of a pair meet the same features. The interval holds at any time
-(`statistics.paired_rates`), so that one may look after each pair, and stop once it decides.
+(`statistics.paired_rates`), so it may be checked after each pair, and the trials may stop once it
+decides.
 """
 
 from dataclasses import dataclass

@@ -72,7 +72,7 @@ class RealTrials(InNotebook):
         return self.table[[verdict is not None for verdict in self.table["failed"]]]
 
     def rules(self, **options: Any) -> "Rules":
-        """Describe with a few boxes where the simulation is wrong; see `analysis.rules`.
+        """Describe the region where the simulation is wrong by boxes; see `analysis.rules`.
 
         **Arguments:**
         - `options`: the options of `analysis.rules`.
@@ -86,9 +86,9 @@ class RealTrials(InNotebook):
     def next_trials(self, count: int = 1, *, seed: int = 0) -> "pd.DataFrame":
         """Choose the trials that would shorten the interval most, the safest first.
 
-        Neyman's rule decides how many trials with a predicted failure there are; within both groups
-        the features are drawn at random, on which the interval relies. So make all of these trials,
-        in any order, and give their verdicts to `real_trials(..., allocated=True)`, with
+        Neyman's rule determines the number of trials with a predicted failure; the features of both
+        groups are drawn at random, which the interval relies on. So make all of these trials, in
+        any order, and give their verdicts to `real_trials(..., allocated=True)`, with
         `at_any_time=True` if you stop early.
 
         **Arguments:**

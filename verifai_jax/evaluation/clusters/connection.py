@@ -4,8 +4,8 @@ with connect("dask://scheduler:8786") as executor:
 vj.falsify(problem, executor=executor)
 
 `RayExecutor` makes a task of Ray for each `submit`, and returns a future of `concurrent.futures`.
-Ray finds a worker for each task, runs the task again where its worker dies, and reuses worker
-processes, which keep what they have compiled.
+Ray finds a worker for each task, repeats a task whose worker died, and reuses worker processes with
+their compiled programs.
 """
 
 import concurrent.futures

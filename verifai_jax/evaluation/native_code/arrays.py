@@ -1,4 +1,4 @@
-"""Steps that move the elements of arrays, and are no code."""
+"""Steps that only move the elements of arrays, for which no code is generated."""
 
 import math
 from collections.abc import Callable

@@ -1,8 +1,8 @@
-"""The text of a translated program: pieces of straight code, with loops and branches around them.
+"""The text of a translated program: pieces of straight-line code inside loops and branches.
 
 A block of simulations is `K` vectors. A piece runs for one vector after another, with its values in
-registers; what a later piece needs lies in memory. What is the same for all simulations is computed
-once, in front of the piece.
+registers; values needed by a later piece are stored in memory. Values equal for all simulations are
+computed once, before the piece.
 """
 
 import math
@@ -33,7 +33,7 @@ _MADE = re.compile(r"\b([uvimw])\d+\b")
 
 
 class Piece:
-    """Code without branches: lines that run before, once for each vector, and after."""
+    """Code without branches: lines before the loop over vectors, in it, and after it."""
 
     def __init__(self) -> None:
         self.together: list[str] = []

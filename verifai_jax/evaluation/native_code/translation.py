@@ -2,8 +2,8 @@
 
     source = translated(jaxpr, inputs)                  # C++, or `Untranslatable`
 
-What moves elements of arrays is done here; only what computes with them becomes code. Small arrays
-are single variables, large ones lie in memory and are computed in loops.
+Moves of array elements are done during translation; only computations become code. Small arrays
+become single variables; large ones are stored in memory and computed in loops.
 """
 
 from collections import Counter

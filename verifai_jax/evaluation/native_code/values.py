@@ -4,7 +4,7 @@
     Element("0x1p-1f", "f", True, np.float32(0.5))      # a constant
     names = elements(value)                             # an object array in the shape of the value
 
-What only moves elements, as a transposition does, is then a step of NumPy and no code at all.
+So a step that only moves elements, such as a transposition, is done by NumPy and generates no code.
 """
 
 import re

@@ -1,4 +1,4 @@
-"""The work of a program, counted: which decides whether a native one is worth its compilation."""
+"""The counted work of a program, which decides whether native compilation pays."""
 
 import numpy as np
 

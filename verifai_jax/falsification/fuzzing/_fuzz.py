@@ -1,12 +1,12 @@
-"""Fuzzing with a model: what may happen is a feature space, what has happened guides the search.
+"""Fuzzing with a model: a feature space describes possible inputs, and coverage guides the search.
 
     run = fuzz(problem, budget=20_000)                  # in addition to the formulas: finite, ended
     run = fuzz(space=space, system=simulate, ranges={"speed": (0, 60)})       # without any formula
     print(run); run.coverage; run.corpus; vj.shrink(run)
 
-It is a falsification with `search.Coverage`, which mutates simulations that did something new. What
-counts as new: transitions of an `Automaton` and pairs of them, cells of signals, and the clause of
-the formulas that is nearest to breaking.
+It is a falsification with `search.Coverage`, which mutates simulations that covered something new:
+transitions of an `Automaton`, pairs of transitions, cells of signals, or another clause of the
+formulas as the one nearest to breaking.
 """
 
 from collections.abc import Callable, Mapping
@@ -47,7 +47,7 @@ def fuzz(
     target: str | None = None,
     keep_going: bool = False,
 ) -> FuzzRun:
-    """Look for failures by covering what can happen, with or without formulas.
+    """Look for failures by covering the possible behaviour, with or without formulas.
 
     **Arguments:**
     - `problem`: a problem with formulas; without one give `space` and `system`.

@@ -1,4 +1,4 @@
-"""Coverage of a run, of how much: states, transitions and pairs of automata, cells, clauses."""
+"""Coverage of a run, and totals: states, transitions and pairs of automata, cells, clauses."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -26,7 +26,7 @@ class Covered:
     - `where`: the name of the feature, or `traces`.
     - `what`: `states`, `transitions`, `pairs`, `cells` or `clauses`.
     - `names`: the names of all items.
-    - `hits`: how many simulations covered each item.
+    - `hits`: number of simulations that covered each item.
     """
 
     where: str
@@ -99,7 +99,7 @@ class FuzzCoverage(InNotebook):
         return cls(tuple(parts), automata)
 
     def __getitem__(self, what: str) -> Covered:
-        """Return the part of this kind; that of the first feature where several have it."""
+        """Return the part of this kind; if several features have it, that of the first."""
         for part in self.parts:
             if part.what == what:
                 return part
@@ -116,7 +116,7 @@ class FuzzCoverage(InNotebook):
         return possible, hits
 
     def plot(self, path: str | Path | None = None) -> Figure:
-        """Draw which transitions of the first automaton followed which.
+        """Draw the pairs of consecutive transitions of the first automaton.
 
         **Raises:** `ValueError` for a run without an automaton.
         """

@@ -25,13 +25,13 @@ from verifai_jax.systems.base import Features, Outcome, Seed, System, as_system,
 from verifai_jax.systems.blackbox._blackbox import plain_leaves
 
 FINITE = "finite"
-"""The signal that is positive where all signals are finite, and its property."""
+"""Name of the signal that is positive if all signals are finite, and of its property."""
 COMPLETED = "completed"
-"""The signal that is positive in a simulation that ended properly, and its property."""
+"""Name of the signal that is positive if a simulation ended properly, and of its property."""
 RANGE = "range_"
 """Beginning of the name of the property that a signal stays in its range."""
 HOLDS = 1e6
-"""The value of these signals where all is well: more than any formula's robustness, which leads."""
+"""The value of these signals if all is well; it exceeds the robustness of any formula."""
 Ranges = Mapping[str, tuple[float, float]]
 """The range within which each signal must stay."""
 Cells = Mapping[str, tuple[float, float, int]]
@@ -39,11 +39,11 @@ Cells = Mapping[str, tuple[float, float, int]]
 CELLS_OF_A_RANGE = 4
 """Default number of cells of a signal with a range."""
 MAX_CUT = 4
-"""Signals with ranges that are divided into cells by default, at most."""
+"""Maximum number of signals with ranges that are divided into cells by default."""
 
 
 class CheckedSystem(System):
-    """A system whose traces also tell whether the simulation ended properly, with finite signals.
+    """A system whose traces also show whether the simulation ended properly, with finite signals.
 
     **Arguments:**
     - `system`: the system.
@@ -190,7 +190,7 @@ class CheckedSystem(System):
 
 
 def _unchecked(trace: Trace) -> Trace:
-    """Return a copy of a batch of traces, which a `Trace` would check as one."""
+    """Return a copy of a batch of traces without the checks of `Trace`, which expects one trace."""
     copy = object.__new__(Trace)
     for name, value in vars(trace).items():
         object.__setattr__(copy, name, value)

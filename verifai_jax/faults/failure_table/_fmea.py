@@ -1,9 +1,9 @@
-"""Failure modes and effects of faults: each alone, and in pairs where neither fails alone.
+"""Failure modes and effects of single faults, and of pairs whose faults cause no failure alone.
 
 print(fmea(problem, [vj.faults.Dropout("gyro", onset=vj.Box(0, 3), duration=vj.Box(0, 1))]))
 
-All faults are features of one problem, so that one program simulates every row; all but the
-faults of a row are off.
+All faults are features of one problem, so one program simulates every row. In a row all other
+faults are off.
 """
 
 import itertools
@@ -54,30 +54,31 @@ def fmea(
     target: str | None = None,
     progress: bool | None = None,
 ) -> FailureTable:
-    """Make the failure table of a system: what each fault does, and how probable that is.
+    """Make the failure table of a system: the effect and the probability of each fault.
 
     **Arguments:**
     - `problem`: a problem, whose own features stay nominal.
-    - `faults`: the faults of `vj.faults`, in addition to those that the problem has. Each has to
-      have a number at which it is off, such as `duration=vj.Box(0, 2)`.
-    - `rate`: occurrences in an hour, of each fault or by its name; `mission_time` in hours. A fault
-      then happens with probability `1 - exp(-rate * mission_time)`, one independent of the other.
-      Without them probabilities are those given that it happens.
-    - `samples`: of each fault, and of each pair, from the prior of its numbers.
-    - `budget`: the budget of the search for failures where no or few samples fail, and half of that
-      of the estimate where few do; 0 for neither.
-    - `pairs`: whether pairs are tried of those faults that never fail alone.
+    - `faults`: faults of `vj.faults`, which are added to those of the problem. Each fault needs a
+      varying number that can switch it off, such as `duration=vj.Box(0, 2)`.
+    - `rate`: occurrences per hour: one number for all faults, or a dictionary by name;
+      `mission_time` in hours. A fault then happens with probability `1 - exp(-rate *
+      mission_time)`, independently of other faults. Without a rate, probabilities are conditional
+      on the fault.
+    - `samples`: number of samples of each fault and of each pair, from the prior.
+    - `budget`: number of simulations of the search that runs if no or few samples fail, and half
+      the budget of the estimate that runs if few samples fail; 0 switches off both.
+    - `pairs`: whether to try pairs of the faults that cause no failure alone.
     - `confidence`: the confidence of each interval.
     - `seed`: the seed of everything that is drawn at random.
-    - `folder`: that keeps the counterexamples as a run, and what is simulated: a table that was cut
-      off goes on there.
-    - `executor`: whose workers simulate, as in `falsify`.
-    - `target`: `FILE.py:NAME` of the problem with its faults, for the commands that replay.
+    - `folder`: the folder of the counterexamples (a run) and of finished simulations; the same call
+      continues an interrupted table there.
+    - `executor`: an executor whose workers simulate, as in `falsify`.
+    - `target`: `FILE.py:NAME` of the problem with its faults, for the replay commands.
     - `progress`: whether to show one line of progress; see `core.display.progress` for the default.
     **Returns:** the table, the most probable failure first. Ctrl-C ends the call; with `folder` it
     may be repeated.
-    **Raises:** `ValueError` for no fault, one that cannot be off, rates out of range or without a
-    mission time; as `Problem.with_faults`.
+    **Raises:** `ValueError` without faults, for a fault that cannot be switched off, for rates out
+    of range or without a mission time; the errors of `Problem.with_faults`.
     """
     started = time.perf_counter()
     faulty = problem.with_faults(*faults) if faults else problem
@@ -130,7 +131,7 @@ def fmea(
 def _run_of(
     rows: Rows, points: list[Points], folder: str | Path | None, target: str | None
 ) -> Run | None:
-    """Simulate the failing points of all faults as one run; None without any."""
+    """Simulate the failing points of all faults as one run; None without failing points."""
     failing = np.concatenate(points)
     if not len(failing):
         return None
@@ -148,7 +149,7 @@ def _run_of(
 def _faults_of(problem: Problem) -> dict[str, Fault]:
     """Return the faults of a problem by name.
 
-    **Raises:** `ValueError` for none, and for one that cannot be off.
+    **Raises:** `ValueError` without faults, and for a fault that cannot be switched off.
     """
     known: dict[str, Fault] = {}
     for name, domain in problem.space.domains.items():
@@ -160,8 +161,8 @@ def _faults_of(problem: Problem) -> dict[str, Fault]:
         if weakest.get("duration") != 0 and weakest.get(fault.severity) != fault.off:
             at = ", ".join(f"{number} {value:zg}" for number, value in weakest.items())
             raise ValueError(
-                f"fault {name!r} cannot be off, at its weakest ({at}) neither: let it be short, "
-                "with duration=vj.Box(0, ...)"
+                f"fault {name!r} cannot be switched off, not even at its weakest ({at}): allow a "
+                "duration of 0, with duration=vj.Box(0, ...)"
             )
         known[name] = fault
     if not known:

@@ -17,18 +17,18 @@ from verifai_jax.faults.fault import Fault
 from verifai_jax.mtl import robustness_signal
 
 DIFFERS = 0.05
-"""Share of the range of a signal by which it has to differ before it shows a fault."""
+"""Share of a signal's range; a smaller difference does not show a fault."""
 
 
 def with_counterexample(
     effect: Effect, run: Run, verdicts: Mapping[int, str], faults: Mapping[str, Fault]
 ) -> Effect:
-    """Return an effect with its counterexample, and with what that shows.
+    """Return an effect completed with its counterexample and the details that it shows.
 
     **Arguments:**
-    - `run`: the run of the table; `verdicts`: of the confirmation, by row, of the failures of this
-      fault or pair, the least severe first.
-    - `faults`: all of them by name.
+    - `run`: the run of the table; `verdicts`: verdicts of the confirmation by row, for the failures
+      of this fault or pair, the least severe first.
+    - `faults`: all faults by name.
     """
     # The first that is confirmed; without one, the first that fails at all.
     row = min(verdicts, key=lambda row: verdicts[row] != "confirmed", default=None)
@@ -53,7 +53,7 @@ def with_counterexample(
 
 
 def _violation(again: Replay, onset: float) -> float:
-    """Return when the predicate that decides is first broken after the onset, in seconds."""
+    """Return the seconds from the onset to the first violation of the deciding predicate."""
     why = again.explain()
     trace = why.trace.finely()
     clock = np.asarray(trace.clock())
@@ -64,7 +64,7 @@ def _violation(again: Replay, onset: float) -> float:
 
 
 def _first_difference(trace: Trace, without: Trace) -> tuple[str, float]:
-    """Return the signal that differs first, of several the one that differs more, and when."""
+    """Return the signal that differs first, and when; of several, the one that differs more."""
     clock, found = np.asarray(trace.clock()), []
     for name, signal in trace.signals.items():
         other = np.asarray(without.signals[name], float)

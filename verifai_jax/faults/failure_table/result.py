@@ -1,4 +1,4 @@
-"""The result of `fmea`: a row for each fault, and for each pair that fails where neither does."""
+"""The result of `fmea`: a row for each fault, and for each pair that fails only together."""
 
 import math
 from collections.abc import Iterator, Mapping
@@ -19,20 +19,21 @@ if TYPE_CHECKING:
 class Effect:
     """The effect of a fault, or of a pair of faults.
 
-    - `faults`: their names.
+    - `faults`: names of the faults.
     - `fails`: whether any simulation with these faults alone breaks the property.
-    - `failures`, `simulations`: the samples of the fault's prior that `probability` rests on.
-    - `undecided`: those among them without a verdict.
-    - `severity`: the lowest at which it fails, by the name of the number; empty if it never does.
+    - `failures`, `simulations`: counts of the samples of the prior that `probability` rests on.
+    - `undecided`: number of these samples without a verdict.
+    - `severity`: the lowest severity that fails, by the name of the number; empty without failures.
     - `row`: the row of the counterexample in the run of the table; None if there is none.
-    - `verdict`: the verdict of the confirmation of that counterexample, see `vj.confirm`.
-    - `broken`: the name of the formula.
+    - `verdict`: the verdict of `vj.confirm` on that counterexample.
+    - `broken`: the name of the broken formula.
     - `delay`: seconds from the onset to the violation.
-    - `shown_by`: the signal that differs first from the same simulation without the fault;
-      `shown_after`: seconds from the onset until it does.
-    - `occurrence`: probability that it happens in a mission.
-    - `probability`, `low`, `high`: of a mission that fails by it, with the interval.
-    - `command`: what simulates the counterexample again.
+    - `shown_by`: the first signal that differs from the same simulation without the fault;
+      `shown_after`: seconds from the onset to this difference.
+    - `occurrence`: probability that the fault, or the pair, happens in a mission.
+    - `probability`, `low`, `high`: probability that a mission fails because of it, and its
+      interval.
+    - `command`: the command that simulates the counterexample again.
     """
 
     faults: tuple[str, ...]
@@ -55,12 +56,12 @@ class Effect:
 
     @property
     def name(self) -> str:
-        """The names of the faults, as one."""
+        """The names of the faults, joined into one text."""
         return " + ".join(self.faults)
 
     @property
     def severity_text(self) -> str:
-        """The lowest severities at which it fails."""
+        """The lowest severities that fail, as text."""
         return ", ".join(f"{name} {value:z.4g}" for name, value in self.severity.items())
 
     @property
@@ -99,10 +100,10 @@ class FailureTable(Drawn, Reported, Tabular):
     - `effects`: the rows.
     - `run`: the counterexamples as a run, for `replay`, `explain` and `confirm`; None if no fault
       fails.
-    - `rate`: the rate of each fault, in an hour; `mission_time`: in hours; None for probabilities
-      of a failure given that the fault happens.
+    - `rate`: the rate of each fault per hour; `mission_time`: in hours; both None if probabilities
+      are conditional on the fault.
     - `confidence`: the confidence of each interval.
-    - `healthy`: whether the nominal features without a fault keep the property.
+    - `healthy`: whether the property holds for the nominal features without a fault.
     - `seconds`: wall-clock time.
     """
 
@@ -126,7 +127,7 @@ class FailureTable(Drawn, Reported, Tabular):
     def __getitem__(self, name: str) -> Effect:
         """Return the row of a fault, or of a pair: `table["gyro_bias + motor_stuck"]`.
 
-        **Raises:** `UnknownNameError` for a fault that has none.
+        **Raises:** `UnknownNameError` for a name without a row.
         """
         rows = {each.name: each for each in self.effects}
         check_names("row of the failure table", [name], rows)

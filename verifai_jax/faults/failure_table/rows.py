@@ -23,21 +23,19 @@ from verifai_jax.statistics.binomial import clopper_pearson
 if TYPE_CHECKING:
     from verifai_jax.core.compute.executors import Executor
 LEVELS = 33
-"""Severities on one line at once; two lines, one within the other, resolve a thousandth."""
+"""Severities simulated at once; a second grid within one interval of the first resolves 1/1000."""
 FOLLOWED = 6
-"""Failing samples of a fault whose severity is lowered."""
+"""Number of failing samples of a fault whose severity is lowered."""
 FEW = 10
-"""Failing samples below which a search looks for others, and importance sampling or splitting
-estimates the probability."""
+"""With fewer failing samples a search looks for more, and another estimator is used."""
 TRIED = 32
-"""Failing samples that are simulated again with the lowered ones: at the edge of failure another
-step, or another random key, may decide otherwise."""
+"""Failing samples simulated again with the lowered ones, whose verdicts are less stable."""
 Points = Float[np.ndarray, "n d"]
 
 
 @dataclass(eq=False)
 class Rows:
-    """Simulations of one problem with all faults; what was simulated before is remembered."""
+    """Simulations of one problem with all faults; repeated points are simulated only once."""
 
     problem: Problem
     faults: Mapping[str, Fault]
@@ -53,11 +51,11 @@ class Rows:
         self._count = 0
 
     def coordinate(self, fault: str, number: str) -> int:
-        """Return the coordinate of a number of a fault."""
+        """Return the index of the coordinate of one number of a fault."""
         return int(self.groups[fault][list(self.faults[fault].domains).index(number)])
 
     def __call__(self, what: str, points: Points) -> tuple[np.ndarray, np.ndarray]:
-        """Simulate points; return which violate the property, and which have a verdict."""
+        """Simulate points; return flags of the violations, and of the rows with a verdict."""
         points = self.nominal.settle(points)
         first, self._count = self._count, self._count + len(points)
 
@@ -69,9 +67,10 @@ class Rows:
         return known["violated"], known["proper"]
 
     def try_out(self, names: tuple[str, ...], samples: int, budget: int) -> tuple[Effect, Points]:
-        """Sample a fault or a pair, search where few samples fail, and lower what fails.
+        """Sample a fault or a pair, search for more failures if few, and lower their severity.
 
-        **Returns:** the effect as far as it is known, and failing points, the least severe first.
+        **Returns:** the effect without the parts of its counterexample, and failing points, the
+        least severe first.
         """
         points = np.repeat(self.nominal.u[None], samples, axis=0)
         for name in names:
@@ -120,7 +119,7 @@ class Rows:
         return self.cache.remember(f"search/{'+'.join(names)}", searched)["points"]
 
     def _lowered(self, names: Sequence[str], failing: Points) -> Points:
-        """Return failing points, first those with a severity as low as they still fail at."""
+        """Return failing points with their severity lowered as far as they fail, lowest first."""
         home, faults = self.nominal.u, self.faults
         index = np.array([self.coordinate(name, faults[name].grade) for name in names])
 

@@ -1,4 +1,4 @@
-"""Compositional falsification: the loop without images first, then single images, then the loop.
+"""Compositional falsification: the loop without images, then single images, then the full loop.
 
     result = vj.perception.abstract(
         problem,                                        # the loop with its network
@@ -65,19 +65,19 @@ def abstract(
     images_per_simulation: int | None = None,
     progress: bool | None = None,
 ) -> result.Compositional:
-    """Find failures of a loop that its perception causes, rendering few images.
+    """Find failures of a loop caused by its perception, while rendering few images.
 
     Three stages:
 
     1. The loop is simulated without images: once with a perfect perception, and once with the worst
-    allowed one. Where it fails only with the worst one is the *region of uncertainty*: only there
-    can an error of the perception decide. For each of its points, bisection finds the smallest
-    error with which the loop fails. 2. In the region, a search looks for images on which the
-    network errs. One image is rendered for each point: from the last instant at which the
+    allowed one. The *region of uncertainty* contains the points that fail only with the worst one:
+    only there can an error of the perception decide. For each of its points, bisection finds the
+    smallest error with which the loop fails. 2. In the region, a search looks for images on which
+    the network errs. One image is rendered for each point: from the last instant at which the
     perception must err for the loop to fail. 3. Points with such an image are simulated with the
     network in the loop, those with the largest error first. Only points that fail there are
-    failures. After each batch of images at most as many images are spent on such simulations, but
-    at least one simulation.
+    failures. After each batch of images, such simulations may use as many images as the batch, but
+    at least one simulation is made.
 
     Failures outside the region, which need a larger error than allowed, are not searched for.
     Images that only fill up a compiled batch are not counted.

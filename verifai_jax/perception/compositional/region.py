@@ -1,4 +1,4 @@
-"""The region of uncertainty: where the error of a perception can decide whether the loop fails.
+"""The region of uncertainty, in which the error of a perception can decide whether the loop fails.
 
     loop = AbstractLoop(problem, abstraction, error, seed=0)
     region = sample_region(loop, samples=4096)          # a row for each sample: kind, severity

@@ -1,4 +1,4 @@
-"""The result of a compositional falsification, and what it says in words.
+"""The result of a compositional falsification, and its summary.
 
 result.region, result.candidates        tables
 result.frames                           images rendered at each stage
@@ -38,10 +38,10 @@ class Compositional(InNotebook):
       `erring`, the number of instants at which the perception then errs, NaN unless uncertain.
     - `images`: the run that looked for images; None if nothing is uncertain.
     - `simulations`: a run with the simulations of candidates.
-    - `candidates`: a row for each image on which the network errs: features; `image`, how far it
-      errs (minus the robustness of `error`); `simulated`, the status of its simulation with the
-      network, empty if there was none; `rho` and `fails` of that; `rendered`, the total number of
-      images rendered until then.
+    - `candidates`: a row for each image on which the network errs: features; `image`, the size of
+      its error (minus the robustness of `error`); `simulated`, the status of its simulation with
+      the network, empty if there was none; `rho` and `fails` of that; `rendered`, the total number
+      of images rendered until then.
     - `images_per_simulation`: number of images rendered in one simulation.
     - `budget`, `search`, `seed`: the arguments of the call.
     - `ended`: `"found"`, `"budget"`, `"nothing uncertain"`, `"interrupted"`, or another reason why

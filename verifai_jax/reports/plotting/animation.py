@@ -1,4 +1,4 @@
-"""A simulation as an animated GIF: MuJoCo's picture of it, or what the problem draws itself."""
+"""A simulation as an animated GIF, drawn by MuJoCo or by the problem itself."""
 
 import base64
 import io

@@ -1,4 +1,4 @@
-"""The picture of a region of uncertainty: where the error of a perception can decide."""
+"""The picture of a region of uncertainty, in which the error of a perception can decide."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""Coverage of an automaton as a picture: which transition followed which, and which never did."""
+"""Coverage of an automaton as a picture: pairs of transitions that occurred, or never did."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""The picture of a failure table: how probable the failure by each fault is."""
+"""The picture of a failure table: the probability of a failure by each fault."""
 
 from pathlib import Path
 

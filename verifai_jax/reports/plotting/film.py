@@ -1,4 +1,4 @@
-"""Films of pictures: which samples they show, what is written above them, and the GIF itself."""
+"""Films of pictures: their samples, captions, and the GIF itself."""
 
 import io
 from collections.abc import Sequence

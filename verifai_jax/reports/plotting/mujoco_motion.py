@@ -1,4 +1,4 @@
-"""Where the bodies of a MuJoCo model were in a simulation: by MuJoCo itself, MJX, or Brax.
+"""Positions of a MuJoCo model's bodies in a simulation by MuJoCo itself, MJX, or Brax.
 
 motion = record(replay)                        # the model of these features, and where it was
 """

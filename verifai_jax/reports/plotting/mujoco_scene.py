@@ -3,12 +3,11 @@
     motion = record(replay)                        # the model of these features, and where it was
     film(motion, "worst.gif"); strip(motion, "worst-strip.png")
 
-MuJoCo draws with OpenGL. Without a screen that is EGL (a GPU's driver, or Mesa's) or OSMesa, named
-by the environment variable `MUJOCO_GL`. Where nothing is named and there is no display, EGL is
-used.
+MuJoCo draws with OpenGL. Without a screen it uses EGL (from a GPU's driver, or Mesa) or OSMesa, as
+chosen by the environment variable `MUJOCO_GL`; by default EGL.
 
 The cameras of a model are made for its task, and may look at a wall. So each of them, and further
-ones made for the motion, is tried on a few small pictures; the film uses the one that shows the
+cameras made for the motion, draws a few small pictures; the film uses the camera that shows the
 moving parts large and completely.
 """
 

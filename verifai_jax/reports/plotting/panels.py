@@ -1,4 +1,4 @@
-"""Samples over two features, and the boxes that rules make there."""
+"""Samples over two features, with the boxes of rules."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""One simulation: its signals, the bounds they must keep, and the instant that decided."""
+"""One simulation: its signals, their bounds, and the deciding instant."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -73,7 +73,7 @@ def plot_replay(
     if signals is not None:
         check_names("signal", signals, ordered)
         if not signals:
-            raise ValueError("signals names what is drawn; got none")
+            raise ValueError("signals must name at least one signal to draw; got none")
     needed = len(monitored) + min(len(inputs), MAX_INPUTS)
     shown = list(signals or ordered[: max(MAX_PANELS, needed)])
     name = replay.worst

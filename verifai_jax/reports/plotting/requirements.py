@@ -1,4 +1,4 @@
-"""Pictures about requirements: the front of mined parameters, examples, traces that tell apart."""
+"""Pictures about requirements: fronts of mined parameters, examples, distinguishing traces."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""The feature space with its safe and failing samples, two features a panel."""
+"""The feature space with its safe and failing samples, two features in each panel."""
 
 from itertools import combinations
 from pathlib import Path

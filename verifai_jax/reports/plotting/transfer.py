@@ -1,4 +1,4 @@
-"""The picture of a policy in two engines: the pair that parts most, and the gaps of all pairs."""
+"""The picture of a policy in two engines: the pair with the largest gap, and all gaps."""
 
 from pathlib import Path
 

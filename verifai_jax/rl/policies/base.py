@@ -192,7 +192,7 @@ class Policy:
             example = getattr(self.compute, "example", None)
             observation = None if example is None else example(self.weights)
         if observation is None:
-            raise PolicyError("the policy does not say what it observes: give observation= too")
+            raise PolicyError("the policy does not define its input: give an example, observation=")
         seen = jax.tree.map(lambda o: np.asarray(o, np.float32), observation)
         parts = (self.weights, self.normaliser)
 

@@ -1,11 +1,9 @@
 """The error of a policy that cannot be loaded."""
 
 MAX_BYTES = 150_000_000
-"""Bytes of a file, and of what is unpacked of it. A policy for control has a thousandth; a
-file that says more is damaged, or means to fill the memory."""
+"""Maximum bytes of a file, also after unpacking; policies for control have a thousandth."""
 MAX_NUMBERS = 2**24
-"""Numbers that a graph computes for one observation, at most. That of a policy computes a
-hundredth; a graph of a few bytes can ask for any number of them."""
+"""Maximum count of numbers that a graph computes for one observation; policies need 1 %."""
 
 
 class PolicyError(ValueError):

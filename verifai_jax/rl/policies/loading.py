@@ -1,8 +1,7 @@
-"""One door for policies that somebody else has trained.
+"""The function that loads policies trained with any framework.
 
-policy("ppo.zip")                                       # Stable-Baselines3
-policy("walk.onnx")                                     # whatever exports ONNX
-policy("actor.safetensors", activation="elu")           # weights, and what they are of
+policy("ppo.zip")                                       # Stable-Baselines3 policy("walk.onnx")
+# whatever exports ONNX policy("actor.safetensors", activation="elu")           # weights of an MLP
 policy(torch_module, observation=np.zeros(48))
 """
 
@@ -159,7 +158,7 @@ def _of_file(
 def _stored_graph(data: bytes, path: Path) -> tuple[Any, dict[str, np.ndarray]] | None:
     """Return the graph and the arrays of a file of `Policy.save`; None for another file.
 
-    **Raises:** `PolicyError` for one that is damaged.
+    **Raises:** `PolicyError` for a damaged file.
     """
     try:
         if path.suffix.lower() == ".npz":
@@ -192,7 +191,7 @@ def _safetensors(data: bytes, path: Path) -> dict[str, np.ndarray]:
 
 
 class _Given:
-    """The function of weights and a network that somebody wrote."""
+    """The function of a user's own network and its weights."""
 
     def __init__(self, network: Network) -> None:
         self.network = network
@@ -208,7 +207,7 @@ def _of_weights(
     layers: Sequence[str] | None,
     what: str,
 ) -> Policy:
-    """Return the policy of weights whose network is stated."""
+    """Return the policy of weights with a given network."""
     if (activation is None) == (network is None):
         raise PolicyError(
             f"{what} contains weights but no network: give activation= for an MLP, or "

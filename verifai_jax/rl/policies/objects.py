@@ -1,4 +1,4 @@
-"""Policies of objects: models and functions of other frameworks, in JAX where they can be.
+"""Policies of objects: models and functions of other frameworks, in JAX if possible.
 
 policy = from_object(model, observation=np.zeros(8))
 """
@@ -130,9 +130,9 @@ class _Rebuilt:
 
 @dataclass(frozen=True, eq=False)
 class _Function:
-    """A Python function: traced by JAX where it can be, otherwise called on the host.
+    """A Python function: traced by JAX if possible, otherwise called on the host.
 
-    - `batched`: on the host it takes a batch of observations at a time.
+    - `batched`: whether the function takes a batch of observations on the host.
     """
 
     function: Callable[..., Any]
@@ -165,9 +165,9 @@ class _Function:
         return jax.tree.map(_plain, without_extras(self.function(seen)))
 
     def _form(self, observation: PyTree, error: Exception) -> Any:
-        """Return the form of the action on the host, and say what it costs.
+        """Return the form of the action on the host, and log the time of a call.
 
-        **Raises:** what the function raises there.
+        **Raises:** the errors of the function.
         """
         zeros = jax.tree.map(lambda o: np.zeros(jnp.shape(o), jnp.result_type(o)), observation)
         begun = time.perf_counter()
@@ -183,7 +183,7 @@ class _Function:
 
 
 def _plain(value: Any) -> np.ndarray:
-    """Return a number or array of any framework as one of NumPy that JAX takes."""
+    """Return a number or array of any framework as a NumPy value that JAX accepts."""
     value = value.detach().cpu().numpy() if hasattr(value, "detach") else value
     array = np.asarray(value)
     return array.astype(jax.dtypes.canonicalize_dtype(array.dtype))
@@ -200,7 +200,7 @@ def _of_sb3(model: Any) -> Policy:
 
 
 def _of_torch(module: Any, observation: ArrayLike | None, batched: bool) -> Policy:
-    """Return a module of PyTorch by way of ONNX, or as a function of the host."""
+    """Return a module of PyTorch, translated by ONNX, or as a function of the host."""
     if observation is None:
         raise PolicyError("for a torch module give observation= as well, an example of its input")
     torch = require("torch", extra="policies")
@@ -227,9 +227,9 @@ def _of_torch(module: Any, observation: ArrayLike | None, batched: bool) -> Poli
 def _translated(
     torch: Any, module: Any, example: np.ndarray, on_host: Callable[..., Any]
 ) -> Policy:
-    """Return a module of PyTorch in JAX, compared with itself.
+    """Return a module of PyTorch in JAX, after comparing its outputs with PyTorch's.
 
-    **Raises:** `ValueError` where they differ: an exporter follows one branch of each decision.
+    **Raises:** `ValueError` if they differ, for an exporter follows only one branch of a condition.
     """
     file = io.BytesIO()
     # It prints the whole graph where it fails.

@@ -2,7 +2,7 @@
 
 policy = read_onnx("walk.onnx")
 
-Weights are a pytree; integers that say shapes and indices stay numbers, so that JAX compiles with
+Weights are a pytree; integers for shapes and indices stay constants, so that JAX compiles with
 fixed shapes. Source: the ONNX specification, `docs/IR.md` and `docs/Operators.md`.
 """
 
@@ -147,7 +147,8 @@ def run(nodes: Sequence[Node], values: Values) -> None:
 def _check_size(node: Node, count: int) -> None:
     if count > MAX_NUMBERS:
         raise PolicyError(
-            f"with {node} the graph computes {count:z.3g} numbers, and one of a policy may compute "
+            f"with {node} the graph computes {count:z.3g} numbers; the graph of a policy may "
+            "compute at most "
             f"{MAX_NUMBERS:,}"
         )
 
@@ -326,7 +327,7 @@ def _attribute(attribute: Any, opset: int, known: set[str], path: Path | None, w
 
 
 def _tensor(tensor: Any, path: Path | None, what: str) -> np.ndarray:
-    """Return a tensor of the model, from the file next to it where it is kept there."""
+    """Return a tensor of the model, which may be stored in a file next to it."""
     package = require("onnx", extra="policies")
     try:
         if tensor.data_location == package.TensorProto.EXTERNAL:
@@ -347,7 +348,7 @@ def _tensor(tensor: Any, path: Path | None, what: str) -> np.ndarray:
 
 
 def _external(tensor: Any, path: Path | None) -> np.ndarray:
-    """Read a tensor that is kept in a file of the model's own folder.
+    """Read a tensor that is stored in a file of the model's own folder.
 
     **Raises:** `ValueError` for a file elsewhere, or one that is too small.
     """
@@ -372,14 +373,14 @@ def _external(tensor: Any, path: Path | None) -> np.ndarray:
 
 
 def _shape(value: Any) -> tuple[int, ...]:
-    """Return the shape of an input or output; a size that is left open is 1."""
+    """Return the shape of an input or output, with 1 for an unspecified size."""
     return tuple(int(d.dim_value) or 1 for d in value.type.tensor_type.shape.dim)
 
 
 def _memory(
     fed: Sequence[Any], made: Sequence[Any], stated: Mapping[str, str] | None
 ) -> list[tuple[str, str]]:
-    """Return the inputs that are memory with the outputs that are their next values."""
+    """Return pairs of a memory input and the output with its next value."""
     if stated is not None:
         check_names("input of the network", stated, [i.name for i in fed])
         check_names("output of the network", stated.values(), [o.name for o in made])

@@ -26,12 +26,12 @@ def layer_normalization(node: Node, x: Value, scale: Value, bias: Value | None =
 
 
 def _across(x: Value, vector: Value) -> Value:
-    """Return one number a channel in the form of a batch of them."""
+    """Reshape one number per channel so that it broadcasts over a batch."""
     return jnp.reshape(vector, (1, -1) + (1,) * (x.ndim - 2))
 
 
 def channel_normalization(node: Node, x: Value, scale: Value, b: Value, *moments: Value) -> Value:
-    """Return channels divided by their stored deviation, or by that of each image."""
+    """Return channels normalised by their stored deviation, or by the deviation of each image."""
     node.refuse(node.get("training_mode", 0), IN_TRAINING)
     if moments:
         mean, variance = (_across(x, v) for v in moments)

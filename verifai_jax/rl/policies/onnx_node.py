@@ -1,4 +1,4 @@
-"""One operation of a graph of ONNX, and what its operators have in common."""
+"""One operation of a graph of ONNX, with the functions that all operators use."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -11,15 +11,14 @@ from jaxtyping import Array
 from verifai_jax.rl.policies.errors import PolicyError
 
 Value: TypeAlias = Array
-"""A value of a graph. Where it is known before the observation, an array of NumPy takes its place,
-which has the same operations."""
+"""A value of a graph; a NumPy array, with the same operations, if it needs no observation."""
 
 
 @dataclass(frozen=True, eq=False)
 class Node:
     """One operation of a graph.
 
-    - `operator`, `name`: those in the file.
+    - `operator`, `name`: operator and name in the file.
     - `inputs`, `outputs`: names of values; an omitted input is empty.
     - `attributes`: plain values, arrays, and subgraphs as `(nodes, outputs)`.
     - `opset`: version of the operators.

@@ -4,7 +4,7 @@
     data["obs_rms"].state["mean"]
 
 Checkpoints of PyTorch and files of Stable-Baselines3 hold pickles, whose format is a program that
-may call any function. This reader follows the program and writes down what it would call.
+may call any function. This reader follows the program and records the calls without making them.
 Source: Python's `pickletools`, which names and describes the operations.
 """
 
@@ -53,7 +53,7 @@ _MARK = object()
 
 
 class _Stack(list[Any]):
-    """The stack of a pickle's program, with what it remembers by number."""
+    """The stack of a pickle's program, with its numbered memory."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -86,7 +86,7 @@ class _Stack(list[Any]):
             self[-1].state = state
 
     def add(self, values: list[Any]) -> None:
-        """Append values to the list on top; an object is not asked to append anything."""
+        """Append values to the list or record on top; no method of an object is called."""
         if isinstance(self[-1], list):
             self[-1].extend(values)
 
@@ -134,7 +134,7 @@ _OPERATIONS: dict[str, Callable[[_Stack, Any], object]] = {
     "BUILD": lambda s, a: s.build(),
     "BINPERSID": lambda s, a: s.append(Persistent(s.pop())),
 }
-"""What each operation does with the stack and its own argument; others push their argument."""
+"""The action of each operation on the stack; an operation not listed pushes its argument."""
 
 
 def read_pickle(data: bytes, what: str) -> Any:

@@ -184,7 +184,7 @@ def _network(
 
 
 def _actions(acts: tuple[str, dict[str, Any]], squashed: bool, what: str) -> Actions:
-    """Return how outputs become an action of the space."""
+    """Return the conversion of outputs to an action of the space."""
     kind, space = acts
     if kind == "Discrete":
         if int(_number(space.get("start", 0), "start", what)) != 0:

@@ -97,7 +97,7 @@ def _collect(value: Any, name: str, found: dict[str, np.ndarray], read: Any, dep
 
 
 def _tensor(value: Any, read: Any, name: str) -> np.ndarray | None:
-    """Return what is pickled as `_rebuild_tensor_v2(storage, offset, size, stride, ...)`."""
+    """Return the tensor pickled as `_rebuild_tensor_v2(storage, offset, size, stride, ...)`."""
     if not isinstance(value, Record) or not isinstance(value.function, Name):
         return None
     if value.function.name == "_rebuild_parameter":

@@ -2,9 +2,9 @@
 
 graph, weights, memory = traced(policy.compute, policy.weights, np.zeros(4), None)
 
-A function is traced, and each operation of JAX becomes operators of ONNX. So whatever JAX computes
-can be saved: networks of flax and equinox, policies of Brax, scales, squashing and memory. It is
-our own, because jax2onnx translates models of named libraries, and pins the versions of several.
+A function is traced, and each operation of JAX becomes operators of ONNX. This covers networks of
+flax and equinox, policies of Brax, scales, squashing and memory. The existing jax2onnx is not used,
+because it only translates models of certain libraries and pins their versions.
 """
 
 import math
@@ -108,7 +108,7 @@ def traced(
 
 
 class _Translation:
-    """Nodes that are made one after the other; a value is the name of one, or a known array."""
+    """The nodes of a graph under construction; a value is a node's name, or a known array."""
 
     def __init__(self, arrays: dict[str, np.ndarray]) -> None:
         self.arrays, self.nodes = arrays, list[Node]()
@@ -227,7 +227,7 @@ class _Translation:
     ) -> str:
         """Return the output of an operation that is not a call.
 
-        **Raises:** `NotImplementedError` for one without a translation.
+        **Raises:** `NotImplementedError` for an operation without a translation.
         """
         node, x = self.node, given[0]
         real = shapes[0].dtype
@@ -317,7 +317,7 @@ class _Translation:
     def product(
         self, given: list[Value], numbers: Jaxpr, shape: Sequence[int], shapes: list[Jaxpr]
     ) -> str:
-        """Return a product over any axes, as one of matrices `[b, m, k]` and `[b, k, n]`."""
+        """Return a product over any axes, as a product of matrices `[b, m, k]` and `[b, k, n]`."""
         contracted, batch = numbers
         sides, free = [], []
         for i, last in ((0, True), (1, False)):
@@ -354,7 +354,7 @@ class _Translation:
         return self.node("Transpose", [made], perm=tuple(int(i) for i in np.argsort(out)))
 
     def pooling(self, kind: str, x: Value, options: Mapping[str, Any], real: np.dtype[Any]) -> str:
-        """Return the greatest or the sum of each window over all axes but two."""
+        """Return the maximum or the sum of each window, over all axes except two."""
         window = options["window_dimensions"]
         still = [i for i, n in enumerate(window) if n == 1][:2]
         moved = [i for i in range(len(window)) if i not in still]
@@ -381,7 +381,7 @@ class _Translation:
 
 
 def _known(value: Any) -> Any:
-    """Return a value that does not depend on inputs as NumPy's; a random key has no such form."""
+    """Return a value that depends on no input as a NumPy array; random keys stay as they are."""
     is_key = jnp.issubdtype(getattr(value, "dtype", np.bool_), jax.dtypes.prng_key)
     return value if is_key else np.asarray(value)
 

@@ -3,7 +3,7 @@
     train(brax_task("inverted_pendulum", backend="generalized"), PPO(normalise=True))
     train(brax_task(MyEnvironment(), time_limit=200), PPO())
 
-`brax.training` is not needed, and does not work with the JAX that is pinned here.
+`brax.training` is not needed, and does not work with the JAX version pinned here.
 """
 
 import functools
@@ -138,4 +138,4 @@ def _checked(
 
 
 _by_name = functools.cache(_checked)
-"""One object for one name, so that programs compiled for it are found again."""
+"""The same object for the same name, so that its compiled programs are reused."""

@@ -4,8 +4,8 @@
     train(gymnax_task("Reacher-misc", time_limit=50), PPO())
     train(gymnax_task(MyEnvironment(), params=MyParams(mass=2.0)), PPO())
 
-Its own reset and step are used, without its reset at the end; its time limit cuts episodes off and
-does not end them, as `Task` asks.
+The environment's own reset and step are used, but no automatic reset. Its time limit truncates
+episodes and does not terminate them, as `Task` requires.
 """
 
 import dataclasses
@@ -129,7 +129,7 @@ def _checked(env: "str | Environment", params: PyTree = None) -> Gymnax:
 
 
 _by_name = functools.cache(_checked)
-"""One object for one id, so that programs compiled for it are found again."""
+"""The same object for the same id, so that its compiled programs are reused."""
 
 
 def _action_adapter(env: "Environment", params: PyTree) -> stepping.ActionAdapter:

@@ -146,7 +146,8 @@ def ode_task(
       one compiled training.
     **Returns:** a task; its states are `OdeState`.
     **Raises:** `ValueError` for a loop with a traced step, discrete actions without `control`,
-    weights that are not numbers or whose names are taken, and functions that do not fit together.
+    weights that are not numbers or have the name of a field, and functions that do not fit
+    together.
     """
     if not isinstance(loop, Ode):
         raise ValueError(f"loop must be made by ode(...); got {outline(loop)}")
@@ -195,7 +196,7 @@ def _check_weights(weights: Mapping[str, float]) -> None:
         if not name.isidentifier() or keyword.iskeyword(name) or hasattr(OdeTask, name):
             raise ValueError(f"a weight's name must be an identifier of its own; got {name!r}")
         if name in taken:
-            raise ValueError(f"{name!r} cannot be a weight; taken are {', '.join(taken)}")
+            raise ValueError(f"{name!r} cannot be a weight; reserved: {', '.join(taken)}")
         if not is_number(value) or not math.isfinite(value):
             raise ValueError(f"weight {name} must be a finite number; got {value!r}")
 
@@ -218,7 +219,7 @@ def _check_reward(reward: Reward, weights: Mapping[str, float]) -> None:
 
 @functools.cache
 def _with_weights(names: tuple[str, ...]) -> type[OdeTask]:
-    """Return a kind of task with a field for each weight: its leaves as a pytree."""
+    """Return a task class with a field for each weight; these fields are its pytree leaves."""
     static = [field.name for field in dataclasses.fields(OdeTask)]
     made = dataclasses.make_dataclass(
         "OdeTask",

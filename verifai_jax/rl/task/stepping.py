@@ -28,8 +28,9 @@ class ActionAdapter(NamedTuple):
     """The policy's kind of action, and its conversion to the environment's: hashable.
 
     - `action`: the kind of action of the policy.
-    - `shape`, `dtype`: those of the environment's action.
-    - `low`, `high`: bounds of each entry, if they differ and the policy acts in [-1, 1].
+    - `shape`, `dtype`: shape and dtype of the environment's action.
+    - `low`, `high`: bounds of each entry; only given if they differ, and then the policy acts in
+      [-1, 1].
     """
 
     action: Action
@@ -61,7 +62,7 @@ def discrete_actions(n: int, shape: tuple[int, ...], dtype: DTypeLike) -> Action
 def box_actions(
     low: ArrayLike, high: ArrayLike, shape: tuple[int, ...], dtype: DTypeLike, name: str
 ) -> ActionAdapter:
-    """Return the adapter for a box. If its bounds differ the policy acts in [-1, 1].
+    """Return the adapter for a box. If the entries' bounds differ the policy acts in [-1, 1].
 
     **Raises:** `ValueError` for a box without bounds.
     """
@@ -94,7 +95,7 @@ def flat_observation(observation: object, name: str) -> Float[Array, " k"]:
 
 
 def match_types(state: PyTree, following: PyTree, name: str) -> PyTree:
-    """Return a state with the dtypes that a step returns: a count may start as an integer.
+    """Convert a state to the dtypes that a step returns, which may differ from the reset's.
 
     **Arguments:**
     - `following`: the state after a step, or its shapes and dtypes.

@@ -7,7 +7,7 @@
         def step(self, key, state, action): ...             # state, reward, terminated
         def observe(self, state): ...
 
-There is nothing to inherit from: whatever has these members is a task.
+There is no base class: any object with these members is a task.
 """
 
 from dataclasses import dataclass
@@ -70,8 +70,8 @@ class Task(Protocol):
     A task may also define `start(key, features) -> state`, the first state of an episode with given
     features of a problem, which `vj.harden` uses to train on counterexamples.
 
-    The object is a static argument of compiled programs, so it must be hashable, or a pytree, whose
-    numbers are then arguments of the program, so that other values need no compilation.
+    The object is a static argument of compiled programs, so it must be hashable. It may also be a
+    pytree: its numbers are then arguments of the program, and other values need no compilation.
     """
 
     @property

@@ -1,12 +1,12 @@
-"""Any Python function as a system: a simulator that JAX cannot see into.
+"""Any Python function as a system: a simulator that JAX cannot trace.
 
     blackbox(simulate)                               # simulate(features) -> Trace, in this process
     blackbox(simulate, seeded=True)                  # simulate(features, seed) -> Trace
     blackbox(simulate, workers=4, timeout=10.0)      # in four processes, 10 s each at most
     blackbox(simulate, vectorised=True)              # many at a time: every array is [n, ...]
 
-A simulation that raises, hangs or kills its process is a row of the table with a message; it does
-not end the run.
+A simulation that raises, hangs or kills its process becomes a row with a message and does not end
+the run.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence

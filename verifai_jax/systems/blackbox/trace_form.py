@@ -1,4 +1,4 @@
-"""The form of the traces that a simulator declares, to which each of them is held."""
+"""The form of its traces that a simulator declares, checked for each trace."""
 
 import math
 from collections.abc import Mapping, Sequence

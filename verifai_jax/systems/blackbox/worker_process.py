@@ -1,6 +1,6 @@
-"""The worker processes of a black box: what such a process runs, from its start to its end.
+"""The code of a black box's worker processes, from their start to their end.
 
-The pool of `workers.py` starts them, and sends each its function by name: nothing is unpickled.
+The pool of `workers.py` starts them and sends each the name of its function: nothing is unpickled.
 """
 
 import contextlib

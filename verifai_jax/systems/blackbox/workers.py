@@ -1,8 +1,8 @@
 """A pool of processes that simulate: a hang or a crash costs one simulation, not the run.
 
-Each worker is a fresh Python, so that nothing of this process (threads, JAX, locks) is half copied
-into it, and in a session of its own: Ctrl-C reaches this process only, and a worker that is ended
-takes along what it has started.
+Each worker is a new Python process, so no state of this process (threads, JAX, locks) is partly
+copied into it. It has its own session: Ctrl-C reaches only this process, and ending a worker also
+ends the processes that it has started.
 """
 
 import contextlib
@@ -107,7 +107,7 @@ class Pool:
     ) -> Iterator[tuple[int, Outcome]]:
         """Simulate all rows, and yield each index with its outcome as soon as that is known.
 
-        A row that was simulated before goes to another worker than then, if there are several.
+        A row that is simulated again goes to another worker than before, if there are several.
         Workers continue while the caller processes an outcome. If the caller stops, or is
         interrupted, running simulations are ended.
 

@@ -42,7 +42,7 @@ class Brax(PolicyLoop):
 
     @property
     def effort(self) -> XlaOptimization:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """Effort of XLA: with `little` the generalized backend compiles sooner, runs as fast."""
+        """Effort of XLA: with `little` the generalized backend compiles faster and runs as fast."""
         backend = getattr(self.env.unwrapped, "_backend", None)
         return "little" if backend == "generalized" else "most"
 

@@ -1,8 +1,8 @@
-"""One trace of one episode: a policy in the loop around any environment that steps.
+"""One trace of one episode: a policy in the loop with any environment.
 
     rollout(Episode(name, start, step, decide, memory, see, steps=200, dt=0.02), key)
 
-An episode that is over stays frozen where it ended: it is never reset within a trace.
+An episode that is over stays in its final state; it is never reset within a trace.
 """
 
 import inspect
@@ -342,7 +342,7 @@ def step_count(
 
 
 def sampling_period(seconds: object) -> float:
-    """Check a sampling period; one that was float32 becomes the intended decimal number."""
+    """Check a sampling period; a float32 number becomes the decimal number that was meant."""
     value: Any = seconds
     number = isinstance(seconds, int | float | np.number) and not isinstance(seconds, bool)
     if isinstance(seconds, jax.Array | np.ndarray) and np.shape(seconds) == ():

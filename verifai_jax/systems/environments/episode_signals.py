@@ -1,4 +1,4 @@
-"""Observations and actions of an environment as arrays, and the signals of its trace from them."""
+"""Observations and actions of an environment as arrays, and the trace's signals made of them."""
 
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, TypeAlias
@@ -77,7 +77,7 @@ def check_signals_option(signals: object, state: str = "state") -> None:
         )
     if len(set(names)) < len(names) or {"action", "reward"} & set(names):
         raise ValueError(
-            f"signals must have names of their own beside action and reward; got {names}"
+            f"signals must have different names, other than action and reward; got {names}"
         )
 
 

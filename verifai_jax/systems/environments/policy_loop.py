@@ -1,7 +1,7 @@
-"""Environments of JAX with a policy in the loop, as systems: what all of them have in common.
+"""Environments of JAX with a policy in the loop, as systems: their common base.
 
-A subclass says how a feature is bound, and gives the environment under the features of an instant,
-its start, its step, its parts and its actions. All else is here: episodes, checks, delays.
+A subclass binds features, and gives the environment for the features of an instant, its start,
+step, parts and actions. Episodes, checks and delays are here.
 """
 
 import importlib.metadata

@@ -1,10 +1,10 @@
-"""Actions and observations of Gymnasium's spaces, distinguished by the class of the space.
+"""Conversion and checks of actions and observations by the class of their Gymnasium space.
 
 fit(env.action_space, action, clip=True)            # as the environment takes it, or a Misfit
 named_numbers("action", action)                     # {"action": ...}, or {"action.grip": ...}
 
-Classes are recognised by their names: Gymnasium is an optional package, and older ones have the
-same.
+Classes are recognised by their names, because Gymnasium is an optional package and older packages
+use the same names.
 """
 
 from collections.abc import Callable, Iterator, Mapping
@@ -63,7 +63,7 @@ def check_space(space: Space, name: str, delayed: bool) -> None:
             )
         if delayed and not kind:
             raise ValueError(
-                f"{path} of {name} has no action that stands for none, which action_delay needs: "
+                f"{path} of {name} has no neutral action, which action_delay needs: "
                 f"{describe(part)}"
             )
 

@@ -5,7 +5,7 @@ system = vj.fmu("plant.fmu", duration=4.0, dt=0.01, controller=control, workers=
 ranges = vj.fmu_ranges("suspension.fmu", ["m", "k"])    # for vj.Box(*ranges["m"])
 
 Each simulation runs in a worker process, which keeps its instance of the FMU for the next one. An
-FMU that crashes ends its worker: that is one row, and the others go on.
+FMU that crashes ends only its worker and costs one row.
 """
 
 import atexit

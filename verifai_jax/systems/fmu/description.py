@@ -1,10 +1,9 @@
-"""The description of an FMU: its variables with types, units and ranges, and what it can do.
+"""The description of an FMU: its variables with types, units and ranges, and its capabilities.
 
 description = read_description("model.fmu")
 description.variables["m"].unit, description.identifier
 
-Nothing is trusted: a document type declaration, by which XML could read files or grow without
-bound, is refused.
+A document type declaration is refused, since it could make XML read files or grow without bound.
 """
 
 import math

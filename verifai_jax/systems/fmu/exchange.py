@@ -1,11 +1,10 @@
-"""FMUs for model exchange, which bring equations and events but no solver: both are solved here.
+"""FMUs for model exchange, which contain equations and events but no solver: both are solved here.
 
 instance = ExchangeInstance(description, folder)     # begin, set, step and get as of `Instance`
 
-LSODA integrates, which changes to implicit steps where the equations are stiff; samples within one
-of its steps are interpolated. An event happens where an indicator has changed its sign after a step
-or a sample, which is found within that step, at a time that the FMU named, where it asks for one,
-and wherever an input changes.
+LSODA integrates, with implicit steps if the equations are stiff; samples within its steps are
+interpolated. Events occur when an indicator changes its sign (located within the step), at times
+that the FMU names, when the FMU requests one, and when an input changes.
 """
 
 from collections.abc import Mapping

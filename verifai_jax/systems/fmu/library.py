@@ -4,7 +4,7 @@ instance = Instance(description, folder)            # folder: where the FMU is u
 instance.begin({"m": 2.0}, duration=4.0)
 instance.set({"force": 1.0}); instance.step(0.0, 0.02); instance.get(["x", "v"])
 
-An FMU is a program of this process: what it does to the process it does to the simulation's worker.
+An FMU runs inside this process, so a crash ends the simulation's worker.
 """
 
 import ctypes

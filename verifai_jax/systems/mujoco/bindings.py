@@ -4,7 +4,7 @@
     bind={"grip": ["geom/left/friction[0]", "geom/right/friction[0]"]}    # one feature, several
     bind={"payload": Scaled("body/torso/mass")}                           # times the model's value
 
-Everything here is pure JAX on one row of features; the native backend runs it on a batch.
+The code here is pure JAX on one row of features; the native backend runs it on a batch.
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence

@@ -1,7 +1,7 @@
-"""The closed loop around a MuJoCo model, for both engines: state, control, signals, end.
+"""The closed loop around a MuJoCo model, for both engines: state, control, signals, termination.
 
 Both backends call `sample` between control periods, the native one on a whole batch under `vmap`.
-It is therefore the same computation on both, down to the order of operations.
+So both perform the same computation, in the same order of operations.
 """
 
 from collections.abc import Callable, Mapping

@@ -1,8 +1,8 @@
 """MuJoCo in JAX: one simulation as a pure function, to be vmapped, jitted and differentiated.
 
-A physics step is MuJoCo's, cut in two: kinematics, contacts and sensors of the present state, then
-forces and integration. The controller runs between the two, so nothing that it reads lags behind
-but accelerations and forces.
+A physics step is MuJoCo's, divided into two parts: kinematics, contacts and sensors of the present
+state, then forces and integration. The controller runs between them, so only the accelerations and
+forces that it reads are those of the previous step.
 """
 
 import copy

@@ -74,8 +74,8 @@ def load(
     if isinstance(source, mujoco.MjModel):
         if contacts:
             raise ValueError(
-                f"signal {contacts[0]!r} needs a sensor that a compiled MjModel cannot be given: "
-                "give the MJCF file, its text or an MjSpec instead"
+                f"signal {contacts[0]!r} needs a sensor, which cannot be added to a compiled "
+                "MjModel: give the MJCF file, its text or an MjSpec instead"
             )
         spec, compiled = None, copy.copy(source)
     else:

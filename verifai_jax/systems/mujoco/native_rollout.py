@@ -1,9 +1,9 @@
 """MuJoCo in C: a batch in lock-step, the policy in JAX between its control periods.
 
-The physics runs on all cores through `mujoco.batch.Batch`, which measured as fast as
-`mujoco.rollout` and keeps its states where the next period continues; parameters that differ
-between rows are written into its arrays, so there is one model however large the batch. A batch is
-worked through in two halves: while one is stepped, the other's policy is evaluated.
+The physics runs on all cores through `mujoco.batch.Batch`, which was measured to be as fast as
+`mujoco.rollout` and keeps its states for the next period. Parameters that differ between rows are
+written into its arrays, so a batch of any size needs only one model. A batch is processed in two
+halves: while one is stepped, the policy of the other is evaluated.
 """
 
 import contextlib

@@ -119,7 +119,7 @@ class MuJoCo(System):
 
     @property
     def likely(self) -> str:
-        """The engine that is probably faster on a CPU: contacts slow down MJX, policies native.
+        """The engine that is probably faster on a CPU: contacts slow MJX, policies slow native.
 
         In measurements MJX was three times as fast as native without constraints (a cart-pole), and
         seven times slower with a contact (a ball).
@@ -158,7 +158,7 @@ class MuJoCo(System):
 
     @property
     def black_box(self) -> bool:
-        """True if JAX cannot trace it: with native, or a model that only native can simulate."""
+        """True if JAX cannot trace it: on the native backend, or for a model that needs it."""
         return self.backend == "native" or (self.backend == "auto" and "mjx" not in self.backends)
 
     @cached_property

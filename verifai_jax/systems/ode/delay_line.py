@@ -43,7 +43,7 @@ class DelayLine:
         return DelayLine(values, jnp.asarray(time, latest.dtype), self.period)
 
     def at(self, time: Any) -> Any:
-        """Return the value at a time in seconds; beyond the ends that of the nearest end."""
+        """Return the value at a time in seconds; beyond the ends, the value at the nearest end."""
         values, latest = jnp.asarray(self.values), jnp.asarray(self.latest)
         count = values.shape[0]
         position = (latest - jnp.asarray(time, latest.dtype)) / self.period

@@ -1,4 +1,4 @@
-"""Lookup tables: numbers on a grid, with lines between them.
+"""Lookup tables: numbers on a grid, interpolated linearly.
 
 torque = LookupTable([800, 1600, 2400], [90.0, 130.0, 110.0])
 torque(rpm)
@@ -36,7 +36,7 @@ class LookupTable:
     - `axes_and_values`: the increasing breakpoints of each argument, at least two of each, followed
       by the values, of shape `[len(first axis), len(second axis), ...]`. Further axes make a table
       of vectors.
-    - `beyond`: `"clip"` returns the value at the end of an axis beyond it, `"extrapolate"`
+    - `beyond`: outside of an axis `"clip"` returns the value at its end, and `"extrapolate"`
       continues the last line.
     **Raises:** `ValueError` for breakpoints that do not increase, values that are not finite or of
     another shape, and an unknown `beyond`.

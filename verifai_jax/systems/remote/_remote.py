@@ -1,4 +1,4 @@
-"""Simulators in other processes, languages and machines, to which a run sends points over TCP.
+"""Simulators in other processes, languages and machines; a run sends them points over TCP.
 
     with remote(port=4567) as system:                    # and there: serve(simulate, port=4567)
         falsify(Problem("cars", space, system, "always x <= 2"))

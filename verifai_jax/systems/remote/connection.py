@@ -1,6 +1,6 @@
 """One client of the server: its hello, its points, and the bytes that wait to be sent to it.
 
-Nothing here blocks: bytes wait in a buffer until the socket takes them. `Absence` counts the time
+Nothing here blocks: bytes wait in a buffer until the socket accepts them. `Absence` counts the time
 without a client, and `server_context` encrypts connections by TLS.
 """
 
@@ -107,7 +107,7 @@ class Client:
 
     @property
     def held(self) -> int:
-        """Number of buffered bytes: of an unfinished message, and of data it has not read."""
+        """Number of buffered bytes: of an unfinished message, and of data that are not sent yet."""
         return len(self.frames) + len(self.out)
 
     @property
@@ -217,7 +217,7 @@ class Client:
     def tell(
         self, message: str, number: int | None = None, fatal: bool = False, retry: bool = False
     ) -> None:
-        """Send the client an error; with `retry` one that may be gone at the next attempt."""
+        """Send the client an error; with `retry`, an error that may vanish at the next attempt."""
         about = {"type": "error", "message": message, "id": number, "fatal": fatal}
         if retry:
             about["retry"] = True

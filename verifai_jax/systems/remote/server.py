@@ -1,7 +1,7 @@
 """The server thread of `remote`: its clients, the points that each of them has, and timeouts.
 
-The points of a client that vanishes go to others. One thread owns all sockets and points, so that
-nothing is locked; the run's thread only puts points into its inbox and takes outcomes from a queue.
+If a client disappears, its points go to others. One thread owns all sockets and points, so no locks
+are needed; the run's thread only puts points into its inbox and takes outcomes from a queue.
 """
 
 import contextlib

@@ -1,12 +1,12 @@
 """Messages between a run and its simulators; `docs/remote.md` describes them for clients.
 
-A frame is a length (4 bytes, big-endian), that many bytes of UTF-8 JSON, and, where the JSON has a
-number `"bytes"`, that many raw bytes, in which the JSON's arrays may lie:
+A frame is a length (4 bytes, big-endian) and that many bytes of UTF-8 JSON. If the JSON has a
+number `"bytes"`, that many raw bytes follow, which may hold the arrays of the JSON:
 
     {"$array": "<f8", "shape": [200, 2], "at": 0}
 
-Everything that arrives here comes from strangers: nothing is evaluated or unpickled, sizes are
-checked before anything is kept, and whatever does not fit is a `WireError` that says what.
+All received data are untrusted: nothing is evaluated or unpickled, sizes are checked before
+anything is stored, and invalid data raise a `WireError` that describes them.
 """
 
 import json

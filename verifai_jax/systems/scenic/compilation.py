@@ -4,8 +4,8 @@
     compiled.scenario                                   # scenic.core.scenarios.Scenario
     compiled.names                                      # names of the program's variables, by id
 
-Scenic 3.1 imports `verifai` for `VerifaiRange` and its kin. Where it is not installed, a stand-in
-with the few names that they use takes its place while the program compiles.
+Scenic 3.1 imports `verifai` for `VerifaiRange` and its kin. If it is not installed, a stand-in with
+the few needed names replaces it while the program compiles.
 """
 
 import contextlib

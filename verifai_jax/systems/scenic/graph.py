@@ -1,4 +1,4 @@
-"""The dependency graph of a compiled Scenic program: which values come from which.
+"""The dependency graph of the values of a compiled Scenic program.
 
     for node in nodes(scenario): ...                    # each after what it depends on
     law(node)                                           # the node that says how it is computed

@@ -1,4 +1,4 @@
-"""The leaf of a Scenic distribution: which kind of random value it is, and over which domain."""
+"""The leaf of a Scenic distribution: its kind of random value, and its domain."""
 
 import math
 from collections.abc import Sequence

@@ -1,8 +1,8 @@
-"""Names for the objects and the random values of a Scenic program that a person recognises.
+"""Readable names for the objects and the random values of a Scenic program.
 
-A value that the program calls by a variable of its own has this name. Any other is called by the
-first object's property, or global parameter, that it feeds: `ego.position.x`, `cone1.heading`,
-`param.brightness`. What feeds none of them has the name of its kind: `range1`.
+A value that the program assigns to a variable has the name of this variable. Any other value has
+the name of the first property or global parameter that depends on it: `ego.position.x`,
+`cone1.heading`, `param.brightness`; without one, it has the name of its kind: `range1`.
 """
 
 from collections import Counter

@@ -1,4 +1,4 @@
-"""Numbers of a scene, of each object and parameter, compiled where JAX can.
+"""Numbers of a scene, for each object and parameter, compiled by JAX if possible.
 
 outputs = Outputs(sampling, planar=True)
 outputs(features)                                   # {"ego": {"x": ..., ...}, "params": {...}}

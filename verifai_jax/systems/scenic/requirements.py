@@ -4,9 +4,8 @@
     constraint(features)                                # one truth value, traced by JAX
     constraint.by_scenic                                # what Scenic decides in Python, named
 
-Built-in requirements (objects apart, contained, visible) and a program's own are compiled where
-they have a meaning in JAX; the others are decided by Scenic, on the points that the compiled ones
-accept.
+Built-in requirements (objects apart, contained, visible) and a program's own are compiled if they
+have a meaning in JAX. Scenic checks the others, on the points that the compiled ones accept.
 """
 
 import time

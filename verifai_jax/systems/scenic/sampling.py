@@ -6,8 +6,8 @@
     sampling.refusal(values, features)                  # None, or why Scenic refuses it
     sampling.scene(values)                              # Scenic's Scene
 
-The same features give the same scene, bit for bit. Scenic keeps global state, so one thread at a
-time computes.
+The same features give the same scene, bit for bit. Scenic has global state, so only one thread
+computes at a time.
 """
 
 import hashlib

@@ -1,7 +1,7 @@
 """Values of a planar scene in JAX: vectors, orientations, objects, choices.
 
-An orientation in the plane is its yaw. Numbers that no random value enters stay plain Python, so
-that what is zero for certain (a pitch, a height) is known to be.
+An orientation in the plane is its yaw. Numbers that depend on no random value stay plain Python, so
+that a certain zero (a pitch, a height) is known as zero.
 """
 
 import math

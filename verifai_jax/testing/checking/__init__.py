@@ -1,4 +1,4 @@
-"""Problems as tests: the corpus of counterexamples is replayed, then a budget is spent."""
+"""Problems as tests: replay the corpus of counterexamples, then search with a budget."""
 
 from verifai_jax.testing.checking._test import Session as Session
 from verifai_jax.testing.checking._test import session as session

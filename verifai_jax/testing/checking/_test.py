@@ -1,4 +1,4 @@
-"""A problem as a test function, for pytest or to be called.
+"""A problem as a test function, for pytest or for a direct call.
 
 @vj.test(problem, budget=2000)
 def test_balance(): ...
@@ -26,7 +26,7 @@ from verifai_jax.testing.checking.check import BUDGET, Check, CheckOutcome, Coun
 MARK = "verifai_jax_check"
 """Attribute of a test function by which the pytest plugin knows it."""
 TESTED = "verifai_jax_problem"
-"""Attribute of a test function with its problem, or the name of it."""
+"""Attribute of a test function with its problem, or the problem's name."""
 
 
 @suggests_options
@@ -41,7 +41,7 @@ def test(
     corpus: str | Path | None = None,
     rename: Mapping[str, str] | None = None,
 ) -> Callable[[Callable[..., Any]], Callable[..., None]]:
-    """Make a test function of a problem: it replays the corpus, then spends the budget.
+    """Make a test function of a problem: it replays the corpus, then searches with the budget.
 
     It fails if a saved counterexample is not fixed, or if a new one is found, which is then shrunk
     and added to the corpus. Under pytest the options `--vj-budget` and `--vj-seed` take precedence.

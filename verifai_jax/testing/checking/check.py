@@ -1,10 +1,11 @@
-"""One problem as a test: replay what was found before, then spend a budget on finding more.
+"""One problem as a test: replay earlier counterexamples, then search for more with a budget.
 
     outcome = Check(budget=2000).run(problem, corpus="counterexamples")
     outcome.failed; print(outcome); outcome.properties
 
-Without `max_failure_probability` a search looks for a counterexample, and one is too many. With it
-independent samples are drawn until the failure probability is known to be below or above.
+Without `max_failure_probability` a search looks for a counterexample, and the first one fails the
+test. With it, independent samples are drawn until the failure probability is known to lie below or
+above this limit.
 """
 
 from collections.abc import Mapping
@@ -25,9 +26,9 @@ from verifai_jax.statistics.confidence_sequences import anytime_interval
 from verifai_jax.statistics.stopping import Decided
 
 BUDGET = 1000
-"""Simulations of a test, where nothing else is said."""
+"""Default number of simulations of a test."""
 SHRINKING = 1000
-"""Simulations at most to shrink a counterexample with."""
+"""Maximum number of simulations to shrink a counterexample."""
 
 
 class CounterexampleFound(AssertionError):
@@ -78,7 +79,7 @@ class Check:
     def run(
         self, problem: Problem, corpus: str | Path | None = None, target: str | None = None
     ) -> "CheckOutcome":
-        """Replay the corpus, and spend the budget if all of it is fixed.
+        """Replay the corpus and, if all of it is fixed, search with the budget.
 
         **Arguments:**
         - `problem`: the problem to test.
@@ -129,7 +130,7 @@ class CheckOutcome(InNotebook):
     - `replayed`: the replayed corpus; None without one.
     - `run`: the run on which the budget was spent; None if the corpus failed already.
     - `saved`: files that were added to the corpus.
-    - `unsaved`: the reason why a counterexample could not be added; empty if there was none.
+    - `unsaved`: the reason why a counterexample could not be added, else empty.
     """
 
     problem: str
@@ -170,7 +171,7 @@ class CheckOutcome(InNotebook):
 
     @property
     def properties(self) -> dict[str, str | int | float]:
-        """Plain numbers and texts about it, for a report of tests."""
+        """Plain numbers and texts about the outcome, for a test report."""
         result: dict[str, str | int | float] = {
             "vj_problem": self.problem,
             "vj_seed": self.check.seed,
@@ -227,7 +228,7 @@ class CheckOutcome(InNotebook):
 
 
 def _describe_saved(path: Path) -> str:
-    """Write a saved counterexample: what departs from nominal, or all of its features."""
+    """Write a saved counterexample: the features that are not nominal, or all features."""
     saved = SavedCounterexample.read(path)
     robustness = ", ".join(
         f"{value:z.4g}" for value in saved.robustness.values() if value is not None
@@ -250,7 +251,7 @@ def _short(value: object) -> str:
 
 
 def min_budget(probability: float, confidence: float) -> int:
-    """Return how many simulations without a failure show a failure probability."""
+    """Return the number of simulations without a failure that prove a failure probability."""
     low, high = 0, 1
     while anytime_interval(0, high, confidence).high > probability:
         low, high = high, 2 * high

@@ -1,4 +1,4 @@
-"""The tool's own oracles, run on the machine and the versions that are used.
+"""The tool's own oracles, run on the user's machine with the installed versions.
 
 found = qualify()
 found.save("qualification")
@@ -18,7 +18,7 @@ from verifai_jax.testing.qualification.result import Outcome, Qualification
 
 
 def qualify(only: Sequence[str] | None = None) -> Qualification:
-    """Run the tool's own oracles here: definitions, closed forms, kills, replays.
+    """Run the tool's own oracles on this machine: definitions, closed forms, kills, replays.
 
     **Arguments:**
     - `only`: names of oracles; all when left out, which takes a minute or two.

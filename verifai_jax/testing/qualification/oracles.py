@@ -1,8 +1,8 @@
-"""Oracles: what the tool computes, against definitions that use nothing of it.
+"""Oracles: results of the tool, compared with independent definitions.
 
 for name, check in ORACLES.items(): check()             # AssertionError where it is wrong
 
-Each is written out from a definition, a closed form or another library, and takes seconds.
+Each uses a definition, a closed form or another library, and takes seconds.
 """
 
 import math
@@ -120,7 +120,7 @@ def zeros() -> None:
 
 
 def gradients() -> None:
-    """Check that gradients of the smooth robustness are differences, and its limit is right."""
+    """Check gradients of the smooth robustness by finite differences, and its limit."""
     formula = mtl.parse("always[0, 2] (x > -1 or eventually[0, 1] x < y)")
     values, smooth = np.random.default_rng(2).normal(size=(2, 7)), mtl.smooth(0.2)
 
@@ -163,7 +163,7 @@ def table() -> None:
 
 
 def statuses() -> None:
-    """Check that what raises or is not finite is a row with a status, and no failure."""
+    """Check that a simulation that raises or is not finite gets a status and is no failure."""
 
     def broken(features: dict[str, float]) -> Trace:
         if features["a"] > 0.8:
@@ -183,7 +183,7 @@ def statuses() -> None:
 
 
 def intervals() -> None:
-    """Check that intervals of rates are the binomial ones, and that any-time ones hold longer."""
+    """Check that intervals of rates are binomial, and that any-time intervals hold at all times."""
     from scipy.stats import binom
 
     for failures, count in ((0, 50), (3, 200), (7, 7), (40, 90)):
@@ -240,7 +240,7 @@ def priors() -> None:
 
 
 def steps() -> None:
-    """Check that integrators converge with their order to exp(-1), and a finer step is finer."""
+    """Check that integrators converge to exp(-1) with their order, and smaller steps err less."""
     for method, order in (("euler", 1), ("rk4", 4)):
         errors = []
         for dt in (0.25, 0.125):
@@ -257,7 +257,7 @@ def steps() -> None:
 
 
 def replays() -> None:
-    """Check that a seed decides the table, and that a row gives its number again."""
+    """Check that a seed determines the table, and that a replayed row has the same robustness."""
 
     def noisy(features: dict[str, jax.Array], key: jax.Array) -> Trace:
         return Trace({"x": features["a"] + 0.1 * jax.random.normal(key, (4,))}, dt=0.1)
@@ -311,7 +311,7 @@ def kills() -> None:
 
 
 def searches() -> None:
-    """Check that searches find a failure of volume 1e-3, and that what is claimed fails."""
+    """Check that searches find a failure of volume 1e-3, and that claimed failures are real."""
 
     def hidden(features: dict[str, jax.Array], key: jax.Array) -> Trace:
         away = sum((features[n] - c) ** 2 for n, c in (("a", 0.8), ("b", 0.3), ("c", 0.6)))
@@ -334,7 +334,7 @@ def searches() -> None:
 
 
 def confirmations() -> None:
-    """Check that a failure of a coarse step alone is refuted, and a real one confirmed."""
+    """Check that a failure caused by a coarse step is refuted, and a real one confirmed."""
     system = ode(
         lambda t, s, c, f: -4.0 * s, lambda f, key: f["a"] * jnp.ones(1), dt=0.4, duration=2.0,
         method="euler", signals=lambda t, s, c, f: {"x": s[0]},
@@ -347,7 +347,7 @@ def confirmations() -> None:
 
 
 def comparisons() -> None:
-    """Check that equal systems are never worse, and one that fails by 5 points more is."""
+    """Check that equal systems never count as worse, and that one with 5 points more does."""
     problem = _problem()
     same = compare(problem, {"same": _problem()}, budget=4000, progress=False)["same"]
     assert same.rates.only_first == same.rates.only_second == 0, same
@@ -358,7 +358,7 @@ def comparisons() -> None:
 
 
 def divergences() -> None:
-    """Check that the worst prior is the worst of all two-valued ones within the divergence."""
+    """Check the worst prior against all two-valued priors within the divergence."""
     from verifai_jax.statistics.divergence import radius_of, worst_probability
 
     q = np.linspace(0.01, 0.99, 9801)

@@ -1,9 +1,9 @@
-"""The record of a qualification: what was run, what fell, with which versions and files.
+"""The record of a qualification: oracles, outcomes, versions and a hash of the files.
 
 found = qualify()
 found.passed; print(found); found.save("qualification")
 
-`HAZARDS` lists possible errors of the tool, each with the oracle that catches it.
+`HAZARDS` lists possible errors of the tool, each with the oracle that detects it.
 `tests/testing/qualification/test_planted_errors.py` plants each in a copy of the package to show
 it.
 """
@@ -26,7 +26,7 @@ from verifai_jax.reports.signing import signing_section
 class Outcome:
     """The outcome of one oracle.
 
-    - `what`: a sentence on what it checks.
+    - `what`: a sentence that describes the check.
     - `message`: the error; empty if it passed.
     """
 

@@ -1,4 +1,4 @@
-"""From requirement to formula, problem, tests, runs, claims and report, and which links are broken.
+"""The links from requirement to formula, problem, tests, runs, claims and report, and broken ones.
 
     print(vj.trace_matrix("specs/brake.py", tests=["tests"], runs=["runs"]))
 
@@ -53,7 +53,7 @@ def trace_matrix(
       file of problems without such functions, as in pytest's `vj_specs`, tests all of them.
     - `runs`: folders of runs, and folders of such folders.
     - `reports`: files and folders of reports; those in the folders of the runs are always included.
-      Kinds of links that are None are not required.
+      A kind of link given as None is not required.
     **Returns:** the matrix.
     **Raises:** `TargetError` for a file that cannot be run; `ValueError` for a damaged record,
     claims of another form, and two problems of one name.
@@ -116,7 +116,7 @@ def _row(
 def _gaps_of(
     problem: Problem, name: str, about: Requirement | None, row: TraceRow, asked: Sequence[str]
 ) -> Iterator[Gap]:
-    """Yield what is wrong with a formula and its row, evidence that has changed aside."""
+    """Yield the faults of a formula and its row, except changed evidence."""
     where = f"in problem {problem.name!r}"
     if about is None:
         text = f"formula {name!r} {where} stands for no requirement"

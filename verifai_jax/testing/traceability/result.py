@@ -1,4 +1,4 @@
-"""The matrix of requirements and what serves them, with the links that are missing or suspect.
+"""The matrix of requirements and their evidence, with missing and suspect links.
 
 matrix = vj.trace_matrix("specs/brake.py", tests=["tests"], runs=["runs"])
 matrix.complete; matrix.missing; matrix.suspect

@@ -1,10 +1,10 @@
-"""Counterexample-guided data augmentation: does it pay to train on what a network gets wrong?
+"""Counterexample-guided data augmentation: measures the gain of training on a network's errors.
 
     result = augment(task, initial=1000, added=200, seeds=5)
     print(result)                           # each arm against none, and against random inputs
 
-For each seed a base network is trained on an initial set, a search fills its error table, and each
-arm trains the base further on the initial set and what the arm adds. All arms of a seed share data,
+For each seed a base network is trained on an initial set, and a search fills its error table. Each
+arm trains the base further on the initial set and its added inputs. All arms of a seed share data,
 weights, keys and tests, so that their differences are paired.
 
 Sources: Dreossi, Ghosh, Yue, Keutzer, Sangiovanni-Vincentelli and Seshia, Counterexample-guided
@@ -37,7 +37,7 @@ from verifai_jax.training.augmentation.task import SupervisedTask
 KIND = "augmentation"
 """Kind of the cache."""
 DEFAULT_ARMS = ("none", "random", "counterexamples")
-"""Arms where none are named; `standard` too, where the task has a transformation."""
+"""Default arms; `standard` is added if the task has a transformation."""
 
 
 @suggests_options

@@ -21,9 +21,9 @@ from verifai_jax.training.augmentation.task import SupervisedTask, TaskError, We
 DRAWN = 2048
 """Features that are drawn at a time while those inside rules are looked for."""
 ROUNDS = 64
-"""Rounds of drawing at most."""
+"""Maximum number of rounds of drawing."""
 GENERATED = 20
-"""Inputs that are generated at most for each one that is to be kept because it is wrong."""
+"""Maximum number of generated inputs for each wrongly predicted input to keep."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -244,7 +244,7 @@ def _kept(base: Base, generate: Generator | str) -> Addition:
 
 
 def _few(base: Base) -> str:
-    """Say how many counterexamples there are, where they are fewer than asked for."""
+    """Write the number of counterexamples if it is lower than requested."""
     found, rows = len(base.counterexamples), len(base.table)
     if found >= base.added:
         return ""

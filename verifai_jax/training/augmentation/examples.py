@@ -5,8 +5,8 @@
     examples = workshop.render(rows)                    # inputs and labels
     workshop.judge(weights, examples).wrongness         # [n]
 
-Blocks have one shape whatever the number of rows, so each function compiles once, and weights are
-arguments, so that it does so for all networks.
+Blocks have one shape for any number of rows, and weights are arguments, so each function compiles
+once for all networks.
 """
 
 from dataclasses import dataclass

@@ -8,7 +8,7 @@ from verifai_jax.core.compute.keys import run_keys
 INITIAL, TRAINING, FURTHER, SEARCH, CHOICE, TEST, MEASURES = range(7)
 """Purposes of random numbers in one repetition."""
 INDEPENDENT = 2**31 - 1
-"""Number of the repetition that is the independent network; no study has so many."""
+"""Number of the repetition of the independent network, higher than that of any seed."""
 
 
 def purpose_key(seed: int, number: int, purpose: int) -> Key[Array, ""]:

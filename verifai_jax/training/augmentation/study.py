@@ -1,4 +1,4 @@
-"""The work of an augmentation: seeds, their networks and what is kept of them.
+"""The work of an augmentation: seeds, their networks, and the stored results.
 
     study = Study(task, plan, cache, bar)
     study.run(0, ("none", "counterexamples"))               # one seed; what is finished is read
@@ -37,7 +37,7 @@ from verifai_jax.training.augmentation.searched import searched_problem
 from verifai_jax.training.augmentation.task import SupervisedTask, TaskError, Weights
 
 _PER_HARD = 40
-"""Inputs that are drawn at most for each one of the hard test."""
+"""Maximum number of drawn inputs for each input of the hard test."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -284,7 +284,7 @@ def _no_rows(task: SupervisedTask) -> pd.DataFrame:
 
 
 def _presence(judged: Judgement) -> dict[str, float]:
-    """Return precision and recall; NaN for a precision where nothing is detected, and so on."""
+    """Return precision and recall; NaN for a ratio with the denominator 0."""
     if judged.present is None or judged.detected is None:
         return {}
     found = float((judged.present & judged.detected).sum())

@@ -1,4 +1,4 @@
-"""The summary of an augmentation in words: what helps, what does not, and how sure that is.
+"""The summary of an augmentation: helpful and useless arms, with confidence.
 
 rings: 10 arms, 5 seeds, 40 inputs added to 200, ...
   base         errs on 11.8 % of new inputs
@@ -80,7 +80,7 @@ def findings(outcome: Outcome, metric: str = "error") -> list[str]:
 
 
 def _gain(outcome: Outcome, metric: str) -> list[str]:
-    """Compare the gains of counterexamples and random inputs, where the former is no chance."""
+    """Compare the gains of counterexamples and random inputs, if the former is significant."""
     if not {"none", "random", "counterexamples"} <= {*outcome.arms}:
         return []
     differences = _differences(outcome, metric, "none")

@@ -1,9 +1,9 @@
-"""A supervised task whose labelled inputs are made from features: what augmentation works on.
+"""A supervised task with labelled inputs made from features, for augmentation.
 
     task = SupervisedTask("rings", space, render, label, train, predict, wrongness)
     task.problem(weights)                   # where does this network err? for every search
 
-Nothing here knows of images: an input is whatever the network takes.
+Inputs need not be images: an input may be anything that the network accepts.
 """
 
 from collections.abc import Callable, Mapping

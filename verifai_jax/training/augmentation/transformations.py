@@ -4,8 +4,7 @@
     SupervisedTask(..., transform=transform)
 
 Images have shape `[n, height, width, channels]` or `[n, height, width]`, with values from 0 to 1.
-Labels pass unchanged: if a label is a position, your transformation must
-move it along.
+Labels pass unchanged: if a label is a position, your transformation must move it along.
 
 Source: Shorten and Khoshgoftaar, A survey on image data augmentation for deep learning, Journal of
 Big Data 6 (2019).

@@ -1,4 +1,4 @@
-"""Training that hardens a policy: train, attack, add what fails to the training, certify.
+"""Hardening of a policy: train, attack, train further on the failures, certify.
 
 result = vj.harden(study)
 print(result)                           # failure probability before and after, return lost, cost

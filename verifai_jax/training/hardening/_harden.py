@@ -1,4 +1,4 @@
-"""Train, attack, add what fails to the training, go on training, certify.
+"""Hardening of a policy: train, attack, train further on the failures, certify.
 
     result = harden(study)                              # a Study: trainer, problem, p
     result = harden(CartPoleTask(), balance_with, algorithm=PPO())
@@ -50,20 +50,19 @@ from verifai_jax.training.sweeps.study import Study
 from verifai_jax.training.sweeps.trainer import FunctionTrainer, Trainer
 
 ROUND, FINAL, COMPARED, ATTACK, RETURNS = range(5)
-"""Purposes of random numbers."""
+"""Numbers of the purposes for which random numbers are drawn."""
 CERTIFIED = ("failures", "simulations", "failure_rate", "failure_low", "failure_high", "verdict",
              "attack_failures", "cost")  # fmt: skip
-"""Columns of a certificate that the table has."""
+"""Columns of the table that come from a certificate."""
 OWN_STEP, OWN_LIMIT = 0.25, 0.75
-"""The task's own share of the episodes grows by the first after a round that loses return, at most
-to the second, and falls again after a round that keeps the return."""
+"""Step and limit by which the share of own episodes grows after a round that loses return."""
 TABLE, SHRUNK = 512, 4
-"""Samples of the prior in the table of a round, and counterexamples that are shrunk."""
+"""Number of prior samples in the table of a round, and of counterexamples to shrink."""
 
 
 @dataclass(frozen=True, eq=False)
 class Plan:
-    """The options that decide the numbers of all rounds."""
+    """The options that determine the results of all rounds."""
 
     rounds: int
     steps: int
@@ -94,7 +93,7 @@ class Plan:
             )
 
     def seed_for(self, purpose: int, stage: int = 0) -> int:
-        """Return the seed of a purpose, of which no two share their samples."""
+        """Return the seed for a purpose; different purposes get different samples."""
         key = jax.random.fold_in(jax.random.fold_in(run_keys(self.seed)[0], purpose), stage)
         return int(jax.random.bits(key) >> 1)
 
@@ -129,49 +128,51 @@ def harden(
     even_if_changed: bool = False,
     progress: bool | None = None,
 ) -> Hardening:
-    """Train a policy, and go on training where it fails until it is certified.
+    """Train a policy, then train it further on its failures until it is certified.
 
-    The policy is trained on the task's own episodes first. Then each round attacks and certifies
-    it, confirms and shrinks the failures, and goes on training with a mixture of episodes: the
-    task's own, the prior of the problem's features, and neighbourhoods of failures. Of the policies
-    whose return is within `tolerance` of the first one's, the one that fails least is returned, and
-    never one that a paired comparison shows to be worse than the first.
+    The first training uses the task's own episodes. Then each round attacks and certifies the
+    policy, confirms and shrinks its failures, and continues the training with a mixture of
+    episodes: the task's own, episodes from the prior of the problem's features, and episodes near
+    failures. The result is the policy that fails least among those whose return is within
+    `tolerance` of the first one's. If a paired comparison shows that it fails more often than the
+    first policy, the first is returned.
 
-    No certificate uses a sample that was trained on: each has a seed of its own. The last one, of
-    the policies before and after together, is made after the choice.
+    No certificate uses samples from the training: each has its own seed. The last certificate
+    covers the policies before and after together, and is made after the choice.
 
     **Arguments:**
-    - `study`: a `Study`, a `Trainer`, or a task. A task says by `start(key, features) -> state` how
-      an episode with the features of the problem starts, as tasks of `ode_task` do. A function that
-      trains gets the argument `starts`: a list of features, of which each of its episodes takes one
-      at random, and `None` for those of its own; in the first training all are.
-    - `problem`: from a policy to the problem of its closed loop; that of the study when left out.
+    - `study`: a `Study`, a `Trainer`, or a task. A task needs a method `start(key, features) ->
+      state` that starts an episode with the problem's features; tasks of `ode_task` have it. A
+      training function gets the argument `starts`, a list from which each episode takes one entry
+      at random: features, or `None` for an episode of the task's own. In the first training all
+      entries are `None`.
+    - `problem`: a function from a policy to the problem of its closed loop; by default the study's.
     - `algorithm`: the algorithm of a task; `PPO()` when left out.
-    - `start(key, features) -> state`: where the task has no such method.
-    - `hyperparameters`: values of the trainer's hyper-parameters.
+    - `start`: a function `(key, features) -> state` for a task without such a method.
+    - `hyperparameters`: a dictionary of the trainer's hyper-parameters.
     - `rounds`: the maximum number of rounds of attack and further training.
-    - `steps`: environment steps of the first training; those of the trainer when left out.
+    - `steps`: environment steps of the first training; by default the trainer's.
     - `further_steps`: steps of each round; an eighth of `steps` when left out.
-    - `p`: failure probability below which the policy is safe; that of the study, or 0.01.
-    - `confidence`: with which the intervals before and after hold together.
-    - `samples`, `attack`, `attack_simulations`: of each certificate, as in `certify`.
-    - `added`: the maximum number of points to train around that a round adds.
-    - `own`, `failing`: shares of episodes that are the task's own, and that begin near failures,
-      with those of the prior that fail anyway; the others are of the prior. After a round that
-      loses return, more are the task's own, and fewer again after one that does not.
-    - `tolerance`: share of the first policy's return that may be lost.
-    - `episodes`: episodes of the task itself, the same for all policies, that measure returns.
-    - `baseline`: whether an arm with plain domain randomisation is trained as well: the same seed,
-      own episodes and environment steps, and the prior instead of failures.
+    - `p`: failure probability below which the policy is safe; by default the study's, or 0.01.
+    - `confidence`: the joint confidence of the intervals before and after.
+    - `samples`, `attack`, `attack_simulations`: options of each certificate, as in `certify`.
+    - `added`: the maximum number of failures, as points to train around, that a round adds.
+    - `own`, `failing`: share of the task's own episodes, and share of episodes that begin near
+      failures, including those drawn from the prior that fail; all others come from the prior. The
+      share of own episodes grows after a round that loses return, and shrinks after other rounds.
+    - `tolerance`: the share of the first policy's return that the result may lose.
+    - `episodes`: number of the task's own episodes that measure returns, the same for all policies.
+    - `baseline`: whether to train a second arm with plain domain randomisation: the same seed, own
+      episodes and environment steps, but episodes from the prior instead of failures.
     - `seed`: the seed of training, attacks and samples.
-    - `max_seconds`: after which no other round begins.
-    - `folder`: keeps finished work: the same call goes on where it was interrupted.
-    - `even_if_changed`: whether to go on with a folder although files of the model have changed.
+    - `max_seconds`: wall-clock seconds after which no round begins.
+    - `folder`: the folder of finished work; the same call continues an interrupted hardening.
+    - `even_if_changed`: whether to continue in a folder although files of the model have changed.
     - `progress`: whether to show one line of progress; see `core.display.progress` for the default.
     **Returns:** the result. Ctrl-C ends the call; with `folder` it may be repeated.
     **Raises:** before anything is trained, `HardeningError` for a task that cannot start with the
-    features; `ValueError` for numbers out of range; as `Trainer.configuration`. `CacheError` for a
-    folder of another hardening; `FolderInUse` where another process writes it.
+    features; `ValueError` for numbers out of range; the errors of `Trainer.configuration`;
+    `CacheError` for a folder of another hardening; `FolderInUse` if another process writes there.
     """
     made = _as_study(study, problem, algorithm, p)
     trainer, values = made.trainer, dict(hyperparameters or {})
@@ -196,7 +197,7 @@ def harden(
 
 @dataclass(eq=False)
 class Work:
-    """The rounds of a hardening, of which finished parts are in the cache."""
+    """The rounds of a hardening; finished parts are read from the cache."""
 
     study: Study
     plan: Plan
@@ -229,7 +230,7 @@ class Work:
         self.returns: dict[tuple[str, int], np.ndarray] = {}
 
     def run(self, max_seconds: float | None) -> Hardening:
-        """Play rounds until the certificate holds or the budget ends."""
+        """Run rounds until the policy is certified or the budget ends."""
         began, plan, stopped = time.perf_counter(), self.plan, "budget"
         for stage in range(plan.rounds + 1):
             # The verbs of a round count their simulations in the same line.
@@ -268,7 +269,7 @@ class Work:
         return certificates
 
     def _collect(self, stage: int, certificates: Certificates) -> None:
-        """Add what the hardened policy of a stage fails at to the episodes of the next."""
+        """Add the failures of a stage's hardened policy to the episodes of the next stage."""
         plan, space = self.plan, self.untrained.space
 
         def compute() -> dict[str, np.ndarray]:
@@ -313,14 +314,14 @@ class Work:
         return not now < before - self.plan.tolerance * abs(before)
 
     def _choice(self, arm: str) -> int:
-        """Return the stage that fails least of those that keep the return; the first, if none."""
+        """Return the stage that fails least among those that keep the return, else the first."""
         rows = [row for row in self.rows if row["arm"] == arm]
         kept = [row for row in rows if self._keeps_return(arm, row["round"])]
         best = min(kept, key=lambda r: (r["failure_rate"], r["attack_failures"], -r["return"]))
         return best["round"]
 
     def _result(self, stopped: str, began: float) -> Hardening:
-        """Choose, certify before and after from fresh samples, and compare them in pairs."""
+        """Choose a policy, certify it and the first on fresh samples, and compare both in pairs."""
         plan, notes = self.plan, []
         chosen = {arm: self._choice(arm) for arm in self.arms_named}
         comparison: Comparison | None = None
@@ -365,10 +366,10 @@ def _as_study(
     p: float | None,
 ) -> Study:
     if isinstance(given, Study | Trainer) and algorithm is not None:
-        raise ValueError(f"a {type(given).__name__} has algorithms; give no other")
+        raise ValueError(f"a {type(given).__name__} has its own algorithms; leave out algorithm=")
     if isinstance(given, Study):
         if problem is not None:
-            raise ValueError("a Study has a problem; give no other")
+            raise ValueError("a Study has its own problem; leave out problem=")
         study = given
     elif problem is None:
         raise HardeningError(

@@ -1,10 +1,10 @@
-"""The policies of hardening, stage by stage: one arm with counterexamples, one with the prior.
+"""Policies of hardening at each stage, in two arms: with counterexamples, and with the prior.
 
 arms.mix(1, [mixture, prior])                       # what the episodes up to stage 1 are drawn from
 arms.policies(1)                                    # trained up to the second stage, or cached
 
-Arms share the training seed, so that up to the first stage they are one training, and afterwards
-take the same number of environment steps, wherever an episode begins.
+Arms share the training seed, so they are one training up to the first stage. Afterwards all take
+the same number of environment steps.
 """
 
 from collections.abc import Mapping, Sequence
@@ -23,7 +23,7 @@ from verifai_jax.training.sweeps.study import Study
 from verifai_jax.training.sweeps.training_runs import RunCheckpoint
 
 STARTS = 4096
-"""Episodes that a function gets to train on: enough that each of 256 neighbourhoods has some."""
+"""Initial features that a function receives; enough for each of 256 neighbourhoods."""
 AVERAGED = 4
 """Weights that are averaged over the second half of a round's training: those of the last update
 alone fail, and return, more or less by chance. Source: Izmailov et al., Averaging weights leads to
@@ -32,9 +32,9 @@ wider optima and better generalization, UAI 2018."""
 
 @dataclass(eq=False)
 class Arms:
-    """Trainings that go on stage by stage.
+    """Trainings that continue from stage to stage.
 
-    - `stages`: steps at the end of each; `names`: of the arms.
+    - `stages`: environment steps at the end of each stage; `names`: names of the arms.
     """
 
     study: Study
@@ -63,7 +63,7 @@ class TaskArms(Arms):
         self._reached = -1
 
     def mix(self, stage: int, mixtures: Sequence[Mixture]) -> None:
-        """Say, for each arm, what the episodes are drawn from on the way to a stage."""
+        """Set the mixtures from which each arm draws the episodes of a stage."""
         self._mixes[stage] = mixtures
 
     def policies(self, stage: int) -> list[Any]:
@@ -94,7 +94,7 @@ class TaskArms(Arms):
 
 @dataclass(eq=False)
 class FunctionArms(Arms):
-    """Trainings by a function, which gets the features that its episodes begin with."""
+    """Trainings by a function that receives the initial features of its episodes."""
 
     def __post_init__(self) -> None:
         study, trainer = self.study, replace(self.study.trainer, steps=self.stages[-1])
@@ -106,7 +106,7 @@ class FunctionArms(Arms):
             self._runs.runs[number] = replace(run, key=f"{run.key}-{arm}")
 
     def mix(self, stage: int, mixtures: Sequence[Mixture]) -> None:
-        """Draw, for each arm, the episodes on the way to a stage."""
+        """Draw the initial features of a stage's episodes for each arm."""
         for number, mixture in enumerate(mixtures):
             key = jax.random.fold_in(jax.random.key(self.seed), stage)
             own, points = jax.vmap(mixture.episode)(*jax.random.split(key, (2, STARTS)))

@@ -1,13 +1,13 @@
-"""Failures of a stage's policy, as points around which it is trained next.
+"""Failures of a stage's policy, as points for the next training to concentrate on.
 
 found = collect(problem, failing, earlier, seed=3, added=64, table=512, shrunk=4)
 found.points, found.sources                 # [n, d], and for each where it comes from
 found.kept                                  # which earlier points stay
 
-Failures of the certificate and of its attack, and earlier points, are simulated together with
-samples of the prior; that table has rules, and failures of it are shrunk. Failing samples come
-first: they fail as often as the policy does, where the attack's are of the worst kind, which may be
-one that no policy can master.
+Failures of the certificate and of its attack, earlier points and samples of the prior are simulated
+together. This table yields rules, and some of its failures are shrunk. Failing samples come first,
+because they represent typical failures. The attack finds the worst failures, which no policy may be
+able to avoid.
 """
 
 from typing import NamedTuple
@@ -26,22 +26,22 @@ from verifai_jax.search import PointList
 from verifai_jax.training.hardening.mixture import NARROW, RADIUS, neighbourhoods
 
 SHRINKING = 300
-"""Simulations to shrink a counterexample: a near failure is wanted, not the nearest."""
+"""Simulations to shrink a counterexample: a close failure suffices, not the closest."""
 AROUND, THIN = 8, 0.25
-"""Samples around each point, and the share of failing ones below which its neighbourhood is narrow:
-few episodes of a wide one would show what fails."""
+"""Samples around each point, and the failing share below which its neighbourhood is narrow."""
 PRIOR = 4096
-"""Samples of the prior of which those within the rules are kept."""
+"""Samples drawn from the prior to find some that satisfy the rules."""
 
 
 class Collected(NamedTuple):
     """Points of the unit cube to train around.
 
-    - `points`: `[n, d]`, new ones.
-    - `radii`: `[n]`, of their neighbourhoods.
-    - `sources`: the origin of each: `"sample"`, `"counterexample"`, `"shrunk"` or `"rule"`.
-    - `kept`: which earlier points stay: those that still fail, and as many others as points fail.
-    - `simulations`: spent to confirm and shrink.
+    - `points`: `[n, d]`, the new points.
+    - `radii`: `[n]`, the radii of their neighbourhoods.
+    - `sources`: the origin of each point: `"sample"`, `"counterexample"`, `"shrunk"` or `"rule"`.
+    - `kept`: indices of the earlier points to keep: all that still fail, and an equal number of
+      others.
+    - `simulations`: number of simulations used to confirm and shrink.
     """
 
     points: Float[np.ndarray, "n d"]
@@ -61,14 +61,14 @@ def collect(
     table: int,
     shrunk: int,
 ) -> Collected:
-    """Confirm failures, and make the points to train around of them.
+    """Confirm failures and convert them to points to train around.
 
     **Arguments:**
     - `problem`: the problem of the policy.
-    - `failing`: rows that fail, the worst first; `earlier`: points of the rounds before.
-    - `seed`, `table`: the seed and the number of samples of the prior.
+    - `failing`: failing rows, the worst first; `earlier`: points of earlier rounds.
+    - `seed`, `table`: the seed, and the number of samples from the prior.
     - `added`: the maximum number of points.
-    - `shrunk`: counterexamples that are shrunk, where the problem says what is nominal.
+    - `shrunk`: number of counterexamples to shrink, if the problem has nominal features.
     """
     space, points, sources = problem.space, [np.zeros((0, problem.space.dim), np.float32)], []
     if not len(failing):
@@ -120,7 +120,7 @@ def collect(
 def _radii(
     problem: Problem, centres: Float[np.ndarray, "n d"], seed: int
 ) -> tuple[Float[np.ndarray, " n"], int]:
-    """Return how far failures reach around points, and the simulations that it took to see it."""
+    """Return the radius of the failing neighbourhood of each point, and the simulations used."""
     space, count = problem.space, len(centres)
     low, high = (np.repeat(ends, AROUND, 0) for ends in neighbourhoods(space, centres, RADIUS))
     points = low + np.random.default_rng(seed).random(low.shape) * (high - low)

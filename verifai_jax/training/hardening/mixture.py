@@ -1,11 +1,11 @@
-"""A task whose episodes are a mixture: its own, the prior of a problem, and what has failed.
+"""A task with a mixture of episodes: its own, from the prior of a problem, and near failures.
 
     task = mixture_of(task, problem, start)             # all episodes are the task's own
     mixture = Mixture.of(space, (0.25, 0.375, 0.375), centres)
     task = replace(task, mixture=mixture)               # the same structure: nothing is compiled
 
-An episode's features are a pure function of its random key and of arrays, so that one compiled
-training serves all rounds, whatever was found in them.
+An episode's features are a pure function of its random key and of arrays, so one compiled training
+serves all rounds.
 """
 
 from collections.abc import Callable
@@ -25,13 +25,11 @@ from verifai_jax.rl.batched_training import StaticTask, numbers_of
 from verifai_jax.rl.task.task import Action, State, Task
 
 CAPACITY = 256
-"""Neighbourhoods that a mixture holds at most; the newest stay."""
+"""Maximum number of neighbourhoods in a mixture; the newest are kept."""
 RADIUS, NARROW = 0.1, 0.03
-"""Half the side of a neighbourhood, a share of each coordinate's range; the second where little of
-the first fails. At 0.03 what was learnt of wide failures did not reach beyond the counterexamples,
-at 0.3 it was domain randomisation."""
+"""Half sides of a wide and a narrow neighbourhood, as shares of each coordinate's range."""
 TRIES = 8
-"""Draws of which the first that the constraint accepts is taken."""
+"""Number of draws; the first that satisfies the constraint is used."""
 Start = Callable[[Key[Array, ""], dict[str, Any]], State]
 """`(key, features) -> state`"""
 Shares = tuple[float, float, float]
@@ -57,8 +55,8 @@ def neighbourhoods(
 class Mixture:
     """Points of the unit cube of a space, from the prior and from neighbourhoods.
 
-    - `shares`: of episodes that are the task's own, from the prior, and from neighbourhoods.
-    - `low`, `high`: `[neighbourhoods, d]`, boxes of the unit cube; the first `count` of them count.
+    - `shares`: shares of the task's own episodes, of those from the prior, and from neighbourhoods.
+    - `low`, `high`: `[neighbourhoods, d]`, boxes of the unit cube; only the first `count` are used.
     """
 
     # JAX rebuilds the class with stacked arrays and placeholders, which have other shapes.
@@ -77,7 +75,7 @@ class Mixture:
         centres: Float[np.ndarray, "n d"],
         radii: Float[np.ndarray, " n"] | float = RADIUS,
     ) -> "Mixture":
-        """Return a mixture with the neighbourhoods of these points; without them of the rest."""
+        """Return a mixture with neighbourhoods of these points; without points it has none."""
         count = len(centres)
         if not count:
             shares = (shares[0], shares[1] + shares[2], 0.0)
@@ -103,7 +101,7 @@ class Mixture:
     def episode(
         self, kind_key: Key[Array, ""], draw_key: Key[Array, ""]
     ) -> tuple[Bool[Array, ""], Float[Array, " d"]]:
-        """Draw whether an episode is the task's own, and the point where it is not."""
+        """Draw whether an episode is the task's own, and the point for any other episode."""
         return jax.random.uniform(kind_key) < self.shares[0], self.draw(draw_key)
 
 
@@ -112,7 +110,7 @@ class Mixture:
 class MixtureTask:
     """A task that draws the features of an episode from a mixture; made by `mixture_of`.
 
-    All else is as in the task itself.
+    All other members are those of the task.
 
     - `own`: the point of the unit cube of the task's own episodes; None if `reset` starts them.
     """
@@ -165,7 +163,7 @@ class MixtureTask:
 
 
 def mixture_of(task: Task, problem: Problem, start: Start | None) -> MixtureTask:
-    """Return a task with all of its own episodes, into which others can be mixed.
+    """Return a task that starts with its own episodes only and accepts other mixtures.
 
     **Raises:** `HardeningError` for a task that cannot start with given features.
     """

@@ -1,4 +1,4 @@
-"""The result of a hardening: failure probability and return before and after, round by round."""
+"""The result of a hardening: failure probability and return before, after, and by round."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -31,18 +31,19 @@ class Hardening(Drawn, Tabular):
 
     - `problem`: the name of the problem.
     - `table`: a row for each round and arm: `steps` of training so far, `failures` among
-      `simulations` with the interval of that round's certificate by itself, its `verdict`,
+      `simulations` with the separate interval of that round's certificate, its `verdict`,
       `attack_failures`, the mean `return`, the number of points `added` afterwards, `cost` in
       simulations, and `seconds`.
     - `added`: features of all points that were trained around, with `round` and `source`.
-    - `start`, `policy`: before and after.
-    - `policies`: the policies of each arm and round; `chosen`: the round of each arm.
-    - `certificates`: of the policies before and after, and of the baseline's, if there is one, from
-      samples that no training and no choice has used. Their intervals hold together.
+    - `start`, `policy`: the policies before and after.
+    - `policies`: the policies of each arm and round; `chosen`: the chosen round of each arm.
+    - `certificates`: certificates of the policies before and after, and of the baseline if there is
+      one. Their samples were used for no training and no choice; their intervals hold jointly.
     - `comparison`: the paired comparison of before and after; None if the first policy is returned.
-    - `returns`: of `"start"` and of each arm's chosen policy, on the same episodes.
+    - `returns`: returns of `"start"` and of each arm's chosen policy, on the same episodes.
     - `stopped`: `"certified"`, `"budget"` or `"max_seconds"`.
-    - `options`: numbers that it was called with; `notes` for people; `seconds`; `version`.
+    - `options`: the options of the call; `notes`: remarks for the reader; `seconds`: wall-clock
+      time; `version`: the version of verifai_jax.
     """
 
     _picture = "hardening", "plot_hardening"
@@ -85,7 +86,7 @@ class Hardening(Drawn, Tabular):
 
     @property
     def times_safer(self) -> float:
-        """The failure probability before as a multiple of that after; infinite where none fails."""
+        """The ratio of the failure probabilities before and after; infinite if none fails after."""
         before, after = self.before.rate, self.after.rate
         if before is None or after is None or not before.estimate:
             return float("nan")
@@ -97,7 +98,7 @@ class Hardening(Drawn, Tabular):
         return paired_difference(before, after, self.options["confidence"])
 
     def summary(self) -> str:
-        """Write what was gained, what was lost and what it cost."""
+        """Write the gain in safety, the loss of return, and the cost."""
         rounds, sure = max(self.table["round"]), format_percent(self.options["confidence"])
         lines = [
             f"{self.problem}: hardened in {counted(rounds, 'round')} ({self.stopped}); the policy "
@@ -138,7 +139,8 @@ class Hardening(Drawn, Tabular):
     def save(self, folder: str | Path) -> Path:
         """Write table, added features, summary and policies to a folder, which is returned.
 
-        **Raises:** `FolderInUse`; `OSError` for what the file system refuses: what was there stays.
+        **Raises:** `FolderInUse` if another process writes there; `OSError` if the file system
+        refuses, in which case the old content stays.
         """
         path = Path(folder)
         with write_lock(path), replacing_all(path, FILES) as made:

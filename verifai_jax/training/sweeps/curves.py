@@ -23,7 +23,7 @@ from verifai_jax.mtl.rewriting import rebuild
 SIGNALS = ("return",)
 """Signals of a learning curve: the mean return of the episodes that ended in each update."""
 _SHORTEST = 64
-"""Least length to which curves are padded, so that few lengths compile."""
+"""Minimum padded length of curves, so that few lengths compile."""
 
 
 def check_curve(formula: Formula | str) -> Formula:

@@ -1,4 +1,4 @@
-"""Shares of a forest's variance that each of its inputs explains, exactly.
+"""Exact shares of a forest's variance that each input explains.
 
 A tree is constant on boxes, so integrals over the unit cube are sums over pairs of boxes: no
 samples are drawn. Source: Hutter, Hoos and Leyton-Brown, An efficient approach for assessing

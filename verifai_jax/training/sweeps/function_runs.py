@@ -1,11 +1,11 @@
-"""Trainings by anybody's function, each call of it in a process of its own.
+"""Trainings by a user's function, with each call in a separate process.
 
 runs = FunctionRuns(study, cache, clock)
 runs.train([runs.add(values, seed=0)], rung=0)
 
-A process is fresh, and its global random numbers are seeded, so that a policy depends on the
-arguments of the call alone. A function with an argument `resume` gets a folder there: a copy of
-what it left at the checkpoint before, which stays until the call has ended and is stored.
+Each process is new and its global random numbers are seeded, so a policy depends only on the
+arguments of the call. A function with an argument `resume` gets a folder with a copy of the files
+that it left at the previous checkpoint; the original stays until the call has ended and is stored.
 """
 
 import json
@@ -97,7 +97,7 @@ class FunctionRuns(TrainingRuns):
             shutil.rmtree(self._folder_of(number), ignore_errors=True)
 
     def _call(self, numbers: list[int], at: int) -> None:
-        """Call the function for each of these, at most as many at a time as there are workers."""
+        """Call the function for each of these, with at most one call per worker at a time."""
         calls: list[dict[str, Any]] = []
         for number in numbers:
             run = self.runs[number]
@@ -169,7 +169,7 @@ class FunctionRuns(TrainingRuns):
 
 
 ARRAY = "array/"
-"""Beginning of the names of a policy's arrays among those that are stored of a training."""
+"""Prefix of the names of a policy's arrays among the stored arrays of a training."""
 
 
 def train_once(

@@ -1,4 +1,4 @@
-"""Hyper-parameters as plain Python values: at points of their space, and to check a domain.
+"""Hyper-parameters as plain Python values: conversion from points, and values for checks.
 
 values_at(space, points)                            # [{"learning_rate": 0.001, "width": 64}, ...]
 probe_values(space.domains["width"])                # [(16, "a choice"), (64, "a choice")]
@@ -17,7 +17,7 @@ from verifai_jax.features.domain import Domain
 Hyperparameters: TypeAlias = dict[str, Any]
 """Plain Python values of hyper-parameters, by name."""
 _MAX_PROBES = 64
-"""Choices of a domain up to which each is checked; only the ends of larger ones are."""
+"""Maximum number of choices that are all checked; of larger domains only the ends are."""
 _COMPANIONS = 16
 """Points of the space at which a value is tried before it is refused."""
 _CHUNK = 32

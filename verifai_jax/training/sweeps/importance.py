@@ -56,7 +56,7 @@ MIN_LOSS = 0.02
 MAX_NAMED = 5
 """Hyper-parameters that the summary names, at most."""
 MAX_CELLS = 8
-"""Different numbers in a column of an unknown domain up to which they count as choices."""
+"""Maximum number of different values in a column of unknown domain that count as choices."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,8 +70,7 @@ class HyperparameterImportance(InNotebook):
       `_first` and `_total`, the shares of the model's variance that it explains alone and including
       interactions; `_trend`, its rank correlation (NaN for choices). NaN without a model.
     - `scores`: R^2 of the models, by target.
-    - `chance`: limit that the largest trend of unrelated hyper-parameters stays below in 95 % of
-      cases, by target.
+    - `chance`: by target, the 95 % quantile of the largest trend of unrelated hyper-parameters.
     - `missing`: reasons for a missing model, by target.
     - `unsafe`, `safe`: principal components of unsafe and safe configurations; None for fewer than
       five.
@@ -370,8 +369,8 @@ class Trends(NamedTuple):
     """Rank correlations of inputs with an outcome.
 
     - `correlation`: Spearman's correlation of each input; NaN for a constant one.
-    - `chance`: limit that the largest correlation stays below in 95 % of shuffled outcomes;
-      correlations beyond it are significant, however many inputs there are.
+    - `chance`: 95 % quantile of the largest correlation over shuffled outcomes; larger correlations
+      are significant for any number of inputs.
     """
 
     correlation: Float[np.ndarray, " d"]

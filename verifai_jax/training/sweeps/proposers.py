@@ -4,7 +4,7 @@
     values = proposer.propose(8)                        # dictionaries of plain values, 8 at most
     proposer.observe([0.02, None, ...])                 # their objective; None if it is unknown
 
-Proposers look for the least `objective`: failure rate first, then worst robustness, then return.
+Proposers minimise `objective`: failure rate first, then worst robustness, then return.
 """
 
 import math

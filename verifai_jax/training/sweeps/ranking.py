@@ -1,4 +1,4 @@
-"""The order of preference among the rows of a sweep's table, and tables derived from it."""
+"""The preference order of the rows of a sweep's table, and tables derived from it."""
 
 from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING, Any

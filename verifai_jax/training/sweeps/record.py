@@ -67,7 +67,7 @@ class SweepRecord:
     - `seed`: the seed of the sweep.
     - `columns`: the table, name -> column `[rows]`, in order: `BEFORE`, the hyper-parameters,
       `AFTER`. Unknown numbers are NaN, unknown texts empty. `steps` are the requested ones.
-    - `hyperparameters`: columns from the space of the study; `steps` is that of `BEFORE`.
+    - `hyperparameters`: columns from the space of the study; `steps` is the column of `BEFORE`.
     - `policies`: the policy of each row, on the host; None without policies.
     - `worst`: features with the least robustness for each row, in the form of `space.rows`; None if
       nothing was simulated.

@@ -6,9 +6,8 @@
     curves.npz            the learning curves
     policies/12.npz       the policy of row 12; `vj.policy` reads it too
 
-`sweep.json` has the checksums of the others and one of itself: what has changed is reported by
-name. The study is code, which the files never name: `load_sweep(folder, study)` takes it from its
-caller.
+`sweep.json` has the checksums of all files including itself, so changed files are reported by name.
+The files never name code: pass the study to `load_sweep(folder, study)`.
 """
 
 import json

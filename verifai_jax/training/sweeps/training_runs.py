@@ -5,8 +5,8 @@
     runs.train([number, ...], rung=0)                   # to the first checkpoint, or cached
     runs.checkpoint(number, 0).policy
 
-Runs of one structure share a program. As many as there are devices continue together from one
-checkpoint to the next, so that a run that has begun is soon finished and cached.
+Runs of one structure share a program. Only as many runs as there are devices train at a time, from
+one checkpoint to the next, so that started runs are soon finished and cached.
 """
 
 import time
@@ -68,7 +68,7 @@ class TrainingRun:
     - `key`: hash of the hyper-parameters that the algorithm uses; part of the names in the cache.
     - `checkpoints`: environment steps of its rows.
     - `configuration`: task and algorithm with these values; None if they cannot be trained.
-    - `error`: the reason why not, in one line.
+    - `error`: the reason why they cannot be trained, in one line.
     """
 
     values: Mapping[str, object]

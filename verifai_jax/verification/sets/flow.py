@@ -2,10 +2,11 @@
 
     end, during = flow(derivative, time, state, seconds)    # within a program for `Interpreter`
 
-First a box is found that no solution leaves during the step: one that contains what the initial
-states and the rates in it reach (Picard and Lindeloef). Then each solution is its Taylor polynomial
-of order `ORDER` at the initial state, a sum of forms, and a remainder, the next coefficient on that
-box. So results hold for the differential equation itself, in real arithmetic.
+First a box is found that no solution leaves during the step: it contains all states that the
+initial states can reach with the rates inside the box (Picard and Lindeloef). Then each solution is
+its Taylor polynomial of order `ORDER` at the initial state, a sum of forms, and a remainder, the
+next coefficient on that box. So results hold for the differential equation itself, in real
+arithmetic.
 
 Source: N. Nedialkov, K. Jackson, G. Corliss, Validated solutions of initial value problems for
 ordinary differential equations, Applied Mathematics and Computation 105 (1999), sections 5 and 6.

@@ -4,16 +4,17 @@
     y = add(x, product(x, x))
     low, high = y.bounds()                                    # [boxes, *shape] each
 
-A form is `centre + sum_i slopes[i] symbol_i + [-radius, radius]`, met with `[low, high]` where an
-operation knows an interval of its own. Each symbol lies in [-1, 1]: the first are the features of
-the box, so that what depends on them stays correlated through a whole simulation; others belong
-to a `Frame` of a loop (`frames.py`). In a box of width w the radius is of the order of w squared.
+A form is `centre + sum_i slopes[i] symbol_i + [-radius, radius]`, intersected with `[low, high]` if
+an operation has a separate interval. Each symbol lies in [-1, 1]. The first symbols are the
+features of the box, so numbers that depend on them stay correlated through a whole simulation;
+others belong to a `Frame` of a loop (`frames.py`). In a box of width w the radius is of the order
+of w squared.
 
-Each set contains the number in real arithmetic and the number that a computer gets: every result is
-widened by the rounding of its type, by numbers below the smallest normal one, which XLA takes for
-zero, and becomes unbounded where it may overflow. An interval without both ends stands for
-everything, NaN included; all operations keep that. Bounds are computed in double precision, whose
-own rounding is covered by what results are widened by.
+Each set contains both the number in real arithmetic and the computed number: every result is
+widened by the rounding of its type and by the smallest normal number, since XLA treats subnormal
+numbers as zero, and becomes unbounded if it may overflow. An interval without both ends contains
+everything, including NaN; all operations preserve that. Bounds are computed in double precision;
+the widening covers its rounding.
 
 Sources: L. de Figueiredo and J. Stolfi, Affine arithmetic: concepts and applications, Numerical
 Algorithms 37 (2004); S. Rump, INTLAB, 1999.

@@ -1,10 +1,10 @@
-"""Symbols of loops and of layers: what is not linear, carried along instead of wrapped in boxes.
+"""Symbols of loops and of layers, which keep nonlinear uncertainties correlated.
 
-A step of a loop turns and shears the set of states, and what is not linear adds an uncertainty to
-each number. Boxes around boxes would grow by that at each step. Here the uncertainties of the
-numbers that a loop carries are symbols, which go through the next step as those of the features do;
-once they are many, they become those of one parallelepiped, with orthogonal sides after scaling.
-The uncertainties of the units of a layer go through the layers after it as symbols of their own, up
+A step of a loop rotates and shears the set of states, and nonlinear terms add an uncertainty to
+each number. If each step enclosed the set in a box, the boxes would grow. Here the uncertainties of
+a loop's carried numbers are symbols, which the next step treats like those of the features. Once
+there are many, they are replaced by the symbols of one parallelepiped, with orthogonal sides after
+scaling. The uncertainties of a layer's units stay separate symbols through the following layers, up
 to a result of few numbers.
 
 Source: R. Lohner, Enclosing the solutions of ordinary initial and boundary value problems (1987);

@@ -1,12 +1,12 @@
-"""Functions of one or two numbers, on sets: their range, and a line with bounds around it.
+"""Functions of one or two numbers, on sets: their range, and a linear enclosure.
 
     FUNCTIONS["tanh"](x)                    # Form -> Form
     quotient(a, b), greater(a, b), power(a, b)
 
 A function f of one number is enclosed by `slope * x + offset +- error`. The slope is that of the
 secant, and the range of `f(x) - slope * x` is exact: its extremes are at the ends, or where the
-derivative of f is the slope, which each function has a formula for. A point that is wrong by
-rounding costs the square of that, which the widening of results covers.
+derivative of f equals the slope, for which each function has a formula. Rounding of such a point
+causes only a quadratic error, which the widening of results covers.
 """
 
 from collections.abc import Callable, Sequence

@@ -2,8 +2,8 @@
 
     values = Interpreter(boxes=512, features=3).closed(jaxpr, inputs)    # or `MissingRule`
 
-What an operation does is in the tables of `elementwise.py`, `arrays.py` and `control_flow.py`,
-by the name of JAX's primitive.
+The tables of `elementwise.py`, `arrays.py` and `control_flow.py` define the operations by the names
+of JAX's primitives.
 """
 
 from collections.abc import Callable, Sequence

@@ -1,6 +1,6 @@
 """Sets of whole numbers and of truth values: intervals, one for each box of a batch.
 
-A truth value that is open is the interval from 0 to 1.
+An undecided truth value is the interval from 0 to 1.
 """
 
 from collections.abc import Callable
