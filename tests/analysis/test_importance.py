@@ -52,7 +52,7 @@ def test_noise_means_nothing():
     found = importance(frame)
     assert not found.is_reliable("failing")
     assert not found.is_reliable("rho")
-    assert str(found).count("importances mean nothing") == 2
+    assert str(found).count("importances are meaningless") == 2
 
 
 def test_without_failures_only_the_robustness_is_explained():

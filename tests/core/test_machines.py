@@ -66,9 +66,7 @@ def test_an_accelerator_takes_all_lanes_of_the_monitor_at_once(monkeypatch):
         return (x,)
 
     whole = np.zeros((4 * lane_chunks.LANES, 2), np.float32)
-    (name,) = [n for n, f in vars(lane_chunks).items() if getattr(f, "__doc__", None) and
-               "a cache's worth at a time" in (f.__doc__ or "")]  # fmt: skip
-    in_chunks = getattr(lane_chunks, name)
+    in_chunks = lane_chunks.in_chunks
     jax.eval_shape(lambda x: in_chunks(seen, (0,), (0,), x), whole)
     assert max(sizes) < len(whole)
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")

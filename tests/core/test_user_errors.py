@@ -159,7 +159,7 @@ WRONG = [
     (branches, 'if f["mass"] > 0.5', "jnp.where(condition, one, other)"),
     (branches, 'if f["mass"] > 0.5', "vj.blackbox"),
     (converts, 'float(f["mass"])', "Leave out float()"),
-    (uses_math, "math.sin(", "jnp in place of math"),
+    (uses_math, "math.sin(", "jnp instead of math"),
     (counts, "int(f[", "jax.lax.fori_loop"),
     (counts_a_traced_integer, "jnp.int32", "jax.lax.fori_loop"),
     (uses_numpy, 'np.sin(f["mass"])', "jnp in place of np"),
@@ -169,12 +169,12 @@ WRONG = [
     (signal_in_jax, 'jnp.sin(f["wind"])', CALLED),
     (signal_in_numpy, 'np.sin(f["wind"])', CALLED),
     (signal_indexed, '["wind"][0]', CALLED),
-    (length_of_an_array, "jnp.zeros(f", "jnp.where(jnp.arange(most) < length"),
+    (length_of_an_array, "jnp.zeros(f", "jnp.where(jnp.arange(maximum) < length"),
     (piece_of_an_array, "jnp.ones(9)[", "jax.lax.dynamic_slice"),
     (key_of_a_dictionary, "{0: 1.0}[", "Index a jnp.array"),
     (writes_a_text, ":.2f", "jax.debug.print"),
     (writes_into_numpy, "values[0] = ", "jnp in place of np"),
-    (list_as_a_signal, '[f["mass"], 1.0]', "join them by jnp.stack"),
+    (list_as_a_signal, '[f["mass"], 1.0]', "join them with jnp.stack"),
     (function_as_a_signal, '{"x": f["wind"]}', "call it with the sample times"),
     (period_that_varies, 'dt=f["mass"]', "dt must be a plain number"),
     (loops, "lax.scan(", "carry input and carry output must have equal types"),
@@ -267,7 +267,7 @@ def test_without_the_text_of_the_code():
 def test_a_package_that_is_there_and_cannot_be_imported_says_why(tmp_path, monkeypatch):
     (tmp_path / "lacks_a_library.py").write_text("raise ImportError('libxcb.so.1: not found')")
     monkeypatch.syspath_prepend(tmp_path)
-    with pytest.raises(MissingExtra, match=r"lacks_a_library is installed and .*: libxcb.so.1"):
+    with pytest.raises(MissingExtra, match=r"lacks_a_library is installed but .*: libxcb.so.1"):
         require("lacks_a_library", "scenic")
 
 

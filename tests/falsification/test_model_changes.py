@@ -141,7 +141,7 @@ def test_a_run_that_recorded_no_model_says_so(folder):
     run = vj.load(folder, steeper)
     assert not run.sources
     assert run.changes() == ()
-    assert "is not recorded" in run.replay(0).finding
+    assert "were not recorded" in run.replay(0).finding
     assert not vj.resume(folder, steeper, budget=12, progress=False).sources
 
 

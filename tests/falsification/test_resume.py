@@ -191,7 +191,7 @@ class TestRefused:
 
     def test_a_search_of_ones_own_has_to_be_given(self, problem):
         run = vj.falsify(problem, Own(), 16, batch=16)
-        with pytest.raises(ValueError, match=r"is none of .*; give it"):
+        with pytest.raises(ValueError, match=r"is not one of .*; give it"):
             vj.resume(run, budget=32)
         resumed = vj.resume(run, search=Own(), budget=32)
         assert same(resumed, vj.falsify(problem, Own(), 32, batch=16))

@@ -134,7 +134,7 @@ def test_the_text_of_what_is_counted_reads_back(text):
     ("text", "error"),
     [
         ("duration(eventually[0, 1] x > 0, 3) < 1", "looks ahead: use an operator that looks back"),
-        ("duration(x > 0, 0) < 1", "in a window of some seconds; got 0"),
+        ("duration(x > 0, 0) < 1", "must be a positive number of seconds; got 0"),
         ("duration(x > 0, y) < 1", "the window of a duration is a number of seconds"),
         ("duration(x > 0) < 1", "no function 'duration'|duration"),
         ("duration(x > 0, 3)[0] < 1", "a component is a signal"),

@@ -108,7 +108,7 @@ def test_a_split_is_recorded_and_read_again(search):
         (lambda: split({}), "at least one part; got none"),
         (lambda: split({"x": "halten"}), "unknown search 'halten'"),
         (lambda: split({"colour": "gradient"}).check(CUBE), "at least one continuous feature"),
-        (lambda: from_json({"name": "halton"}), "describes no search"),
+        (lambda: from_json({"name": "halton"}), "does not describe a search"),
     ],
 )
 def test_bad_input(make, message):
