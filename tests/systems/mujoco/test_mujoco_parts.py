@@ -68,7 +68,7 @@ class TestPaths:
         wanted = cart(other, backend="native", keyframe=0)({})
         np.testing.assert_allclose(trace.signals["x"], wanted.signals["x"], atol=1e-6)
         with pytest.raises(
-            ValueError, match="'geom/g/mass': the inertia of body 'stated' is given"
+            ValueError, match="'geom/g/mass': the inertia of body 'stated' is giv"
         ):
             cart(bind={"m": "geom/g/mass"})
 
