@@ -67,9 +67,7 @@ class TestPaths:
         trace = system({"tip": jnp.float32(0.5), "more": jnp.float32(2.0)})
         wanted = cart(other, backend="native", keyframe=0)({})
         np.testing.assert_allclose(trace.signals["x"], wanted.signals["x"], atol=1e-6)
-        with pytest.raises(
-            ValueError, match="'geom/g/mass': the inertia of body 'stated' is giv"
-        ):
+        with pytest.raises(ValueError, match="'geom/g/mass': the inertia of body 'stated' is giv"):
             cart(bind={"m": "geom/g/mass"})
 
     @pytest.mark.slow
