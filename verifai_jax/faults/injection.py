@@ -40,8 +40,14 @@ class Injected(Link):
     entries: Entries
     other: Entries | None
     choice: tuple[str, int] | None
-    side: Side
-    draws: bool
+
+    @property
+    def side(self) -> Side:
+        return self.entries.side
+
+    @property
+    def draws(self) -> bool:
+        return self.fault.draws
 
     @property
     def features(self) -> tuple[str, ...]:
@@ -215,7 +221,7 @@ def inject(fault: Fault, passing: Passing, choice: tuple[str, int] | None = None
                 f"source of WrongChannel must be part of the same {entries.side} as "
                 f"{fault.channel!r}, with 1 or {entries.count} entries; got {fault.source!r}"
             )
-    return Injected(fault, entries, other, choice, entries.side, fault.draws)
+    return Injected(fault, entries, other, choice)
 
 
 def with_faults(problem: Problem, faults: Sequence[object], by_simulator: bool = False) -> Problem:

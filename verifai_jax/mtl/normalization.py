@@ -26,8 +26,8 @@ def normalize(formula: Formula, scales: Mapping[str, float] | Trace) -> Formula:
     """Divide each predicate of a formula by its scale; its truth stays, its robustness is relative.
 
     **Arguments:**
-    - `scales`: a typical magnitude for each signal by name, of which a predicate takes the largest
-      among its signals; or a trace, from which each predicate takes the range of its margin (1 if
+    - `scales`: a typical magnitude for each signal by name: the scale of a predicate is the largest
+      one among its signals. Or a trace: the scale of a predicate is the range of its margin (1 if
       that is constant).
     **Raises:** `UnknownNameError` for a scale that belongs to no signal of the formula,
     `ValueError` for a signal without a scale, or a scale that is not positive and finite.

@@ -23,7 +23,7 @@ from verifai_jax.core.compute.keys import run_keys
 from verifai_jax.core.compute.precision import reproducible_settings
 from verifai_jax.core.display.progress import shows_progress
 from verifai_jax.core.messages.checks import check_count, check_fraction
-from verifai_jax.core.messages.errors import suggests_options
+from verifai_jax.core.messages.errors import end_if_interrupted, suggests_options
 from verifai_jax.core.user_code.revisions import load_at_revision, split_revision
 from verifai_jax.core.values.trace import Status
 from verifai_jax.estimation.comparison.result import UNDECIDED, Compared, Comparison, judge
@@ -164,8 +164,7 @@ def _compare(
     except KeyboardInterrupt:
         stopped = "interrupted"
     if not any(tally.pairs for tally in tallies.values()):
-        if stopped == "interrupted":
-            raise KeyboardInterrupt
+        end_if_interrupted(stopped)
         raise ProblemError("no pair was simulated, so that nothing can be compared")
     return Comparison(
         target or baseline.name,

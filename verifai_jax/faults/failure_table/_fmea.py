@@ -24,7 +24,7 @@ from verifai_jax.core.messages.checks import check_count, check_fraction, is_num
 from verifai_jax.core.messages.errors import check_names, end_if_interrupted, suggests_options
 from verifai_jax.core.store.cache import locked_cache
 from verifai_jax.evaluation.backends import resolved
-from verifai_jax.falsification import simulate
+from verifai_jax.falsification import load, simulate
 from verifai_jax.falsification.run import Run
 from verifai_jax.faults.failure_table.effects import with_counterexample
 from verifai_jax.faults.failure_table.result import FailureTable
@@ -138,11 +138,14 @@ def _run_of(
     space = rows.problem.space
     frame = pd.DataFrame(space.rows(space.features_at(rows.nominal.settle(failing))))
     path = None if folder is None else Path(folder) / "counterexamples"
+    if path is not None and rows.cache.note("counterexamples") is not None:
+        return load(path, rows.problem)
     if path is not None:
-        # Made again each time: it takes seconds, as its confirmation does.
-        shutil.rmtree(path, ignore_errors=True)
+        shutil.rmtree(path, ignore_errors=True)  # What an interrupt left.
     run = simulate(rows.problem, frame, seed=rows.seed, folder=path, target=target, progress=False)
     end_if_interrupted(run.stopped)
+    if path is not None:
+        rows.cache.note("counterexamples", len(frame))
     return run
 
 

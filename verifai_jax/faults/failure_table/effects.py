@@ -41,7 +41,9 @@ def with_counterexample(
     off = {f"{name}.{n}": fault.weakest(n) for name, fault in own.items() for n in fault.domains}
     key = run_keys(run.seed)[1]
     without = simulate_again(run.problem, {**columns, **off}, key, row, run.precision)
-    command = "table." * (run.folder is None) + replay_command(run, row)
+    command = replay_command(run, row)
+    if run.folder is None:
+        command = f"table.{command}"
     shown_by, shown = _first_difference(again.trace, without.trace)
     grades = [f"{name}.{fault.grade}" for name, fault in own.items()]
     return replace(
