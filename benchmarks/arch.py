@@ -33,6 +33,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pandas as pd
+from seeds import FirstFailures, first_failures
 
 import verifai_jax as vj
 from specs.arch.lstm import from_folder
@@ -86,11 +87,11 @@ def requirements() -> dict[str, vj.Problem]:
     }
 
 
-def claimed(problem: vj.Problem, trials: vj.Trials) -> str:
+def claimed(problem: vj.Problem, found: FirstFailures) -> str:
     """Return how many of the first failures are confirmed, as text."""
-    if trials.failures is None or not trials.falsified:
+    if not found.falsified:
         return "-"
-    points = trials.failures[np.isfinite(trials.first_failure)]
+    points = found.points[np.isfinite(found.number)]
     features = jax.vmap(problem.space.unflatten)(jnp.asarray(points))
     rows = pd.DataFrame(problem.space.rows(features))
     checked = vj.confirm(vj.simulate(problem, rows, batch=64, progress=False))
@@ -153,8 +154,8 @@ def main() -> None:
                 line = " | ".join([name, search, rate, mean, mean, median, confirmed, ""])
                 print(f"| {line} |", flush=True)
                 continue
-            trials = vj.repeat(problem, search, budget, batch=1, seeds=chosen.seeds, confirm=False)
-            cost = trials.cost()
+            found = first_failures(problem, search, budget, 1, range(chosen.seeds))
+            cost = found.cost
             file = f"{name}.{search}.npy"
             if chosen.save:
                 chosen.save.mkdir(parents=True, exist_ok=True)
@@ -164,13 +165,14 @@ def main() -> None:
             finite = cost[np.isfinite(cost)]
             counts = ["-"] * 3
             if len(finite):
-                counts = [f"{trials.mean_simulations:.1f}", f"{finite.mean():.1f}"]
+                number = found.number[np.isfinite(found.number)]
+                counts = [f"{number.mean():.1f}", f"{finite.mean():.1f}"]
                 counts.append(f"{np.median(finite):.0f}")
-            confirmed = claimed(problem, trials)
+            confirmed = claimed(problem, found)
             published = PUBLISHED_1 if name.endswith("_instance1") else PUBLISHED
             best = published.get(name.removesuffix("_instance1"), "")
             best = best if search == "portfolio" else ""
-            rate = f"{trials.falsified}/{chosen.seeds}"
+            rate = f"{found.falsified}/{chosen.seeds}"
             line = " | ".join([name, search, rate, *counts, confirmed, best])
             print(f"| {line} |", flush=True)
             # Progress; not part of the table.

@@ -19,6 +19,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from landscapes import LANDSCAPES, tell_of
+from seeds import first_failures
 
 import verifai_jax as vj
 from verifai_jax.core.user_code.targets import load_target
@@ -75,7 +76,7 @@ def advance(search, rho, cube, batch, rounds, state):
     return jax.vmap(one)(state)
 
 
-def first_failures(search, landscape, batch, seeds):
+def first_on_landscape(search, landscape, batch, seeds):
     """Number of the first failing simulation of each seed, counted from 1; infinite without one.
 
     **Returns:** that, and the same with a derivative counted as a simulation more.
@@ -108,7 +109,7 @@ def on_landscapes(options):
     for name, (search, batch) in searches(options.searches).items():
         started, cells, doubled = time.perf_counter(), [], []
         for landscape in chosen:
-            counts = first_failures(search, LANDSCAPES[landscape], batch, options.seeds)
+            counts = first_on_landscape(search, LANDSCAPES[landscape], batch, options.seeds)
             for median, row in zip(map(np.median, counts), (cells, doubled), strict=True):
                 row.append(f"{median:>8.0f} {expected[landscape] / median:>6.1f}x")
         seconds = time.perf_counter() - started
@@ -126,10 +127,7 @@ def first_failure(problem, search, batch, seed, budget):
 
 def median_cost(problem, search, batch, options):
     """Median of what the first failure costs, a derivative as a simulation more."""
-    trials = vj.repeat(
-        problem, search, options.budget, batch=batch, seeds=options.seeds, confirm=False
-    )
-    cost = trials.cost()
+    cost = first_failures(problem, search, options.budget, batch, range(options.seeds)).cost
     return statistics.median(np.where(np.isfinite(cost), cost, options.budget).tolist())
 
 

@@ -130,7 +130,6 @@ LONG_FILES = (
     "test_remembered.py",
     "test_gaussian_process.py",
     "test_cli.py",
-    "test_repeat.py",
     "test_estimate_methods.py",
     "test_learning_curves.py",
     "test_sweep_driver.py",

@@ -58,8 +58,6 @@ if TYPE_CHECKING:
     from verifai_jax.falsification import load as load
     from verifai_jax.falsification import resume as resume
     from verifai_jax.falsification import simulate as simulate
-    from verifai_jax.falsification._repeat import Trials as Trials
-    from verifai_jax.falsification._repeat import repeat as repeat
     from verifai_jax.falsification.fuzzing import FuzzCoverage as FuzzCoverage
     from verifai_jax.falsification.fuzzing import FuzzRun as FuzzRun
     from verifai_jax.falsification.fuzzing import fuzz as fuzz

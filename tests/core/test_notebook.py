@@ -70,7 +70,7 @@ def test_results_of_every_verb_show_themselves():
     from verifai_jax.training.hardening.result import Hardening
     from verifai_jax.training.sweeps.importance import HyperparameterImportance
 
-    verbs = [vj.Estimate, vj.Modes, vj.Comparison, vj.Trials, vj.Certificates, vj.Augmentation]
+    verbs = [vj.Estimate, vj.Modes, vj.Comparison, vj.Certificates, vj.Augmentation]
     verbs += [vj.Synthesis, vj.Repair, vj.Confirmation, vj.Confirmations, vj.FuzzRun]
     verbs += [counterexamples.Explained, counterexamples.Shrunk, vj.Mode]
     verbs += [vj.perception.Compositional, synthesis.Repair, vj.mtl.Explanation, vj.mtl.Mined]

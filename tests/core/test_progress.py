@@ -139,7 +139,7 @@ def test_one_bar_on_a_terminal_for_a_verb_and_what_it_calls(monkeypatch):
 
 def test_every_verb_that_takes_long_says_what_it_is_doing():
     verbs = [
-        vj.compare, vj.repair, vj.synthesize, vj.shrink, vj.explain, vj.confirm, vj.repeat,
+        vj.compare, vj.repair, vj.synthesize, vj.shrink, vj.explain, vj.confirm,
         vj.replay_counterexamples, vj.estimate, vj.modes, vj.certify, vj.falsify, vj.fuzz,
         vj.resume, vj.simulate, vj.sweep, vj.augment, vj.rl.train, vj.analysis.analyze,
         vj.analysis.sobol_indices, vj.analysis.morris, vj.analysis.gradient_sensitivity,

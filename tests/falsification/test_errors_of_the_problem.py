@@ -162,18 +162,6 @@ def test_parameters_with_which_all_raise_are_not_searched():
         assert len(CALLS) == 64
 
 
-@pytest.mark.thorough
-@pytest.mark.parametrize("search", ["uniform", "gradient"])
-def test_seeds_of_which_all_raise_are_not_repeated(search):
-    def traced(features, key):
-        bad = jnp.int32(Status.ERROR)
-        return vj.Trace({"x": jnp.full(2, features["x"])}, dt=1.0, status=bad)
-
-    asked = vj.Problem("p", SPACE, traced, "x > 0")
-    with pytest.raises(RuntimeError, match=r"each of the first \d+ simulations .* raised an error"):
-        vj.repeat(asked, search, 400, batch=16, seeds=4, progress=False)
-
-
 def test_what_is_known_of_signals_is_checked_before():
     declared = problem(_trace, "always p > 0", signals={"x": 1, "p": 2})
     with pytest.raises(TypeError, match="signal 'p' is a vector of 2 components"):

@@ -148,8 +148,6 @@ def test_it_is_refused_where_it_has_no_effect_and_where_it_is_wrong():
     for name in ("uniform", "halton"):
         with pytest.raises(ValueError, match=r"has a guide, which steers searches that learn"):
             vj.falsify(GUIDED, name, 16)
-    with pytest.raises(ValueError, match="a guide"):
-        vj.repeat(GUIDED, "cross_entropy", 16, seeds=2)
     with unchecked(), pytest.raises(TypeError, match="a guide must be a formula"):
         vj.Guide(3)
     with pytest.raises(ValueError, match="weight of a guide"):

@@ -4,7 +4,6 @@ import importlib
 import sys
 from dataclasses import replace
 
-import numpy as np
 import pytest
 
 import verifai_jax as vj
@@ -102,13 +101,3 @@ def test_a_repair_from_a_run_of_another_model_says_so(project):
     (project / "gains.py").write_text("GAIN = 3.0\n")
     found = vj.repair(replace(run, problem=tuning()), "bias", **options)
     assert str(found).startswith("The model has changed since the run: gains.py (SHA-256 ")
-
-
-@pytest.mark.thorough
-def test_seeds_of_a_search_record_their_model():
-    def system(features, key):
-        return vj.Trace({"x": np.ones(3) * features["a"]}, dt=0.1)
-
-    problem = vj.Problem("line", {"a": vj.Box(0.0, 1.0)}, system, "always x < 0.5")
-    found = vj.repeat(problem, "uniform", 8, seeds=2, confirm=False, progress=False)
-    assert any(name.endswith("test_certified_model.py") for name in names(found))
