@@ -675,22 +675,6 @@ def test_a_new_project_passes_its_tests(call, tmp_path):
     assert "2 passed" in done.stdout.decode()
 
 
-@pytest.mark.thorough
-def test_parts_of_a_job_array_are_merged_to_the_run_of_one_machine(call, tmp_path):
-    for number in (1, 2):
-        output = call("falsify", "specs/ramp.py:ramp", "--budget", 300, "--shard", f"{number}/2")
-        assert "merge        verifai-jax merge runs/ramp-parts/*" in output
-    parts = sorted((tmp_path / "runs" / "ramp-parts").iterdir())
-    output = call("merge", *parts, "--folder", "merged", "--no-pictures")
-    assert "of 300 simulations violate the property" in output
-    call(
-        "falsify", "specs/ramp.py:ramp", "--search", "uniform", "--budget", 300,
-        "--folder", "whole", "--no-pictures",
-    )  # fmt: skip
-    merged, whole = load(tmp_path / "merged"), load(tmp_path / "whole")
-    assert merged.table.all.equals(whole.table.all)
-
-
 @pytest.mark.parametrize(
     "option", [["--seed", 0], ["--no-confirm"], ["--diverse"], ["--set", "a=1"]]
 )
@@ -699,11 +683,6 @@ def test_an_option_that_the_run_has_fixed_is_refused_and_not_ignored(call, optio
     assert f"{option[0].replace('--no-', '--')} is fixed in the run" in output
 
 
-def test_a_part_alone_neither_stops_nor_learns_nor_uses_a_cluster(call):
-    for option in (["--stop-after", 3], ["--cluster", "dask://a:1"], ["--diverse"]):
-        output = call("falsify", "specs/ramp.py:ramp", "--shard", "1/2", *option, code=2)
-        assert f"{option[0]} needs all rows of a run" in output
+def test_an_unknown_kind_of_cluster_is_refused(call):
     output = call("falsify", "specs/ramp.py:ramp", "--cluster", "dusk://a:1", code=2)
     assert "unknown kind of cluster 'dusk'; did you mean 'dask'?" in output
-    output = call("falsify", "specs/ramp.py:ramp", "--shard", "3", code=2)
-    assert "a shard is written as 3/16" in output

@@ -13,7 +13,6 @@ import pytest
 import verifai_jax as vj
 from verifai_jax.core.store.files import sealed
 from verifai_jax.core.user_code.targets import load_target
-from verifai_jax.falsification.shards import Shard, merge, simulate_shard
 
 SPEC = """
 import numpy as np
@@ -226,16 +225,6 @@ def test_studies_of_a_row_begin_with_it(folder):
     for found in (vj.explain(run), vj.shrink(run, budget=40), vj.confirm(run)):
         assert begin not in str(found)
         assert "its number again" not in str(found)
-
-
-def test_parts_of_a_run_are_of_one_model(tmp_path):
-    for number in (1, 2):
-        problem = slope(SPEC if number == 1 else STEEPER)
-        simulate_shard(problem, Shard(number, 2), "uniform", 8, folder=tmp_path / str(number))
-    with pytest.raises(ValueError, match=r"the model has changed since the part in .*spec\.py"):
-        merge([tmp_path / "1", tmp_path / "2"], problem)
-    with pytest.raises(ValueError, match="rows of one run are of one model"):
-        simulate_shard(problem, Shard(1, 2), "uniform", 8, folder=tmp_path / "1")
 
 
 def test_a_saved_counterexample_knows_its_model(folder, tmp_path):

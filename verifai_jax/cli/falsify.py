@@ -17,18 +17,12 @@ from verifai_jax.cli.json_output import command, describe_run, give_result
 from verifai_jax.cli.next_folder import given_or_next
 
 if TYPE_CHECKING:
-    from verifai_jax import Decided, Problem, Run, Within
-    from verifai_jax.search import Search
+    from verifai_jax import Decided, Run, Within
 _RESUMES = (
     *("resume", "target", "only", "budget", "max_seconds", "stop_after", "within", "decide"),
     *("even_if_changed", "cluster", "fail_on"),
 )
 """Options that go with `--resume`; the run has fixed the others."""
-_PARTS = (
-    *("shard", "target", "search", "options", "budget", "batch", "seed", "only", "precision"),
-    *("backend", "confirm", "folder", "even_if_changed"),
-)
-"""Options that go with `--shard`; the others need all rows."""
 
 
 @command()
@@ -55,11 +49,6 @@ _PARTS = (
 @arguments.ENGINE
 @arguments.CLUSTER
 @arguments.PROVED
-@option(
-    "--shard",
-    metavar="I/N",
-    help="Simulate only part I of N, as a job of an array; merge combines the parts.",
-)
 @click.option(
     "--confirm/--no-confirm",
     default=True,
@@ -97,7 +86,6 @@ def falsify(
     resume: Path | None,
     even_if_changed: bool,
     cluster: str | None,
-    shard: str | None,
     diverse: bool,
     diverse_by: Literal["inputs", "behaviour"] | None,
     folder: Path | None,
@@ -114,22 +102,11 @@ def falsify(
     if pictures:
         while_compiling(figure.load)
     stop_when = _stopping_rule(within, decide)
-    if shard is not None:
-        arguments.refuse_others(_PARTS, "needs all rows of a run; --shard has only a part")
-    elif resume is not None:
+    if resume is not None:
         arguments.refuse_others(_RESUMES, "is fixed in the run that --resume goes on with")
         target = target or _resumed_target(resume)
     if target is None:
         raise click.UsageError("Missing argument 'TARGET', such as specs/cartpole.py:balance.")
-    if shard is not None:
-        chosen = named(search or "uniform", **arguments.plain_values("--set", options))
-        asked = {
-            name: given[name]
-            for name in ("batch", "seed", "precision", "backend", "confirm", "progress")
-        }
-        problem = arguments.load_problem(target, only)
-        _simulate_shard(problem, shard, chosen, budget or 10_000, folder, target=target, **asked)
-        return
     ends = {"--max-seconds": given["max_seconds"], "--stop-after": given["stop_after"]}
     ends |= {"--within": within, "--decide": decide, "--cluster": cluster}
     goes_on = partial(arguments.resuming, "falsify", target=target, options=ends)
@@ -174,30 +151,6 @@ def falsify(
             )
     print_run(run, pictures, ends)
     check_run(run, fail_on)
-
-
-def _simulate_shard(
-    problem: "Problem",
-    shard: str,
-    search: "Search",
-    budget: int,
-    folder: Path | None,
-    **options: Any,
-) -> None:
-    """Simulate one part of a run, and say what makes the run of the parts."""
-    from verifai_jax.core.messages.text import folder_name
-    from verifai_jax.falsification.shards import Shard, simulate_shard
-
-    part = Shard.parse(shard)
-    parts = Path("runs") / f"{folder_name(problem.name)}-parts"
-    path = parts / f"{part.number}-of-{part.of}" if folder is None else folder
-    simulations = simulate_shard(problem, part, search, budget, folder=path, **options)
-    click.echo(f"part {part} of {problem.name}: {simulations:,} of {budget:,} simulations")
-    give_result(
-        problem=problem.name, part=str(part), simulations=simulations, budget=budget, folder=path
-    )
-    click.echo(f"  part         {path}")
-    click.echo(f"  merge        verifai-jax merge {shlex.quote(str(path.parent))}/*")
 
 
 def _resumed_target(folder: Path) -> str:

@@ -34,7 +34,6 @@ from verifai_jax.cli.going_on import WORDS
 from verifai_jax.cli.harden import harden
 from verifai_jax.cli.list import list_targets
 from verifai_jax.cli.mcp import mcp
-from verifai_jax.cli.merge import merge
 from verifai_jax.cli.modes import modes
 from verifai_jax.cli.monitor import monitor
 from verifai_jax.cli.new import new
@@ -52,7 +51,6 @@ from verifai_jax.core.messages.errors import unknown_name
 
 COMMANDS = (
     falsify,
-    merge,
     fuzz,
     harden,
     list_targets,
