@@ -9,7 +9,6 @@ import pandas as pd
 import pytest
 
 import verifai_jax as vj
-from verifai_jax import search
 from verifai_jax.features.given import given_features
 
 SPACE = {
@@ -72,7 +71,7 @@ def test_every_form_is_simulated_as_it_is(problem, precision):
 
 
 @pytest.mark.slow
-def test_rows_before_a_search_and_suggestions(tmp_path):
+def test_rows_before_a_search(tmp_path):
     options = {"batch": 8, "first": [ROW], "folder": tmp_path / "run"}
     run = vj.falsify(PROBLEM, "cross_entropy", 16, **options)
     assert run.table.all.loc[0, NUMBERS].tolist() == numbers("float32")
@@ -82,14 +81,6 @@ def test_rows_before_a_search_and_suggestions(tmp_path):
         .table.all.head(1)
         .equals(run.table.all.head(1))
     )
-    asked = search.Suggested(lambda question: [ROW], search.CrossEntropy(), times=2, every=8)
-    found = vj.falsify(PROBLEM, asked, 17, batch=8).table.all
-    given = found.loc[found["suggested"]]
-    assert len(given) == 2
-    assert (
-        given[NUMBERS].to_numpy().tolist() == [np.float32([ROW[n] for n in NUMBERS]).tolist()] * 2
-    )
-    assert set(given["size"]) == {"2"}
 
 
 @pytest.mark.thorough

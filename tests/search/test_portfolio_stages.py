@@ -7,8 +7,8 @@ import pytest
 from playing import tell_of
 
 from verifai_jax.core.values.cube import Cube
-from verifai_jax.search import Diverse, Portfolio, descent, portfolio
-from verifai_jax.search.portfolio import MANY, NEVER, PATIENT, PortfolioStage
+from verifai_jax.search import Diverse, Portfolio, descent
+from verifai_jax.search.portfolio import MANY, PATIENT, PortfolioStage
 
 CUBE = Cube((0,) * 3)
 PLAIN = PortfolioStage(Portfolio(), descends=False)
@@ -120,12 +120,3 @@ def test_a_failure_ends_the_count_of_barren_rounds():
     assert int(state.barren) == 0
     *_, (_, state) = play(PLAIN, state, 64, 2)
     assert int(state.barren) == 128
-
-
-@pytest.mark.slow
-def test_suggested_starts_are_descended_from_at_once():
-    state, batch = begin(4), MANY + 1
-    told = portfolio.Observations(jnp.full((4, 3), 0.25), jnp.full(4, 0.5), jnp.ones(4, bool))
-    started = Portfolio().start_from(state, CUBE, told)
-    assert int(started.barren) == NEVER
-    assert Portfolio().stage(started, CUBE, batch) == DESCENDS

@@ -6,7 +6,6 @@ run = resume(run, budget=50_000)
 
 import time
 from collections.abc import Iterable, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
@@ -54,7 +53,6 @@ from verifai_jax.falsification.validation import (
 )
 from verifai_jax.problem.problem import Problem
 from verifai_jax.search import Search
-from verifai_jax.search.suggested import without_suggestions
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -175,7 +173,6 @@ def falsify(
 
         proved = as_verification(proved)
         problem, of_rest = proved.rest(problem, precision), (proved.note,)
-    asking, search = without_suggestions(search)
     default = search == AUTO
     usual = "cross_entropy" if objective == "likelihood" else "portfolio"
     search = check_search(problem, usual if default else search)
@@ -220,19 +217,14 @@ def falsify(
         table = ErrorTable(tuple(problem.space.columns), path)
         rounds = Rounds(
             problem, search, size, seed, table, precision, path, confirm, executor, target, given,
-            suggests=asking is not None, budget=budget,
-            engine=as_wanted(engine, portable=ends.may_be_early or search.learns),
+            budget=budget, engine=as_wanted(engine, portable=ends.may_be_early or search.learns),
         )  # fmt: skip
-        if asking is not None:
-            rounds.ask(replace(asking, search=search))
 
         def prepare() -> None:
             if earlier is not None:
                 rounds.warm(earlier)
             chooses = default and not diverse and not search.wants.likelihood
-            if asking is not None or not can_be_slow(problem, executor):
-                return
-            if keep_going and not chooses:
+            if not can_be_slow(problem, executor) or (keep_going and not chooses):
                 return
             seconds = rounds.measure(size, timed=chooses)
             if not chooses or (rounds.hopeless is not None and not keep_going):
@@ -377,7 +369,6 @@ def _resume(
                 "search=)"
             )
         search = recorded_search(run)
-    asking, search = without_suggestions(search)
     search = check_search(problem, search)
     check_same_space(run, problem)
     check_same_guide(run, problem)
@@ -406,11 +397,9 @@ def _resume(
         table = run.table.resumed(rows, run.folder)
     rounds = Rounds(
         problem, search, run.batch, run.seed, table, run.precision, run.folder, run.confirm,
-        executor, run.target, rows_of_first(run.first, problem), suggests=asking is not None,
+        executor, run.target, rows_of_first(run.first, problem),
         engine=as_wanted(run.engine), budget=run.budget,
     )  # fmt: skip
-    if asking is not None:
-        rounds.ask(replace(asking, search=search), checkpoint)
     rounds.checks = tuple(run.checks)
 
     def prepare() -> None:

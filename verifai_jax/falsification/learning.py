@@ -32,8 +32,8 @@ if TYPE_CHECKING:
 MAX_WARM = 2048
 """Rows of an earlier table that a search starts with at most, the worst ones: a bound on what the
 first `tell` costs, whatever the length of that table."""
-Source = Literal["search", "first", "suggested"]
-"""The origin of a round's points: the search, the user before the run, or the user during it."""
+Source = Literal["search", "first"]
+"""The origin of a round's points: the search, or the user before the run."""
 
 
 class Batch(NamedTuple):
@@ -171,18 +171,11 @@ class Learning:
         verdicts: Verdicts,
         outcomes: Float[np.ndarray, "n outcome"] | None,
     ) -> None:
-        """Let the search start from points that a person gave."""
+        """Let the search learn from points that a person gave."""
         self.proposals.remember(batch.points)
         proper = verdicts.proper
         points, rho = batch.points[proper], objective[proper].astype(np.float32)
-        outcomes = None if outcomes is None else outcomes[proper]
-        if batch.source == "first":
-            self.proposals.warm_start(points, rho, outcomes)
-            return
-        # The best ones last, so that none of a small batch takes their place.
-        order = np.argsort(-rho, kind="stable")
-        outcomes = None if outcomes is None else outcomes[order]
-        self.proposals.start_from(points[order], rho[order], outcomes)
+        self.proposals.warm_start(points, rho, None if outcomes is None else outcomes[proper])
 
     def _tell(
         self,

@@ -42,8 +42,6 @@ if TYPE_CHECKING:
 
     from verifai_jax.core.compute.executors import Executor
     from verifai_jax.falsification.prefetch import Prefetch
-    from verifai_jax.falsification.suggestions import Suggestions
-    from verifai_jax.search import Suggested
 COMPILE, SEARCH, SIMULATE, CONFIRM, REST = "compile", "search", "simulate", "confirm", "rest"
 """Activities by which the seconds of a run are counted."""
 
@@ -52,11 +50,11 @@ class Rounds:
     """The rounds of one run; call `compile` first, then `advance` as often as wanted.
 
     `first` are rows of given features (`given_rows`) that are simulated before the search proposes
-    any; `suggestions` are points that a user's function gives during the run, None without one.
-    `record_checksum` is the checksum of the run's record, for the checkpoints. `only_budget_ends`
-    is true if nothing but the budget can end the run. `checks` names the closer replays that were
-    made. `watch` measures seconds: `COMPILE`; `SEARCH`, for proposals, learning and suggestions;
-    `SIMULATE`, including adding rows to the table; `CONFIRM`. Other time is not counted here.
+    any. `record_checksum` is the checksum of the run's record, for the checkpoints.
+    `only_budget_ends` is true if nothing but the budget can end the run. `checks` names the closer
+    replays that were made. `watch` measures seconds: `COMPILE`; `SEARCH`, for proposals and
+    learning; `SIMULATE`, including adding rows to the table; `CONFIRM`. Other time is not counted
+    here.
     """
 
     def __init__(
@@ -72,14 +70,12 @@ class Rounds:
         executor: "Executor | None" = None,
         target: str | None = None,
         first: Float[np.ndarray, "n row"] | None = None,
-        suggests: bool = False,
         engine: Wanted = "xla",
         budget: int = 0,
     ) -> None:
         self.problem, self.batch, self.table = problem, batch, table
         self.precision, self.folder = precision, folder
         self.first = np.zeros((0, problem.space.dim), np.float32) if first is None else first
-        self.suggestions: Suggestions | None = None
         self.learning = Learning(problem, search, run_keys(seed)[0])
         self._journal = None
         if folder is not None and problem.black_box:
@@ -91,7 +87,7 @@ class Rounds:
             problem, search, batch, seed, precision=precision, journal=self._journal,
             executor=executor, target=target, guidance=self.learning.guidance,
             keep_traces=self.learning.surrogate is not None,
-            given=suggests or self.first.shape[1] > problem.space.dim,
+            given=self.first.shape[1] > problem.space.dim,
             engine=engine, budget=budget,
         )  # fmt: skip
         self._confirmer = None
@@ -153,20 +149,12 @@ class Rounds:
                 self._keep()
 
     def _next_points(self, maximum: int, limit: int | None) -> Batch:
-        """Return the points of the next round: given ones, then suggestions, then proposals."""
+        """Return the points of the next round: given ones, then proposals."""
         # The number of rows alone says how many of them are still to come, so resuming goes on.
         done = len(self.table)
         given = self.first[done : done + maximum]
         if len(given):
             return Batch(given, "first", maximum < self.batch and len(self.first) > done + maximum)
-        if self.suggestions is not None:
-            with self._searching():
-                given = self.suggestions.next_points(
-                    self.table, self.evaluate.key, self._keep_on_disk
-                )
-            left = maximum if limit is None else max(limit - done, 0)
-            if len(given[:left]):
-                return Batch(given[:left], "suggested", limit is not None and len(given) > left)
         if self._prefetch is None:
             self._prefetch = self._begin_prefetching(done + maximum if limit is None else limit)
         if self._prefetch is not None:
@@ -190,8 +178,8 @@ class Rounds:
         """
         done, proposals = len(self.table), self.learning.proposals
         here = self.only_budget_ends and limit > done + self.batch and present() is None
-        asked = self.problem.black_box or self.suggestions is not None
-        if self.search.learns or not (self._has_workers or (here and not asked)):
+        here = here and not self.problem.black_box
+        if self.search.learns or not (self._has_workers or here):
             return None
         from verifai_jax.falsification.prefetch import Prefetch
 
@@ -221,8 +209,6 @@ class Rounds:
             points = np.asarray(batch.points[:, : self.problem.space.dim], np.float32)
             batch = batch._replace(points=points)
         columns = rows_of(self.problem, verdicts, self._simulations.differentiates)
-        if self.suggestions is not None:
-            columns["suggested"] = np.full(len(batch.points), batch.source == "suggested")
         coverage_ids, book = None, self.learning.coverage_ids
         if book is not None:
             coverage_ids = book.of(batch.points, verdicts)
@@ -283,22 +269,6 @@ class Rounds:
             if proposals.stage.wants.clause_gradients:
                 self._simulations.begin_derivatives()
             proposals.wait()
-
-    def ask(self, search: "Suggested", checkpoint: Mapping[str, Any] | None = None) -> None:
-        """Ask a function for suggestions from now on, or continue asking from a checkpoint.
-
-        **Raises:** `ValueError` if a checkpoint has open questions and no function is given.
-        """
-        from verifai_jax.falsification.suggestions import Suggestions
-
-        self.suggestions = Suggestions(search, self.problem, self.precision)
-        if checkpoint is not None:
-            self.suggestions.restore(checkpoint)
-            self.suggestions.check_source()
-
-    def _keep_on_disk(self) -> None:
-        self._keep()
-        self.save()
 
     def measure(self, maximum: int, timed: bool) -> float:
         """Simulate the first rows, and return the shortest time of a row in seconds.
@@ -389,8 +359,7 @@ class Rounds:
     def notes(self) -> tuple[str, ...]:
         """Decisions of the engines that a user may not expect."""
         raised = () if self._confirmer is None else self._confirmer.raised
-        suggested = () if self.suggestions is None else self.suggestions.notes
-        return (*self._simulations.notes, *raised, *suggested)
+        return (*self._simulations.notes, *raised)
 
     @property
     def exhausted(self) -> bool:
@@ -441,7 +410,6 @@ class Rounds:
             self.checkpoint |= part.checkpoint()
 
     @property
-    def _parts(self) -> "list[Learning | Suggestions | Confirmer]":
+    def _parts(self) -> list[Learning | Confirmer]:
         """The objects with their own entries in a checkpoint."""
-        each = (self.learning, self.suggestions, self._confirmer)
-        return [part for part in each if part is not None]
+        return [self.learning, *([] if self._confirmer is None else [self._confirmer])]

@@ -46,7 +46,7 @@ class Run(InNotebook):
       process was killed.
     - `compile_seconds`, `confirm_seconds`, `run_seconds`: time spent compiling, in closer replays,
       and in everything else, over all parts of the run.
-    - `search_seconds`: the part of `run_seconds` spent on proposals, suggestions and learning.
+    - `search_seconds`: the part of `run_seconds` spent on proposals and learning.
     - `simulate_seconds`: the part of `run_seconds` spent on simulations and on adding rows to the
       table. The rest went to callbacks and checkpoints.
     - `version`: the version of verifai_jax.

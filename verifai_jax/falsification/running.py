@@ -258,18 +258,12 @@ class Running:
             after += cut_short_note(search, total, max(simulated, 0))
         return replace(result, notes=(*result.notes, *after))
 
-    @property
-    def _recorded_search(self) -> Search:
-        """The search, wrapped in its suggestions if it has any."""
-        asked = self.rounds.suggestions
-        return self.rounds.search if asked is None else asked.search
-
     def result(self, stopped: str) -> Run:
         """Return the run as it is now.
 
         - `stopped`: the condition that ended it.
         """
-        rounds, problem, search = self.rounds, self.rounds.problem, self._recorded_search
+        rounds, problem, search = self.rounds, self.rounds.problem, self.rounds.search
         spent = dict(rounds.watch.seconds)
         origin = origin_of(search, len(rounds.first))
         why = self.choice.why

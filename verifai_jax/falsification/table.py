@@ -56,7 +56,6 @@ RESERVED = (
     "verdict",
     "rho_again",
     "new_coverage",
-    "suggested",
 )
 """Names of the table's own columns, which no feature may have."""
 _FEW = 256

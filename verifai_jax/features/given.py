@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     import pandas as pd
 Rows: TypeAlias = "pd.DataFrame | pd.Series | Iterable[Any] | Mapping[str, Any]"
 """Features of simulations: the feature columns of a table, a row of one, or dictionaries."""
-TABLE_COLUMNS = ("row", "rho", "violated", "status", "verdict", "suggested", "message")
+TABLE_COLUMNS = ("row", "rho", "violated", "status", "verdict", "message")
 """Columns of a table other than its features, which a dictionary made of a row may hold."""
 
 

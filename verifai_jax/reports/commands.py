@@ -53,13 +53,9 @@ def _options_of_search(name: str, options: dict[str, Any]) -> list[str]:
 def run_python(run: Run) -> str:
     """Return the lines of Python that repeat a run."""
     how = f"search={run.search!r}" if not run.search_data else f"search=vj.search.{run.search}"
-    asks = bool(run.search_data) and "suggested" in run.search_data
-    if asks:
-        how = "search=suggested"
     lines = [
         "import verifai_jax as vj",
         f"# problem: {run.name}" + ("" if run.target is None else f", of {run.target}"),
-        *([f"# suggested: {run.search}, whose function is not recorded"] if asks else []),
         f"run = vj.falsify(problem, {how},",
         f"                 budget={run.budget}, batch={run.batch}, seed={run.seed},",
         f"                 precision={run.precision!r}, confirm={run.confirm})",

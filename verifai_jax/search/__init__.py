@@ -38,7 +38,6 @@ if TYPE_CHECKING:
     from verifai_jax.search.point_list import PointList as PointList
     from verifai_jax.search.portfolio import Portfolio as Portfolio
     from verifai_jax.search.sobol import Sobol as Sobol
-    from verifai_jax.search.suggested import Suggested as Suggested
     from verifai_jax.search.trace_surrogate import TraceSurrogate as TraceSurrogate
     from verifai_jax.search.turbo import TuRBO as TuRBO
     from verifai_jax.search.uniform import Uniform as Uniform
@@ -65,7 +64,7 @@ _SEARCHES = {
     "descent": "Descent",
     "portfolio": "Portfolio",
 }
-_WRAPPERS = {"diverse": "Diverse", "likeliest": "Likeliest", "suggested": "Suggested"}
+_WRAPPERS = {"diverse": "Diverse", "likeliest": "Likeliest"}
 
 
 def names() -> tuple[str, ...]:
@@ -120,10 +119,6 @@ def to_json(search: "Search") -> dict[str, Any] | None:
     options = {f.name: getattr(search, f.name) for f in fields(cast(Any, search))}
     if kind.__name__ in _WRAPPERS.values():
         described: dict[str, Any] = {kind.__name__.lower(): to_json(options.pop("search"))}
-        if kind.__name__ == "Suggested":
-            del options["suggest"]
-            options["units"] = dict(options["units"])
-            described["source"] = cast("Suggested", search).source
         whole = described[kind.__name__.lower()] is not None
         return described | ({"options": options} if options else {}) if whole else None
     for name, of in _SEARCHES.items():
@@ -146,10 +141,6 @@ def from_json(data: Mapping[str, Any]) -> "Search":
     for name, kind in _WRAPPERS.items():
         if name in data:
             options = dict(data.get("options", {}), search=from_json(data[name]))
-            if kind == "Suggested":
-                from verifai_jax.search.suggested import Absent
-
-                options["suggest"] = Absent(str(data.get("source", "a function")))
             return lazy_import(__name__, kind)(**options)
     if not isinstance(data.get("options"), Mapping):
         raise ValueError(f"this does not describe a search: {data!r}")

@@ -117,11 +117,6 @@ class Split(Search[tuple[PyTree, ...]]):
     ) -> tuple[PyTree, ...]:
         return self._learn("warm_start", state, cube, observations)
 
-    def start_from(
-        self, state: tuple[PyTree, ...], cube: Cube, observations: Observations
-    ) -> tuple[PyTree, ...]:
-        return self._learn("start_from", state, cube, observations)
-
     def temperature(self, state: tuple[PyTree, ...]) -> Float[Array, ""]:
         """Return the temperature of the first part that wants gradients."""
         for search, its in zip(self.searches, state, strict=True):

@@ -225,7 +225,7 @@ class Search(ForUsers, abc.ABC, Generic[State]):
 
     _internal = frozenset((
         "distinct", "fallback", "learns", "needs_derivatives", "origin", "plan", "samples_prior",
-        "sequence", "stage", "start_from", "temperature", "total", "wants", "warm_start",
+        "sequence", "stage", "temperature", "total", "wants", "warm_start",
     ))  # fmt: skip
 
     @property
@@ -293,10 +293,6 @@ class Search(ForUsers, abc.ABC, Generic[State]):
         """Learn from points of an earlier table, before the first `ask`."""
         return self.tell(state, cube, observations)
 
-    def start_from(self, state: State, cube: Cube, observations: Observations) -> State:
-        """Learn from points that a user suggested between two rounds, and start from them."""
-        return self.warm_start(state, cube, observations)
-
     def distinct(self, state: State) -> Int[Array, ""] | None:
         """Return the number of failures found so far that are far from each other.
 
@@ -336,7 +332,7 @@ class PointSequence(Search[State]):
 
 
 class SlopeSearch(Search[State]):
-    """A search that follows gradients of clauses, and can also start from suggested points.
+    """A search that follows gradients of clauses, and can also start from given points.
 
     Its state has the points `offered` as next starts, and `near`, the closeness of each to failing.
     """

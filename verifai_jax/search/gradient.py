@@ -294,26 +294,6 @@ class Gradient(SlopeSearch[GradientState]):
         )
         return choose(state.differentiates, differentiated, undifferentiated)
 
-    def start_from(
-        self, state: GradientState, cube: Cube, observations: Observations
-    ) -> GradientState:
-        """Replace some descents by new ones from these points, which are differentiated next.
-
-        More than half of the descents are replaced; with few points several start from the same
-        one, so that other members of a portfolio soon get their turn.
-        """
-        none = jnp.full_like(state.near, jnp.inf)
-        warmed = self.warm_start(state._replace(near=none), cube, observations)
-        count, n = jnp.sum(jnp.isfinite(warmed.near)), len(state.near)
-        index = jnp.arange(n) % jnp.maximum(count, 1)
-        chosen = (jnp.arange(n) < jnp.maximum(count, n // 2 + 1)) & (count > 0)
-        return state._replace(
-            offered=_rows(chosen, warmed.offered[index], state.offered),
-            near=jnp.where(chosen, warmed.near[index], none),
-            fresh=state.fresh | chosen,
-            known=state.known & ~chosen,
-        )
-
     def _starts(
         self, state: GradientState, cube: Cube
     ) -> tuple[Float[Array, "descents d"], GradientState]:

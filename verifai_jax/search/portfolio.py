@@ -75,8 +75,6 @@ simulations with these descents as without, where more are two took 1.3 and 2.7 
 MANY = 32
 """Simulations of a round beyond which descents wait until failures are rare: such rounds simulate
 thousands in the seconds that gradients take to compile."""
-NEVER = 1 << 30
-"""Simulations since the last failure that stand for any number of them: more than a run has."""
 AMONG = 4
 """Number of best points among which a new one is a gain: those that mutations have as parents."""
 TAKEN = 32
@@ -350,20 +348,6 @@ class Portfolio(Search[PortfolioState]):
             cross_entropy=ce.tell(state.cross_entropy, cube, common),
         )
 
-    def start_from(
-        self, state: PortfolioState, cube: Cube, observations: Observations
-    ) -> PortfolioState:
-        gradient = state.gradient
-        state = self.warm_start(state._replace(gradient=None), cube, observations)
-        if gradient is None:
-            return state
-        gradient = self._gradient(cube).start_from(gradient, cube, Wants().only(observations))
-        # The descents from there have their turn at once, whatever the shares are.
-        min_share = jnp.where(jnp.any(jnp.isfinite(gradient.near)), len(gradient.fresh), -jnp.inf)
-        credit = state.credit.at[GRADIENT].max(min_share.astype(jnp.float32))
-        # Whoever suggests a start wants a descent from it.
-        return state._replace(gradient=gradient, credit=credit, barren=jnp.int32(NEVER))
-
     def _shares(self, state: PortfolioState, cube: Cube, batch: int) -> Float[Array, " members"]:
         prior = self._prior_gains(cube, batch)
         rate = (state.gains + 0.1 * prior) / (state.costs + 0.1 * PRIOR_COSTS)
@@ -420,12 +404,6 @@ class PortfolioStage(Wrapper[PortfolioState]):
         spent = rows * jnp.where(state.differentiates, 2.0, 1.0)
         waiting = wait(state.interior, jnp.where(simulated, score, jnp.inf), spent)
         return learned._replace(interior=waiting)
-
-    def start_from(
-        self, state: PortfolioState, cube: Cube, observations: Observations
-    ) -> PortfolioState:
-        # Whoever suggests a start wants descents from it, which are then in the next stage.
-        return self.search.start_from(state, cube, observations)
 
     def inner_state(self, state: PortfolioState) -> PortfolioState:
         """Return the state of the members that take part."""

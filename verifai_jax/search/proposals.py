@@ -78,7 +78,7 @@ class Proposals:
         if self._accepts is not None:
             # Compiled now, in the shape that it will be asked in.
             self._accepts(np.zeros((batch, self.cube.dim), np.float32))
-        self._verbs: dict[str, Callable[..., PyTree]] = {}
+        self._warm: Callable[..., PyTree] | None = None
         assert self._program.init is not None
         self._state = self._program.init(key)
         self._queue = np.zeros((0, self.cube.dim), np.float32)
@@ -179,35 +179,12 @@ class Proposals:
         rho: Float[np.ndarray, " n"],
         outcomes: Float[np.ndarray, "n outcome"] | None = None,
     ) -> None:
-        """Let the search learn from the points of an earlier table, before the first round."""
-        self._learn_from(u, rho, outcomes, "warm_start")
-
-    def start_from(
-        self,
-        u: Float[np.ndarray, "n d"],
-        rho: Float[np.ndarray, " n"],
-        outcomes: Float[np.ndarray, "n outcome"] | None = None,
-    ) -> None:
-        """Let the search start from points that a user suggested, between two rounds."""
-        self._learn_from(u, rho, outcomes, "start_from")
-
-    def remember(self, u: Float[np.ndarray, "n d"]) -> None:
-        """Never propose these given points, which the run has already simulated."""
-        if self._repetition is not None:
-            self._repetition.add(u)
-
-    def _learn_from(
-        self,
-        u: Float[np.ndarray, "n d"],
-        rho: Float[np.ndarray, " n"],
-        outcomes: Float[np.ndarray, "n outcome"] | None,
-        verb: str,
-    ) -> None:
+        """Let the search learn from points of an earlier table, or points that a person gave."""
         if not self.search.learns or not len(u):
             return
-        if verb not in self._verbs:
-            learn = getattr(self.search, verb)
-            self._verbs[verb] = jax.jit(lambda state, rows: learn(state, self.cube, rows))
+        if self._warm is None:
+            learn = self.search.warm_start
+            self._warm = jax.jit(lambda state, rows: learn(state, self.cube, rows))
         for start in range(0, len(u), self.batch):
             part = slice(start, start + self.batch)
             rows = np.arange(len(u[part]))
@@ -215,7 +192,12 @@ class Proposals:
             values, valid = rho[part].astype(np.float32), np.ones(len(rows), bool)
             known = {"outcomes": None if outcomes is None else outcomes[part]}
             observations = self._observed(points, rows, values, valid, known)
-            self._state = self._verbs[verb](self._state, observations)
+            self._state = self._warm(self._state, observations)
+
+    def remember(self, u: Float[np.ndarray, "n d"]) -> None:
+        """Never propose these given points, which the run has already simulated."""
+        if self._repetition is not None:
+            self._repetition.add(u)
 
     def _observed(
         self,

@@ -21,7 +21,7 @@ from verifai_jax.core.values.cube import Cube
 from verifai_jax.search.base import Asked, Observations, Origin, Plan, Search, State, Wants
 
 Learn: TypeAlias = Callable[[PyTree, Cube, Observations], PyTree]
-"""A way to learn of the search inside: its `tell`, `warm_start` or `start_from`."""
+"""A way to learn of the search inside: its `tell` or `warm_start`."""
 
 
 class Wrapper(Search[State]):
@@ -118,6 +118,3 @@ class Wrapper(Search[State]):
 
     def warm_start(self, state: State, cube: Cube, observations: Observations) -> State:
         return self.learn(self.search.warm_start, state, cube, observations)
-
-    def start_from(self, state: State, cube: Cube, observations: Observations) -> State:
-        return self.learn(self.search.start_from, state, cube, observations)
