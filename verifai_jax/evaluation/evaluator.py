@@ -42,6 +42,8 @@ NOT_NATIVE = (
 class Evaluator:
     """Simulates and evaluates points of a problem's unit cube; `simulations` counts them.
 
+    `sender` is the engine that sends points to workers; None in this process.
+
     **Arguments:**
     - `problem`: a checked problem, on the backend on which it should run.
     - `batch`: maximum number of simulations at once; fewer points are padded.
@@ -88,12 +90,12 @@ class Evaluator:
         self._dtype = np.dtype(precision if self.given else "float32")
         self.engine: Engine | NativeEngine | HostEngine | ExecutorEngine
         self._host: HostEngine | None = None
-        self._sender: ExecutorEngine | None = None
+        self.sender: ExecutorEngine | None = None
         self._native: NativeEngine | None = None
         if executor is not None:
             from verifai_jax.evaluation import executor_engine
 
-            self.engine = self._sender = executor_engine.ExecutorEngine(
+            self.engine = self.sender = executor_engine.ExecutorEngine(
                 problem, batch, executor, gradient=gradient, clauses=clauses,
                 precision=precision, journal=journal, target=target, guidance=guidance,
                 given=self.given,
@@ -180,7 +182,7 @@ class Evaluator:
         start = self.simulations if first is None else first
         u = self.rows_of(u)
         count, parts = len(u), []
-        if self._sender is not None and count:
+        if self.sender is not None and count:
             return self.begin(u, temperature, start).result()
         begin = 0
         while begin < count:
@@ -260,9 +262,9 @@ class Evaluator:
     def _send(
         self, u: Float[Any, "n row"], first: int, temperature: Float[np.ndarray, " n"] | float
     ) -> "Pending":
-        if self._sender is None:
+        if self.sender is None:
             raise TypeError("points are sent to workers only by an evaluator with an executor")
-        return self._sender.submit(u, self.key, first, temperature)
+        return self.sender.submit(u, self.key, first, temperature)
 
     def rows_of(self, u: Float[Any, "n d"]) -> Float[Any, "n row"]:
         """Return points as rows of the engine, which are longer if features may be given."""

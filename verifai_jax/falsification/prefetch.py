@@ -13,7 +13,7 @@ from collections import deque
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import AbstractContextManager, nullcontext
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import numpy as np
@@ -21,9 +21,11 @@ from jaxtyping import Float
 
 from verifai_jax.core.compute.precision import reproducible_settings
 from verifai_jax.evaluation.evaluator import Evaluator
-from verifai_jax.evaluation.executor_engine import ExecutorEngine, Pending
 from verifai_jax.evaluation.verdicts import Verdicts
 from verifai_jax.search.proposals import Proposals
+
+if TYPE_CHECKING:
+    from verifai_jax.evaluation.executor_engine import Pending
 
 AHEAD = 3
 """Rounds of this process that are simulated or wait to be, so that one is ready while an earlier
@@ -34,7 +36,7 @@ class _Round(NamedTuple):
     """One round: its points, its offset among the rows sent together, and the state after it."""
 
     points: Float[Any, "n d"]
-    pending: Pending | Future[Verdicts]
+    pending: "Pending | Future[Verdicts]"
     begin: int
     checkpoint: dict[str, Any]
 
@@ -61,8 +63,7 @@ class Prefetch:
         searching: Callable[[], AbstractContextManager[object]] = nullcontext,
     ) -> None:
         self._proposals, self._evaluate, self._searching = proposals, evaluate, searching
-        engine = evaluate.engine
-        self._workers = engine if isinstance(engine, ExecutorEngine) else None
+        self._workers = evaluate.sender
         self._thread = None if self._workers else ThreadPoolExecutor(1, "simulations")
         self._batch, self._limit, self._next = batch, limit, first
         self._rounds: deque[_Round] = deque()
@@ -111,7 +112,7 @@ class Prefetch:
         """Number of rows that are simulated ahead at a time."""
         return AHEAD * self._batch if self._workers is None else self._workers.ahead
 
-    def _submit(self, points: Float[Any, "n d"], first: int) -> Pending | Future[Verdicts]:
+    def _submit(self, points: Float[Any, "n d"], first: int) -> "Pending | Future[Verdicts]":
         if self._thread is None:
             return self._evaluate.submit(points, first)
         return self._thread.submit(self._simulated, points, first)
