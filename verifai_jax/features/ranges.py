@@ -7,6 +7,8 @@ They contain every number that `space.unflatten` gives within a box, including r
 domain is `monotone`.
 """
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -101,6 +103,31 @@ class FeatureRanges:
                 size = np.asarray(np.maximum(np.abs(leaf[-2]), np.abs(leaf[-1])))
                 real = bool(jnp.issubdtype(part.dtype, jnp.floating))
                 found.append((depends, size, self.space.domains[name].uniform, real))
+        return found
+
+    def scales(self) -> list[dict[str, list[Any]]]:
+        """Return the values of the feature along each coordinate, as the columns of a table.
+
+        **Returns:** for a continuous coordinate `values`, at 0 and 1; for a discrete one those of
+        its cells, and their `edges`; nothing where a coordinate is no column's alone.
+        """
+        points, columns = list[np.ndarray](), self.space.coordinates
+        for j, edges in enumerate(self.edges):
+            at = np.array([0.0, 1.0]) if edges is None else (edges[1:] + edges[:-1]) / 2
+            # Items of arrays are there if the length is greatest.
+            points.append(np.ones((len(at), self.dim)))
+            points[-1][:, j] = at
+        monotone = [d.monotone for d in self.space.domains.values() for _ in range(d.size)]
+        found, start = [], 0
+        rows = self.space.rows(self.space.features_at(np.concatenate(points).astype(np.float32)))
+        for j, edges in enumerate(self.edges):
+            begin, start = start, start + len(points[j])
+            if not monotone[j] or columns[j] not in rows:
+                found.append({})
+                continue
+            found.append({"values": np.asarray(rows[columns[j]])[begin:start].tolist()})
+            if edges is not None:
+                found[-1]["edges"] = edges.tolist()
         return found
 
     def shares(self, points: Corners) -> Corners:
