@@ -111,23 +111,22 @@ class FeatureRanges:
         **Returns:** for a continuous coordinate `values`, at 0 and 1; for a discrete one those of
         its cells, and their `edges`; nothing where a coordinate is no column's alone.
         """
-        points, columns = list[np.ndarray](), self.space.coordinates
-        for j, edges in enumerate(self.edges):
-            at = np.array([0.0, 1.0]) if edges is None else (edges[1:] + edges[:-1]) / 2
-            # Items of arrays are there if the length is greatest.
-            points.append(np.ones((len(at), self.dim)))
-            points[-1][:, j] = at
         monotone = [d.monotone for d in self.space.domains.values() for _ in range(d.size)]
-        found, start = [], 0
-        rows = self.space.rows(self.space.features_at(np.concatenate(points).astype(np.float32)))
-        for j, edges in enumerate(self.edges):
-            begin, start = start, start + len(points[j])
-            if not monotone[j] or columns[j] not in rows:
-                found.append({})
-                continue
-            found.append({"values": np.asarray(rows[columns[j]])[begin:start].tolist()})
-            if edges is not None:
-                found[-1]["edges"] = edges.tolist()
+        cells = [np.arange(2.0) if e is None else (e[1:] + e[:-1]) / 2 for e in self.edges]
+        stops = np.cumsum([len(each) for each in cells])
+        # Items of arrays are there if the length is greatest.
+        points = np.ones((stops[-1] if cells else 0, self.dim), np.float32)
+        parts = [slice(stop - len(each), stop) for stop, each in zip(stops, cells, strict=True)]
+        for j, part in enumerate(parts):
+            points[part, j] = cells[j]
+        rows = self.space.rows(self.space.features_at(points)) if cells else {}
+        found = [
+            {"values": np.asarray(rows[name])[part].tolist()} if own and name in rows else {}
+            for name, part, own in zip(self.space.coordinates, parts, monotone, strict=True)
+        ]
+        for scale, edges in zip(found, self.edges, strict=True):
+            if scale and edges is not None:
+                scale["edges"] = edges.tolist()
         return found
 
     def shares(self, points: Corners) -> Corners:

@@ -64,15 +64,16 @@ def verification_page(result: Verification, about: About, problem: Problem | Non
         )
     ]
     columns = ["verdict", "mass", "lowest", "highest", "failure_bound"]
-    ends = [f"{name} {end}" for name in result.columns for end in ("from", "to")]
-    heads = [
-        f"{with_unit(name, about.units)} {end}" for name in result.columns for end in ("from", "to")
-    ]
+    ends, heads = (
+        [f"{name} {end}" for name in names for end in ("from", "to")]
+        for names in (result.columns, [with_unit(name, about.units) for name in result.columns])
+    )
     largest: Any = result.table.groupby("verdict", sort=False).head(MAX_BOXES // 3)
     rows = [
         [f"{v:z.4g}" if isinstance(v, float) else str(v) for v in values]
         for values in largest[[*columns, *ends]].itertuples(index=False)
     ]
+    drawn = png(plot_verification(result, units=about.units))
     asked = [] if problem is None else problem_content(problem, about)
     subject: dict[str, Any] = {}
     if problem is not None:
@@ -96,7 +97,7 @@ def verification_page(result: Verification, about: About, problem: Problem | Non
         asked=[paragraph(f"Where no {what} of {result.name} fails, for certain."), *asked],
         found=[
             table(["part", "of the prior", "of the volume"], parts),
-            picture(png(plot_verification(result, units=about.units)), "The parts, two coordinates at a time"),
+            picture(drawn, "The parts, two coordinates at a time"),
             table(
                 [*columns, *heads],
                 rows,

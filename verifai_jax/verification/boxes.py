@@ -53,12 +53,9 @@ class Boxes:
 
     @classmethod
     def between(
-        cls,
-        low: Float[np.ndarray, "n dim"],
-        high: Float[np.ndarray, "n dim"],
-        inside: Bool[np.ndarray, "#n"],
+        cls, low: Float[np.ndarray, "n dim"], high: Float[np.ndarray, "n dim"], inside: np.ndarray
     ) -> "Boxes":
-        """Return open boxes."""
+        """Return open boxes, of which the constraint accepts all points or may not."""
         n, infinite = len(low), np.full(len(low), np.inf)
         return cls(
             low, high, np.zeros(n, int), -infinite, infinite, np.full(low.shape, np.nan),
@@ -83,7 +80,8 @@ class Boxes:
                 f"examines at most {CHOICES:,}; fix some with problem.only(...)"
             )
         ends = np.array(list(itertools.product(*sides))).reshape(count, space.dim, 2)
-        return cls.between(ends[..., 0].copy(), ends[..., 1].copy(), np.array([space.where is None]))
+        inside = np.array([space.where is None])
+        return cls.between(ends[..., 0].copy(), ends[..., 1].copy(), inside)
 
     def __len__(self) -> int:
         return len(self.low)

@@ -62,7 +62,7 @@ class Verification(Drawn, Reported, InNotebook):
     - `name`: the name of the problem; `columns`: its unit coordinates.
     - `boxes`: the partition of the unit cube; `shares`, `upper_shares`: the corners of the boxes as
       shares of the features' ranges; `scales`: the values along each coordinate.
-    - `constraint`: whether the space has one. Shares of the prior are then of accepted points.
+    - `constraint`: whether the space has one. The accepted prior is then what it accepts.
     - `tails`: for each feature whose distribution has tails the probability of their outermost
       part, at most, which no coordinate reaches: nothing is known of it.
     - `features`, `formulas`, `model`, `precision`: the subject of the verification; the system is
@@ -76,8 +76,8 @@ class Verification(Drawn, Reported, InNotebook):
 
     _picture = "verification", "plot_verification"
     _internal = frozenset((
-        "check_same", "constraint", "cut", "cut_off", "ends", "left", "loosest", "note", "of_prior", "scales",
-        "tails",
+        "check_same", "constraint", "cut", "cut_off", "ends", "left", "loosest", "note", "of_prior",
+        "scales", "tails",
     ))  # fmt: skip
     name: str
     columns: tuple[str, ...]
@@ -130,21 +130,25 @@ class Verification(Drawn, Reported, InNotebook):
         return known + whole * rate.low, known + whole * rate.high
 
     @cached_property
-    def _masses(self) -> Float[np.ndarray, " n"]:
-        """The accepted mass of each box, estimated for boxes that the constraint cuts."""
-        boxes = self.boxes
-        accepted = np.where(boxes.state == OUTSIDE, 0.0, boxes.mass)
+    def _masses(self) -> Float[np.ndarray, "3 n"]:
+        """The accepted mass of each box, estimated if it is cut, and bounds for this box alone."""
+        boxes, confidence = self.boxes, 1 - (1 - self.confidence) / 2
+        masses = np.tile(np.where(boxes.state == OUTSIDE, 0.0, boxes.mass), (3, 1))
         for cut in (self.cut & boxes.confirmed, self.cut & ~boxes.confirmed):
+            drawn, accepted = boxes.drawn[cut], boxes.accepted[cut]
+            usual = accepted.sum() / drawn.sum() if drawn.any() else 1.0
             # One more draw, as those of all such boxes, is for boxes with few of their own.
-            usual = boxes.accepted[cut].sum() / max(boxes.drawn[cut].sum(), 1)
-            usual = usual if boxes.drawn[cut].sum() else 1.0
-            accepted[cut] *= (boxes.accepted[cut] + usual) / (boxes.drawn[cut] + 1)
-        return accepted
+            shares = [(accepted + usual) / (drawn + 1), np.zeros(len(drawn)), np.ones(len(drawn))]
+            for i in np.flatnonzero(drawn):
+                rate = anytime_interval(int(accepted[i]), int(drawn[i]), confidence)
+                shares[1][i], shares[2][i] = rate.low, rate.high
+            masses[:, cut] *= shares
+        return masses
 
     def _part(self, rows: Bool[np.ndarray, " n"]) -> Part:
         inside = self.boxes.state != OUTSIDE
         shares = []
-        for weights in (self._masses, np.prod(self.upper_shares - self.shares, axis=1)):
+        for weights in (self._masses[0], np.prod(self.upper_shares - self.shares, axis=1)):
             whole = weights[inside].sum()
             shares.append(float(weights[rows & inside].sum() / whole) if whole > 0 else 0.0)
         if not self.cut.any():
@@ -176,9 +180,9 @@ class Verification(Drawn, Reported, InNotebook):
     @property
     def failure_bound(self) -> float:
         """An upper bound of the failure probability within the undecided part, from samples."""
-        return self._failing_share(self.confidence)
+        return self._failing(self.confidence)
 
-    def _failing_share(self, confidence: float) -> float:
+    def _failing(self, confidence: float) -> float:
         rows = self.verdicts == "undecided"
         count, failures = (int(n[rows].sum()) for n in (self.boxes.samples, self.boxes.failures))
         if not rows.any():
@@ -202,7 +206,7 @@ class Verification(Drawn, Reported, InNotebook):
         (proved, _), (_, most) = (
             self._accepted(rows, confidence) for rows in (self.boxes.state == PROVED, broken)
         )
-        share, every = self._failing_share(confidence), self._accepted(self.boxes.state >= OPEN)[1]
+        share, every = self._failing(confidence), self._accepted(self.boxes.state >= OPEN)[1]
         highest = max(
             (most + share * rest) / max(proved + most + rest, TINY)
             for rest in (max(end, TINY) for end in self._accepted(undecided, confidence))
@@ -225,20 +229,14 @@ class Verification(Drawn, Reported, InNotebook):
         for i in np.flatnonzero((boxes.samples > 0) & (self.verdicts == "undecided")):
             counts = int(boxes.failures[i]), int(boxes.samples[i])
             bound[i] = anytime_interval(*counts, self.confidence).high
-        whole = max(self._masses.sum(), TINY)
-        least, most = np.tile(self._masses, (2, 1))
-        most[self.cut], least[self.cut] = boxes.mass[self.cut], 0.0
-        for i in np.flatnonzero(self.cut & (boxes.drawn > 0)):
-            rate = anytime_interval(int(boxes.accepted[i]), int(boxes.drawn[i]), half)
-            least[i], most[i] = boxes.mass[i] * rate.low, boxes.mass[i] * rate.high
         fewest, greatest = self._accepted(np.ones(len(boxes), bool), half)
+        wholes = self._masses[0].sum(), greatest, fewest
+        mass, least, most = (m / max(w, TINY) for m, w in zip(self._masses, wholes, strict=True))
         rows: dict[str, Any] = {
-            "verdict": self.verdicts, "throughout": boxes.state == BROKEN,
-            "mass": self._masses / whole,
+            "verdict": self.verdicts, "throughout": boxes.state == BROKEN, "mass": mass,
             "volume": np.prod(self.upper_shares - self.shares, axis=1), "lowest": boxes.lowest,
             "highest": boxes.highest, "failure_bound": bound,
-            "mass_low": least / max(greatest, TINY),
-            "mass_high": np.minimum(most / max(fewest, TINY), 1.0),
+            "mass_low": least, "mass_high": np.minimum(most, 1.0),
         }  # fmt: skip
         for j, column in enumerate(self.columns):
             rows[f"{column} from"], rows[f"{column} to"] = self.ends(j)
@@ -258,7 +256,7 @@ class Verification(Drawn, Reported, InNotebook):
     @property
     def of_prior(self) -> str:
         """What shares are shares of."""
-        return "of the prior that the constraint accepts" if self.constraint else "of the prior"
+        return "of the accepted prior" if self.constraint else "of the prior"
 
     @property
     def cut_off(self) -> str:

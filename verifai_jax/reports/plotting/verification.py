@@ -23,11 +23,7 @@ COLORS = {"proved": SAFE, "broken": FAILING, "undecided": NOT_CLAIMED}
 def plot_verification(
     result: Verification, path: str | Path | None = None, units: Mapping[str, str] | None = None
 ) -> Figure:
-    """Draw each pair of the coordinates that were split most, averaged over the others.
-
-    **Arguments:**
-    - `units`: the units of features, by name.
-    """
+    """Draw each pair of the coordinates that were split most, averaged over the others."""
     from matplotlib.colors import to_rgb
     from matplotlib.patches import Patch
 
@@ -50,11 +46,11 @@ def plot_verification(
             rows = result.verdicts == verdict
             share = up[rows].T @ (own[rows, None] * across[rows])
             image -= np.clip(share, 0, 1)[:, :, None] * (1 - np.array(to_rgb(color)))
-        across_ends = _label(axes.xaxis, result, first, units or {})
-        up_ends = _label(axes.yaxis, result, -1 if second == first else second, units or {})
-        axes.imshow(
-            np.clip(image, 0, 1), origin="lower", extent=(*across_ends, *up_ends), aspect="auto"
+        extent = (
+            *_label(axes.xaxis, result, first, units or {}),
+            *_label(axes.yaxis, result, -1 if second == first else second, units or {}),
         )
+        axes.imshow(np.clip(image, 0, 1), origin="lower", extent=extent, aspect="auto")
     patches = [Patch(color=color, label=verdict) for verdict, color in COLORS.items()]
     figure.legend(handles=patches, loc="outside upper center", ncols=len(COLORS), frameon=False)
     return show_or_save(figure, path)

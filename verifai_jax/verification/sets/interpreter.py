@@ -137,20 +137,14 @@ def _where(step: Equation) -> str:
 
 
 def as_form(value: Value) -> Form:
-    """Return a value that is a real number.
-
-    **Raises:** `NotImplementedError` for whole numbers.
-    """
+    """Return a value that is a real number; others raise `NotImplementedError`."""
     if not isinstance(value, Form):
         raise NotImplementedError("whole numbers where only real ones are supported")
     return value
 
 
 def as_whole(value: Value) -> Whole:
-    """Return a value that is a whole number or a truth value.
-
-    **Raises:** `NotImplementedError` for real numbers.
-    """
+    """Return a whole number or a truth value; others raise `NotImplementedError`."""
     if not isinstance(value, Whole):
         raise NotImplementedError("real numbers where only whole ones are supported")
     return value
