@@ -77,7 +77,7 @@ class Verification(Drawn, Reported, InNotebook):
     _picture = "verification", "plot_verification"
     _internal = frozenset((
         "check_same", "constraint", "cut", "cut_off", "ends", "left", "loosest", "note", "of_prior",
-        "scales", "tails",
+        "scales",
     ))  # fmt: skip
     name: str
     columns: tuple[str, ...]
@@ -136,8 +136,8 @@ class Verification(Drawn, Reported, InNotebook):
         masses = np.tile(np.where(boxes.state == OUTSIDE, 0.0, boxes.mass), (3, 1))
         for cut in (self.cut & boxes.confirmed, self.cut & ~boxes.confirmed):
             drawn, accepted = boxes.drawn[cut], boxes.accepted[cut]
-            usual = accepted.sum() / drawn.sum() if drawn.any() else 1.0
-            # One more draw, as those of all such boxes, is for boxes with few of their own.
+            # One more draw of each is accepted as those of all are: none counts as nothing.
+            usual = (accepted.sum() + 1) / (drawn.sum() + 1)
             shares = [(accepted + usual) / (drawn + 1), np.zeros(len(drawn)), np.ones(len(drawn))]
             for i in np.flatnonzero(drawn):
                 rate = anytime_interval(int(accepted[i]), int(drawn[i]), confidence)
