@@ -44,9 +44,9 @@ def verification_page(result: Verification, about: About, problem: Problem | Non
     tails = (f"{result.cut_off[:1].upper()}{result.cut_off[1:]}.",) if result.tails else ()
     rests = MODEL, verified, *tails
     # Where a constraint cuts boxes the accepted share of the proved ones has a lower bound.
-    least = f"at least {format_percent(proved.low)} (at {sure})" if result.cut.any() else shares[0]
+    share = f"at least {format_percent(proved.low)} (at {sure})" if result.cut.any() else shares[0]
     claims = [
-        Claim("C1", f"No {what} fails in {least} {of}.", (boxes,), rests),
+        Claim("C1", f"No {what} fails in {share} {of}.", (boxes,), rests),
         Claim("C2", f"The failure probability is {bounds}, at {sure}.", (boxes, samples),
               (*rests, SAMPLED)),
     ]  # fmt: skip

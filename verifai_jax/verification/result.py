@@ -154,8 +154,8 @@ class Verification(Drawn, Reported, InNotebook):
         if not self.cut.any():
             return Part(*shares, shares[0], shares[0])
         half = 1 - (1 - self.confidence) / 2
-        (least, most), (fewest, greatest) = (self._accepted(r, half) for r in (rows, ~rows))
-        return Part(*shares, least / max(least + greatest, TINY), most / max(most + fewest, TINY))
+        (low, high), (lower, upper) = (self._accepted(each, half) for each in (rows, ~rows))
+        return Part(*shares, low / max(low + upper, TINY), high / max(high + lower, TINY))
 
     @property
     def proved(self) -> Part:
@@ -203,12 +203,12 @@ class Verification(Drawn, Reported, InNotebook):
         """
         confidence = 1 - (1 - self.confidence) / (3 if self.cut.any() else 1)
         broken, undecided = (self.verdicts == name for name in ("broken", "undecided"))
-        (proved, _), (_, most) = (
+        (proved, _), (_, failing) = (
             self._accepted(rows, confidence) for rows in (self.boxes.state == PROVED, broken)
         )
         share, every = self._failing(confidence), self._accepted(self.boxes.state >= OPEN)[1]
         highest = max(
-            (most + share * rest) / max(proved + most + rest, TINY)
+            (failing + share * rest) / max(proved + failing + rest, TINY)
             for rest in (max(end, TINY) for end in self._accepted(undecided, confidence))
         )
         return self._accepted(self.boxes.state == BROKEN)[0] / max(every, TINY), min(1.0, highest)
@@ -229,14 +229,14 @@ class Verification(Drawn, Reported, InNotebook):
         for i in np.flatnonzero((boxes.samples > 0) & (self.verdicts == "undecided")):
             counts = int(boxes.failures[i]), int(boxes.samples[i])
             bound[i] = anytime_interval(*counts, self.confidence).high
-        fewest, greatest = self._accepted(np.ones(len(boxes), bool), half)
-        wholes = self._masses[0].sum(), greatest, fewest
-        mass, least, most = (m / max(w, TINY) for m, w in zip(self._masses, wholes, strict=True))
+        lower, upper = self._accepted(np.ones(len(boxes), bool), half)
+        wholes = self._masses[0].sum(), upper, lower
+        mass, low, high = (m / max(w, TINY) for m, w in zip(self._masses, wholes, strict=True))
         rows: dict[str, Any] = {
             "verdict": self.verdicts, "throughout": boxes.state == BROKEN, "mass": mass,
             "volume": np.prod(self.upper_shares - self.shares, axis=1), "lowest": boxes.lowest,
             "highest": boxes.highest, "failure_bound": bound,
-            "mass_low": least, "mass_high": np.minimum(most, 1.0),
+            "mass_low": low, "mass_high": np.minimum(high, 1.0),
         }  # fmt: skip
         for j, column in enumerate(self.columns):
             rows[f"{column} from"], rows[f"{column} to"] = self.ends(j)
@@ -255,7 +255,7 @@ class Verification(Drawn, Reported, InNotebook):
 
     @property
     def of_prior(self) -> str:
-        """What shares are shares of."""
+        """The words for the whole of which shares are taken."""
         return "of the accepted prior" if self.constraint else "of the prior"
 
     @property
@@ -263,8 +263,8 @@ class Verification(Drawn, Reported, InNotebook):
         """A sentence on the tails that are cut off; empty without any."""
         if not self.tails:
             return ""
-        least = max(self._accepted(np.ones(len(self.boxes), bool), self.confidence)[0], TINY)
-        share = format_percent(min(1.0, sum(self.tails.values()) / least))
+        whole = max(self._accepted(np.ones(len(self.boxes), bool), self.confidence)[0], TINY)
+        share = format_percent(min(1.0, sum(self.tails.values()) / whole))
         return (
             f"nothing is known of the outermost tails of {', '.join(self.tails)}, which no "
             f"simulation reaches: at most {share} {self.of_prior}, in no bound above"
@@ -276,9 +276,9 @@ class Verification(Drawn, Reported, InNotebook):
         def line(name: str, part: Part, text: str) -> str:
             if not part.mass:
                 return f"  {name:<12} nothing"
-            mass, volume, least, most = map(format_percent, part)
+            mass, volume, low, high = map(format_percent, part)
             if self.cut.any():
-                return f"  {name:<12} {mass} {of} ({least} to {most} at {sure}): {text}"
+                return f"  {name:<12} {mass} {of} ({low} to {high} at {sure}): {text}"
             return f"  {name:<12} {mass} {of}, {volume} of the volume: {text}"
 
         low, high = self.probability

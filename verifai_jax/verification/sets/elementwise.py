@@ -189,7 +189,7 @@ def _convert(t: Interpreter, step: Equation, inputs: list[Value]) -> list[Value]
     # Of what does not fit the machine may make any number, as of integers that leave their type.
     far = ~((np.abs(low) < whole.FAR) & (np.abs(high) < whole.FAR))
     ends = zip(whole.limits(np.dtype(np.int64)), (low, high), strict=True)
-    ends = (np.where(far, most, np.trunc(end).astype(np.int64)) for most, end in ends)
+    ends = (np.where(far, upper, np.trunc(end).astype(np.int64)) for upper, end in ends)
     return [Whole(*ends, dtype)]
 
 

@@ -26,11 +26,11 @@ class Whole:
     __slots__ = ("dtype", "high", "low")
 
     def __init__(self, low: Numbers, high: Numbers, dtype: np.dtype) -> None:
-        least, most = limits(dtype)
+        lower, upper = limits(dtype)
         if low is not high:
-            wraps = (low < max(least, -FAR)) | (high > min(most, FAR))
+            wraps = (low < max(lower, -FAR)) | (high > min(upper, FAR))
             if np.any(wraps):
-                low, high = np.where(wraps, least, low), np.where(wraps, most, high)
+                low, high = np.where(wraps, lower, low), np.where(wraps, upper, high)
         self.low, self.high, self.dtype = low, high, dtype
 
     @classmethod
@@ -79,7 +79,7 @@ class Whole:
 
 @cache
 def limits(dtype: np.dtype) -> tuple[int, int]:
-    """Return the least and the greatest number of a type.
+    """Return the smallest and the greatest number of a type.
 
     **Raises:** `NotImplementedError` for a type whose numbers do not fit into 64 bits with a sign.
     """
@@ -99,8 +99,8 @@ def exactly(operation: Callable[..., Numbers], *ends: Numbers) -> Numbers:
     """
     size, result = operation(*(np.asarray(end, float) for end in ends)), operation(*ends)
     far = ~(np.abs(size) < FAR)
-    least, most = limits(np.dtype(np.int64))
-    return np.where(far, np.where(size > 0, most, least), result) if np.any(far) else result
+    lower, upper = limits(np.dtype(np.int64))
+    return np.where(far, np.where(size > 0, upper, lower), result) if np.any(far) else result
 
 
 def by_corners(
@@ -128,9 +128,9 @@ def _logic(operation: Callable[..., np.ndarray]) -> Callable[[Whole, Whole], Who
         low, high = (np.full(ends[0].shape, end) for end in limits(a.dtype))
         if operation is np.bitwise_and:
             # A mask without a sign leaves nothing greater than itself.
-            for least, most in (ends[::2], ends[1::2]):
-                low = np.where(least >= 0, 0, low)
-                high = np.where(least >= 0, np.minimum(most, high), high)
+            for lower, upper in (ends[::2], ends[1::2]):
+                low = np.where(lower >= 0, 0, low)
+                high = np.where(lower >= 0, np.minimum(upper, high), high)
         return Whole(low, high, a.dtype)
 
     return applied
@@ -146,12 +146,12 @@ def _divided(a: Whole, b: Whole) -> Whole:
 
 
 def _left(a: Whole, b: Whole) -> Whole:
-    least, most = limits(a.dtype)
+    lower, upper = limits(a.dtype)
     top = np.maximum(exactly(np.abs, b.low), exactly(np.abs, b.high)) - 1
     zero = (b.low <= 0) & (b.high >= 0)
     low = np.where(a.low >= 0, 0, np.maximum(a.low, -top))
     high = np.where(a.high <= 0, 0, np.minimum(a.high, top))
-    return Whole(np.where(zero, least, low), np.where(zero, most, high), a.dtype)
+    return Whole(np.where(zero, lower, low), np.where(zero, upper, high), a.dtype)
 
 
 OPERATIONS: dict[str, Callable[[Whole, Whole], Whole]] = {
