@@ -302,7 +302,7 @@ def _with_decided(found: Estimate, rest: "Rest", limit_state: LimitState, seed: 
     Decided boxes satisfy the constraint; samples show the share of the rest that does.
     """
     left, error = rest.mass, 0.0
-    if rest.mass + rest.decided < 1 and rest.mass:
+    if rest.cut:
         left, error = limit_state.acceptance(np.random.default_rng((seed, 2)))
 
     def whole(inside: float, off: float) -> float:

@@ -274,7 +274,8 @@ def bound_answer(
         f"{limit_state.lowest:z.4g}, or has no slope to follow",
         "budget": f"the budget ended at robustness {level:z.4g}, which is reached with probability "
         f"{reached:z.1e}; a failure is less probable, or impossible",
-    }.get(run.stopped or "", f"ended ({run.stopped}) at robustness {level:z.4g}")
+        None: "splitting reached failures, and no independent sample of the prior failed",
+    }.get(run.stopped, "splitting ended early" + f" at robustness {level:z.4g}" * bool(run.levels))
     counts = counts + monte_carlo.sample_prior(limit_state, rng, limit_state.left)
     answer = monte_carlo_answer(counts, plan)
     answer.diagnostics = {"levels": list(run.levels), "fractions": list(run.fractions)}

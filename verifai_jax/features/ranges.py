@@ -7,6 +7,8 @@ They contain every number that `space.unflatten` gives within a box, including r
 domain is `monotone`.
 """
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -101,6 +103,30 @@ class FeatureRanges:
                 size = np.asarray(np.maximum(np.abs(leaf[-2]), np.abs(leaf[-1])))
                 real = bool(jnp.issubdtype(part.dtype, jnp.floating))
                 found.append((depends, size, self.space.domains[name].uniform, real))
+        return found
+
+    def scales(self) -> list[dict[str, list[Any]]]:
+        """Return the values of the feature along each coordinate, as the columns of a table.
+
+        **Returns:** for a continuous coordinate `values`, at 0 and 1; for a discrete one those of
+        its cells, and their `edges`; nothing where a coordinate is no column's alone.
+        """
+        monotone = [d.monotone for d in self.space.domains.values() for _ in range(d.size)]
+        cells = [np.arange(2.0) if e is None else (e[1:] + e[:-1]) / 2 for e in self.edges]
+        stops = np.cumsum([len(each) for each in cells])
+        # Items of arrays are there if the length is greatest.
+        points = np.ones((stops[-1] if cells else 0, self.dim), np.float32)
+        parts = [slice(stop - len(each), stop) for stop, each in zip(stops, cells, strict=True)]
+        for j, part in enumerate(parts):
+            points[part, j] = cells[j]
+        rows = self.space.rows(self.space.features_at(points)) if cells else {}
+        found = [
+            {"values": np.asarray(rows[name])[part].tolist()} if own and name in rows else {}
+            for name, part, own in zip(self.space.coordinates, parts, monotone, strict=True)
+        ]
+        for scale, edges in zip(found, self.edges, strict=True):
+            if scale and edges is not None:
+                scale["edges"] = edges.tolist()
         return found
 
     def shares(self, points: Corners) -> Corners:

@@ -5,7 +5,7 @@ write_report(sweep, "sweep.html")               # a sweep, an estimate, a compar
 """
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -107,7 +107,7 @@ def write_report(
             _check(about, None if problem is None else problem.space, ())
             page = estimate_page(result, about, problem)
         case Verification():
-            _check(about, None if problem is None else problem.space, ())
+            _check(about, None, result.features)
             page = verification_page(result, about, problem)
         case Comparison():
             _check(about, result.candidates[0].space, ())
@@ -148,6 +148,6 @@ def claims_path(path: Path) -> Path:
     return path.with_suffix(".claims.json")
 
 
-def _check(about: About, space: FeatureSpace | None, columns: Sequence[str]) -> None:
+def _check(about: About, space: FeatureSpace | None, columns: Iterable[str]) -> None:
     known = [*([] if space is None else space.domains), *columns]
     check_names("feature", [*about.units, *about.reasons], list(dict.fromkeys(known)))

@@ -8,6 +8,7 @@ from verifai_jax.problem.problem import Problem
 from verifai_jax.reports.claims import Claim, about_json
 from verifai_jax.reports.markup import Child, paragraph, picture, preformatted, table
 from verifai_jax.reports.page import Page
+from verifai_jax.reports.plotting.verification import plot_verification, with_unit
 from verifai_jax.reports.provenance import Model
 from verifai_jax.reports.run_question import About
 from verifai_jax.reports.sections import MODEL, problem_content, result_page
@@ -32,22 +33,27 @@ def verification_page(result: Verification, about: About, problem: Problem | Non
     model = Model.of([result.sources], None if problem is None else problem.sources())
     proved, broken, undecided = result.proved, result.broken, result.undecided
     shares = [format_percent(part.mass) for part in (proved, broken, undecided)]
-    headline = f"{shares[0]} of the prior is proved, {shares[1]} broken, {shares[2]} undecided."
+    of = result.of_prior
+    headline = f"{shares[0]} {of} is proved, {shares[1]} broken, {shares[2]} undecided."
     low, high = result.probability
     sure = format_percent(result.confidence)
     bounds = f"{format_percent(low)} at least, {format_percent(high)} at most"
     what = "solution" if result.continuous else "simulation"
     verified = f"What is verified is {result.subject}."
     boxes, samples = f"{len(result.boxes):,} boxes", f"{int(result.boxes.samples.sum()):,} samples"
+    tails = (f"{result.cut_off[:1].upper()}{result.cut_off[1:]}.",) if result.tails else ()
+    rests = MODEL, verified, *tails
+    # Where a constraint cuts boxes the accepted share of the proved ones has a lower bound.
+    share = f"at least {format_percent(proved.low)} (at {sure})" if result.cut.any() else shares[0]
     claims = [
-        Claim("C1", f"No {what} fails in {shares[0]} of the prior.", (boxes,),
-              (MODEL, verified)),
+        Claim("C1", f"No {what} fails in {share} {of}.", (boxes,), rests),
         Claim("C2", f"The failure probability is {bounds}, at {sure}.", (boxes, samples),
-              (MODEL, verified, SAMPLED)),
+              (*rests, SAMPLED)),
     ]  # fmt: skip
     if broken.mass:
-        found = f"Boxes of {shares[1]} of the prior contain a point that fails for certain."
-        claims.append(Claim("C3", found, (boxes,), (MODEL, verified)))
+        some = f"about {shares[1]}" if result.cut.any() else shares[1]
+        found = f"Boxes of {some} {of} contain a point that fails for certain."
+        claims.append(Claim("C3", found, (boxes,), rests))
     parts: list[tuple[str, Child, Child]] = [
         (name, format_percent(part.mass), format_percent(part.volume))
         for name, part in (
@@ -58,12 +64,16 @@ def verification_page(result: Verification, about: About, problem: Problem | Non
         )
     ]
     columns = ["verdict", "mass", "lowest", "highest", "failure_bound"]
-    ends = [f"{name} {end}" for name in result.columns for end in ("from", "to")]
+    ends, heads = (
+        [f"{name} {end}" for name in names for end in ("from", "to")]
+        for names in (result.columns, [with_unit(name, about.units) for name in result.columns])
+    )
     largest: Any = result.table.groupby("verdict", sort=False).head(MAX_BOXES // 3)
     rows = [
-        [v if isinstance(v, str) else f"{v:z.4g}" for v in values]
+        [f"{v:z.4g}" if isinstance(v, float) else str(v) for v in values]
         for values in largest[[*columns, *ends]].itertuples(index=False)
     ]
+    drawn = png(plot_verification(result, units=about.units))
     asked = [] if problem is None else problem_content(problem, about)
     subject: dict[str, Any] = {}
     if problem is not None:
@@ -87,19 +97,20 @@ def verification_page(result: Verification, about: About, problem: Problem | Non
         asked=[paragraph(f"Where no {what} of {result.name} fails, for certain."), *asked],
         found=[
             table(["part", "of the prior", "of the volume"], parts),
-            picture(png(result.plot()), "The parts, two coordinates at a time"),
+            picture(drawn, "The parts, two coordinates at a time"),
             table(
-                [*columns, *ends],
+                [*columns, *heads],
                 rows,
-                "The most probable boxes; ends are shares of the range of a feature.",
+                "The most probable boxes, between these values of the features.",
             ),
         ],
         limits=[
-            f"{shares[2]} of the prior is undecided; at most "
+            f"{shares[2]} {of} is undecided; at most "
             f"{format_percent(result.failure_bound)} of it fails, at {sure}.",
             verified,
             SAMPLED,
             MODEL,
+            *tails,
             *result.notes,
         ],
         reproduce=[

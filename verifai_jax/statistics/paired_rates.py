@@ -54,8 +54,9 @@ class PairedRates:
         points = 100 * self.estimate
         more = "more" if points >= 0 else "fewer"
         ends = sorted(100 * end if points >= 0 else -100 * end for end in (self.low, self.high))
+        shown = f"{abs(points):z.3g} points {more}" if self.pairs > self.undecided else "unknown"
         return (
-            f"{abs(points):z.3g} points {more} ({100 * self.confidence:zg} % interval "
+            f"{shown} ({100 * self.confidence:zg} % interval "
             f"{ends[0]:z.3g} to {ends[1]:z.3g}{', whenever stopped' if self.at_any_time else ''})"
         )
 

@@ -8,6 +8,7 @@ from verifai_jax.core.compute.precision import in_precision
 from verifai_jax.core.display.progress import shows_progress
 from verifai_jax.core.messages.checks import check_count, check_fraction, check_positive
 from verifai_jax.core.messages.errors import suggests_options
+from verifai_jax.features.continuous import OUTERMOST
 from verifai_jax.problem.problem import Problem
 from verifai_jax.verification.boxes import Boxes
 from verifai_jax.verification.branch_and_bound import BranchAndBound
@@ -99,6 +100,12 @@ def verify(
         boxes=work.boxes,
         shares=enclosure.ranges.shares(work.boxes.low),
         upper_shares=enclosure.ranges.shares(work.boxes.high),
+        scales=tuple(enclosure.ranges.scales()),
+        constraint=problem.space.where is not None,
+        tails={
+            name: 2 * OUTERMOST * sum(domain.tailed)
+            for name, domain in problem.space.domains.items() if any(domain.tailed)
+        },
         precision=precision,
         confidence=confidence,
         looked_at=work.looked_at + (0 if before is None else before.looked_at),

@@ -32,7 +32,10 @@ class Boxes:
       the box itself was evaluated with sets.
     - `witness`: `[n, dim]`, a point that fails when simulated; NaN without one.
     - `confirmed`: `[n]`, whether the witness certainly fails.
-    - `failures`, `samples`: `[n]`, counts of independent samples of the box.
+    - `inside`: `[n]`, whether the constraint is known to accept all points.
+    - `drawn`, `accepted`: `[n]`, counts of independent draws of the box from the prior of the
+      unconstrained features, and of those that the constraint accepts.
+    - `failures`, `samples`: `[n]`, counts of independent samples of the box, which are accepted.
     """
 
     low: Float[np.ndarray, "n dim"]
@@ -42,16 +45,21 @@ class Boxes:
     highest: Float[np.ndarray, " n"]
     witness: Float[np.ndarray, "n dim"]
     confirmed: Bool[np.ndarray, " n"]
+    inside: Bool[np.ndarray, " n"]
+    drawn: Int[np.ndarray, " n"]
+    accepted: Int[np.ndarray, " n"]
     failures: Int[np.ndarray, " n"]
     samples: Int[np.ndarray, " n"]
 
     @classmethod
-    def between(cls, low: Float[np.ndarray, "n dim"], high: Float[np.ndarray, "n dim"]) -> "Boxes":
-        """Return open boxes."""
+    def between(
+        cls, low: Float[np.ndarray, "n dim"], high: Float[np.ndarray, "n dim"], inside: np.ndarray
+    ) -> "Boxes":
+        """Return open boxes, of which the constraint accepts all points or may not."""
         n, infinite = len(low), np.full(len(low), np.inf)
         return cls(
             low, high, np.zeros(n, int), -infinite, infinite, np.full(low.shape, np.nan),
-            np.zeros(n, bool), np.zeros(n, int), np.zeros(n, int),
+            np.zeros(n, bool), np.resize(inside, n), *(np.zeros(n, int) for _ in range(4)),
         )  # fmt: skip
 
     @classmethod
@@ -72,7 +80,8 @@ class Boxes:
                 f"examines at most {CHOICES:,}; fix some with problem.only(...)"
             )
         ends = np.array(list(itertools.product(*sides))).reshape(count, space.dim, 2)
-        return cls.between(ends[..., 0].copy(), ends[..., 1].copy())
+        inside = np.array([space.where is None])
+        return cls.between(ends[..., 0].copy(), ends[..., 1].copy(), inside)
 
     def __len__(self) -> int:
         return len(self.low)
@@ -88,7 +97,7 @@ class Boxes:
         """Return the intersections of the boxes with the box between two corners, as open boxes."""
         lower, upper = np.maximum(self.low, low), np.minimum(self.high, high)
         some = (lower < upper).all(axis=1)
-        return Boxes.between(lower[some], upper[some])
+        return Boxes.between(lower[some], upper[some], self.inside[some])
 
     def with_more(self, others: "Boxes") -> "Boxes":
         """Return these boxes followed by others."""
@@ -134,8 +143,8 @@ class Boxes:
                 first, last = (np.searchsorted(edges, end[own]) for end in (low, high))
                 middle[own] = edges[(first + last) // 2]
         left, right = (
-            Boxes.between(self.low, self.high.copy()),
-            Boxes.between(self.low.copy(), self.high),
+            Boxes.between(self.low, self.high.copy(), self.inside),
+            Boxes.between(self.low.copy(), self.high, self.inside),
         )
         left.high[rows, coordinate] = right.low[rows, coordinate] = middle
         left.lowest[:] = right.lowest[:] = self.lowest

@@ -25,6 +25,9 @@ NO_INFLUENCE = 1e-6
 APART = 4
 """Coordinates along which a box without bounds is halved at once: those of its halves, which would
 have none either, would be looked at in vain."""
+DRAW, DRAWS = 65_536, 16
+"""Points that are drawn at a time from boxes that a constraint may cut, and times at most until
+enough of them are accepted."""
 CANDIDATES = 4096
 """Failing points that are confirmed when the budget is spent, those of the largest boxes first."""
 
@@ -84,6 +87,7 @@ class BranchAndBound:
         if len(worth):
             bounds = self.enclosure(some.low[worth], some.high[worth])
             some.lowest[worth], some.highest[worth] = bounds.low, bounds.high
+            some.inside[worth] |= bounds.inside
             # Without bounds nothing is known of what moves: all coordinates count alike.
             moves[worth] = np.where(bounds.moves.any(1, keepdims=True), bounds.moves, 1.0)
             state = np.where(bounds.holds, PROVED, np.where(bounds.high < 0, BROKEN, OPEN))
@@ -101,7 +105,7 @@ class BranchAndBound:
         split = (some.state == OPEN) & can.any(1)
         kept = np.ones(len(self.boxes), bool)
         kept[rows[split]] = False
-        for name in ("state", "lowest", "highest", "witness", "confirmed"):
+        for name in ("state", "lowest", "highest", "witness", "confirmed", "inside"):
             getattr(self.boxes, name)[rows] = getattr(some, name)
         order, alike = self.influence(some, robustness, moves, can)
         self.boxes = self.boxes[kept]
@@ -176,26 +180,42 @@ class BranchAndBound:
             self.boxes.confirmed[rows] = (bounds.high < 0) & bounds.inside
 
     def sample(self, count: int) -> None:
-        """Simulate points of the undecided part, drawn from the prior."""
-        self.boxes.failures[:] = self.boxes.samples[:] = 0
-        rows = np.flatnonzero((self.boxes.state == OPEN) & ~self.boxes.confirmed)
-        mass = self.boxes.mass[rows]
-        if not count or not mass.sum() > 0:
+        """Draw points of open boxes from the prior, and simulate accepted ones of undecided boxes.
+
+        Points that the constraint refuses are no samples: they only say how much of the boxes that
+        it may cut is accepted. Such boxes are drawn from even if nothing is to be simulated.
+        """
+        boxes = self.boxes
+        for counts in (boxes.drawn, boxes.accepted, boxes.samples, boxes.failures):
+            counts[:] = 0
+        undecided = (boxes.state == OPEN) & ~boxes.confirmed
+        rows = np.flatnonzero((boxes.state == OPEN) & ~(boxes.confirmed & boxes.inside))
+        cut = not boxes.inside[rows].all()
+        mass, left, constraint = boxes.mass[rows], count, self.problem.space.constraint
+        if not mass.sum() > 0 or not (cut or count):
             return
-        random = np.random.default_rng((self.seed, len(self.boxes)))
-        chosen = rows[random.choice(len(rows), count, p=mass / mass.sum())]
-        low, high = self.boxes.low[chosen], self.boxes.high[chosen]
-        points = (low + random.random(low.shape) * (high - low)).astype(np.float32)
-        points = np.clip(points, low, high).astype(np.float32)
-        verdicts = self.evaluator(points)
-        # What gives no verdict is not known to be safe.
-        failing = verdicts.violated | ~verdicts.proper
-        if self.problem.space.where is not None:
-            failing &= np.asarray(self.problem.space.accepts_points(points))
-        np.add.at(self.boxes.samples, chosen, 1)
-        np.add.at(self.boxes.failures, chosen, failing)
-        failed = np.flatnonzero(verdicts.violated & failing)
-        self.boxes.witness[chosen[failed]] = points[failed]
+        random = np.random.default_rng((self.seed, len(boxes)))
+        for _ in range(DRAWS if cut else 1):
+            chosen = rows[random.choice(len(rows), DRAW if cut else count, p=mass / mass.sum())]
+            low, high = boxes.low[chosen], boxes.high[chosen]
+            points = (low + random.random(low.shape) * (high - low)).astype(np.float32)
+            points = np.clip(points, low, high).astype(np.float32)
+            accepted = np.ones(len(points), bool)
+            if constraint is not None:
+                accepted = np.asarray(constraint(points))
+            np.add.at(boxes.drawn, chosen, 1)
+            np.add.at(boxes.accepted, chosen, accepted)
+            own = np.flatnonzero(accepted & undecided[chosen])[:left]
+            if len(own):
+                verdicts = self.evaluator(points[own])
+                # What gives no verdict is not known to be safe.
+                np.add.at(boxes.samples, chosen[own], 1)
+                np.add.at(boxes.failures, chosen[own], verdicts.violated | ~verdicts.proper)
+                failed = own[np.asarray(verdicts.violated)]
+                boxes.witness[chosen[failed]] = points[failed]
+            left -= len(own)
+            if not left:
+                break
 
 
 def _relative(numbers: Float[np.ndarray, "n dim"]) -> Float[np.ndarray, "n dim"]:

@@ -162,10 +162,11 @@ def enclosable(problem: Problem, precision: str) -> Problem:
     """Return a problem on the backend that can be evaluated with sets.
 
     **Raises:** `ProblemError` for a black box, and for a system that draws random numbers; the
-    errors of `Problem.check`.
+    errors of `Problem.check` and, for a constraint, of `FeatureSpace.check_where`.
     """
     problem = resolved(problem, batch=512, budget=512, precision=precision).problem
     problem.check()
+    problem.space.check_where()
     if problem.black_box:
         raise ProblemError(
             f"problem {problem.name!r} has a system that JAX does not trace, but verify evaluates "

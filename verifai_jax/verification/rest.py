@@ -33,8 +33,9 @@ class Rest:
     - `boxes`: the partition of the cube.
     - `states`: the states that count as decided.
 
-    `mass` is its probability, `decided` the probability of the decided boxes, and `failing` that of
-    the decided boxes in which every point fails.
+    `mass` is its probability with what the constraint refuses of its boxes, and `cut` whether it
+    may refuse some. `decided` is the probability of the decided boxes, which it accepts, and
+    `failing` that of the decided boxes in which every point fails.
     """
 
     def __init__(self, boxes: Boxes, states: Sequence[int]) -> None:
@@ -44,6 +45,7 @@ class Rest:
             float(boxes.mass[rows].sum())
             for rows in (left, decided, decided & (boxes.state == BROKEN))
         )
+        self.cut = not boxes.inside[left].all()
         self._boxes = boxes[left]
         # The partition is one of cuts from face to face, which are found again: a node for each.
         nodes: list[Node] = []

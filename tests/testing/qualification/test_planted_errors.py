@@ -75,6 +75,12 @@ PLANTED = {
     "E48": ("estimation/comparison/_compare.py", "self.failing.append((one[0], other[0]))", "self.failing.append((other[0], one[0]))"),
     "E49": ("statistics/divergence.py", "near = _tilted(values, weights, middle)[1] <= radius", "near = _tilted(values, weights, middle)[1] <= radius / 2"),
     "E50": ("statistics/divergence.py", "return 0.0 if limit <= p else binary_divergence(limit, p)", "return 0.0 if limit <= p else 2 * binary_divergence(limit, p)"),
+    "E51": ("verification/sets/whole.py", "(low < max(lower, -FAR)) | (high > min(upper, FAR))", "np.zeros((low + high).shape, bool)"),
+    "E52": (
+        "verification/branch_and_bound.py",
+        "np.add.at(boxes.samples, chosen[own], 1)",
+        "np.add.at(boxes.samples, chosen[undecided[chosen]], 1)",
+    ),
 }  # fmt: skip
 """By identifier of the error: the file, what stands there, and what is planted in its place."""
 

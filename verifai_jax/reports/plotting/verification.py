@@ -1,7 +1,9 @@
 """The picture of a verification: proved, broken and undecided parts, two coordinates at a time."""
 
 import itertools
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -13,10 +15,14 @@ from verifai_jax.verification.result import Verification
 CELLS = 160
 """Cells of a picture along each axis."""
 PANELS = 3
+TICKS = 8
+"""Values of a discrete coordinate that are written along its axis, at most."""
 COLORS = {"proved": SAFE, "broken": FAILING, "undecided": NOT_CLAIMED}
 
 
-def plot_verification(result: Verification, path: str | Path | None = None) -> Figure:
+def plot_verification(
+    result: Verification, path: str | Path | None = None, units: Mapping[str, str] | None = None
+) -> Figure:
     """Draw each pair of the coordinates that were split most, averaged over the others."""
     from matplotlib.colors import to_rgb
     from matplotlib.patches import Patch
@@ -40,15 +46,37 @@ def plot_verification(result: Verification, path: str | Path | None = None) -> F
             rows = result.verdicts == verdict
             share = up[rows].T @ (own[rows, None] * across[rows])
             image -= np.clip(share, 0, 1)[:, :, None] * (1 - np.array(to_rgb(color)))
-        axes.imshow(np.clip(image, 0, 1), origin="lower", extent=(0, 1, 0, 1), aspect="auto")
-        axes.set_xlabel(f"{result.columns[first]}, share of its range" if first >= 0 else "")
-        if second != first:
-            axes.set_ylabel(f"{result.columns[second]}, share of its range")
-        else:
-            axes.set_yticks([])
+        extent = (
+            *_label(axes.xaxis, result, first, units or {}),
+            *_label(axes.yaxis, result, -1 if second == first else second, units or {}),
+        )
+        axes.imshow(np.clip(image, 0, 1), origin="lower", extent=extent, aspect="auto")
     patches = [Patch(color=color, label=verdict) for verdict, color in COLORS.items()]
     figure.legend(handles=patches, loc="outside upper center", ncols=len(COLORS), frameon=False)
     return show_or_save(figure, path)
+
+
+def _label(
+    axis: Any, result: Verification, coordinate: int, units: Mapping[str, str]
+) -> tuple[float, float]:
+    """Label an axis with the values of a coordinate, none for -1, and return its ends."""
+    if coordinate < 0:
+        axis.set_ticks([])
+        return 0.0, 1.0
+    name, scale = result.columns[coordinate], result.scales[coordinate]
+    axis.set_label_text(with_unit(name, units) + ("" if scale else ", share of its range"))
+    if "edges" in scale:
+        middles = np.add(scale["edges"][1:], scale["edges"][:-1]) / 2
+        shown = np.unique(np.linspace(0, len(middles) - 1, TICKS).round().astype(int))
+        axis.set_ticks(middles[shown], [str(scale["values"][i]) for i in shown])
+        return 0.0, 1.0
+    low, high = scale.get("values", (0.0, 1.0))
+    return low, high
+
+
+def with_unit(name: str, units: Mapping[str, str]) -> str:
+    """Return the name of a coordinate with the unit of its feature, if it has one."""
+    return f"{name} [{units[name]}]" if name in units else name
 
 
 def _overlap(

@@ -26,12 +26,21 @@ from verifai_jax.core.values.trace import Trace
 from verifai_jax.estimation import estimate
 from verifai_jax.estimation.comparison import compare
 from verifai_jax.falsification import falsify, load, resume, simulate
-from verifai_jax.features import Box, Categorical, FeatureSpace, LogNormal, LogUniform, Normal
+from verifai_jax.features import (
+    Box,
+    Categorical,
+    DiscreteBox,
+    FeatureSpace,
+    LogNormal,
+    LogUniform,
+    Normal,
+)
 from verifai_jax.problem import Problem
 from verifai_jax.statistics.binomial import clopper_pearson, simulations_without_failure
 from verifai_jax.statistics.confidence_sequences import anytime_interval
 from verifai_jax.systems.blackbox import blackbox
 from verifai_jax.systems.ode import ode
+from verifai_jax.verification import verify
 
 LIMIT = 0.6
 DT = 0.5
@@ -368,10 +377,35 @@ def divergences() -> None:
         assert abs(radius_of(p, worst_probability(p, radius)) - radius) < 1e-6
 
 
+def proofs() -> None:
+    """Check proofs against all values of whole numbers that wrap around, and with a constraint."""
+
+    def whole(f: Any, key: Any) -> Trace:
+        numbers = jnp.stack([9 * f["a"], 5 * f["b"] + 1]).astype(jnp.int8)
+        return Trace({"x": jnp.sum(numbers, dtype=jnp.int8) * jnp.ones(2)}, dt=1.0)
+
+    space = FeatureSpace({"a": DiscreteBox(0, 19), "b": DiscreteBox(0, 19)})
+    problem = Problem("whole", space, whole, "always x >= 0")
+    found: Any = verify(problem, boxes=60, samples=64, progress=False)
+    a, b = np.mgrid[:20, :20]
+    fails = (9 * a + 5 * b + 1).astype(np.int8) < 0
+    for _, box in found.table[found.table["verdict"] == "proved"].iterrows():
+        part = fails[box["a from"] : box["a to"] + 1, box["b from"] : box["b to"] + 1]
+        assert not part.any(), dict(box)
+    low, high = found.probability
+    assert low <= fails.mean() <= high, (fails.mean(), low, high)
+    band = FeatureSpace({"a": Box(-1, 1), "b": Box(-1, 1)}, lambda f: abs(f["a"] - f["b"]) < 0.05)
+    for limit, truth in ((-2.0, 1.0), (0.0, 0.5), (2.0, 0.0)):
+        problem = Problem("band", band, _system, f"always x <= {limit}")
+        low, high = verify(problem, boxes=40, samples=400, progress=False).probability
+        assert low <= truth <= high, (truth, low, high)
+
+
 ORACLES: dict[str, Callable[[], None]] = {
     each.__name__: each
     for each in (
         formulas, zeros, gradients, table, statuses, intervals, probabilities, priors, steps,
         replays, kills, searches, confirmations, comparisons, divergences,
+        proofs,
     )
 }  # fmt: skip

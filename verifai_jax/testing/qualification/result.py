@@ -234,6 +234,10 @@ _BY_ORACLE = {
         "the worst prior is not the worst",
         "a claim is said to bear a greater shift of the prior than it does",
     ),
+    "proofs": (
+        "a proof takes integers for numbers that never wrap around",
+        "a proof counts points that the constraint refuses as safe",
+    ),
 }
 HAZARDS = {
     f"E{number:02}": hazard

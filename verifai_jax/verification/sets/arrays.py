@@ -3,11 +3,12 @@
 import functools
 import itertools
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 
-from verifai_jax.verification.sets import functions
+from verifai_jax.verification.sets import functions, whole
 from verifai_jax.verification.sets.elementwise import of_rank, select
 from verifai_jax.verification.sets.form import (
     Form,
@@ -27,6 +28,7 @@ from verifai_jax.verification.sets.interpreter import (
     Value,
     as_form,
     as_whole,
+    constant,
     rule,
 )
 from verifai_jax.verification.sets.whole import Whole
@@ -208,11 +210,17 @@ def _by_index(t: Interpreter, step: Equation, inputs: list[Value]) -> list[Value
 
 @rule("reduce_sum")
 def _sum(t: Interpreter, step: Equation, inputs: list[Value]) -> list[Value]:
-    (value,), axes = inputs, step.params["axes"]
-    if isinstance(value, Form):
-        return [total(value, axes)]
-    lead = tuple(axis + 1 for axis in axes)
-    return [Whole(value.low.sum(lead), value.high.sum(lead), value.dtype)]
+    return [_total(inputs[0], step.params["axes"])]
+
+
+def _total(value: Value, axes: Sequence[int]) -> Value:
+    return total(value, axes) if isinstance(value, Form) else whole.total(value, axes)
+
+
+def _times_each(a: Value, b: Value) -> Value:
+    if isinstance(a, Form):
+        return product(a, as_form(b))
+    return whole.OPERATIONS["mul"](a, as_whole(b))
 
 
 @rule("reduce_max", "reduce_min", "reduce_and", "reduce_or")
@@ -223,9 +231,9 @@ def _extreme(t: Interpreter, step: Equation, inputs: list[Value]) -> list[Value]
         (np.max, -np.inf)
     )  # fmt: skip
     if isinstance(value, Whole):
-        first = 2**62 if initial > 0 else -(2**62)
-        if value.dtype == np.bool_:
-            first = int(initial > 0)
+        if value.dtype != np.bool_ and step.primitive.name in ("reduce_and", "reduce_or"):
+            return t.concrete(step, inputs)
+        first = whole.limits(value.dtype)[initial > 0]
         low, high = (extreme(end, axes, initial=first) for end in (value.low, value.high))
         return [Whole(low, high, value.dtype)]
     low, high = value.bounds()
@@ -237,34 +245,41 @@ def _extreme(t: Interpreter, step: Equation, inputs: list[Value]) -> list[Value]
 
 @rule("reduce_prod")
 def _product(t: Interpreter, step: Equation, inputs: list[Value]) -> list[Value]:
-    value = as_form(inputs[0])
+    value = inputs[0]
     for axis in sorted(step.params["axes"], reverse=True):
-        value = functools.reduce(product, _rows(value, axis))
+        one = constant(np.ones(value.shape[:axis] + value.shape[axis + 1 :]), value.dtype)
+        value = functools.reduce(_times_each, _rows(value, axis) or [one])
     return [value]
 
 
-def _rows(value: Form, axis: int) -> list[Form]:
+def _rows(value: Value, axis: int) -> list[Value]:
     return [
         value.moved(lambda array, lead, i=i: array.take(i, axis + lead))
         for i in range(value.shape[axis])
     ]
 
 
-_ACCUMULATED = {"cumprod": product, "cummax": functions.greater, "cummin": functions.lesser}
+_ACCUMULATED: dict[str, Callable[[Any, Any], Value]] = {
+    "cumprod": _times_each,
+    "cummax": functions.greater,
+    "cummin": functions.lesser,
+}
 
 
 @rule("cumsum", *_ACCUMULATED)
 def _cumulative(t: Interpreter, step: Equation, inputs: list[Value]) -> list[Value]:
     axis, name = step.params["axis"], step.primitive.name
-    if isinstance(inputs[0], Whole):
-        return t.concrete(step, inputs)
     order = slice(None, None, -1 if step.params["reverse"] else 1)
     rows = _rows(inputs[0], axis)[order]
+    if not rows:
+        return inputs
     if name == "cumsum":
         # Whatever the order of the additions: XLA adds up in a tree.
-        sums = [total(as_form(together(rows[: i + 1], np.stack)), (0,)) for i in range(len(rows))]
+        sums = [_total(together(rows[: i + 1], np.stack), (0,)) for i in range(len(rows))]
     else:
-        sums = list(itertools.accumulate(rows, _ACCUMULATED[name]))
+        extreme = whole.OPERATIONS.get(name.removeprefix("cum"))
+        each = extreme if extreme and isinstance(rows[0], Whole) else _ACCUMULATED[name]
+        sums = list(itertools.accumulate(rows, each))
     return [together(sums[order], lambda arrays, lead: np.stack(arrays, axis + lead))]
 
 
@@ -286,19 +301,19 @@ def _argument(t: Interpreter, step: Equation, inputs: list[Value]) -> list[Value
 
 @rule("dot_general")
 def _dot(t: Interpreter, step: Equation, inputs: list[Value]) -> list[Value]:
-    if isinstance(inputs[0], Whole):
-        return t.concrete(step, inputs)
-    (contracted, batched), (a, b) = step.params["dimension_numbers"], map(as_form, inputs)
+    (contracted, batched), (a, b) = step.params["dimension_numbers"], inputs
+    dtype = np.dtype(step.outvars[0].aval.dtype)
     letters = iter("abcdefghijklmnopqrstuvw")
     joint = [next(letters) for _ in batched[0]], [next(letters) for _ in contracted[0]]
     names: list[str] = []
-    for form, outer, inner in zip((a, b), batched, contracted, strict=True):
+    for value, outer, inner in zip((a, b), batched, contracted, strict=True):
         known = dict(zip((*outer, *inner), (*joint[0], *joint[1]), strict=True))
-        names.append("".join(known.get(i) or next(letters) for i in range(len(form.shape))))
+        names.append("".join(known.get(i) or next(letters) for i in range(len(value.shape))))
     free = ["".join(c for c in name if c not in joint[0] + joint[1]) for name in names]
     result = "".join(joint[0]) + free[0] + free[1]
-    dtype = np.dtype(step.outvars[0].aval.dtype)
     for form, other, (own, its) in ((a, b, names), (b, a, names[::-1])):
+        if isinstance(form, Whole) or isinstance(other, Whole):
+            continue
         if is_point(other) and np.isfinite(other.centre).all():
             text = f"...{own},{its}->...{result}"
             terms = int(np.prod([form.shape[own.index(c)] for c in joint[1]], dtype=np.int64))
@@ -316,10 +331,12 @@ def _dot(t: Interpreter, step: Equation, inputs: list[Value]) -> list[Value]:
         return array.reshape(*array.shape[:lead], *(sizes.get(c, 1) for c in axes))
 
     a, b = (
-        form.moved(functools.partial(spread, name))
-        for form, name in zip((a, b), names, strict=True)
+        value.moved(functools.partial(spread, name))
+        for value, name in zip((a, b), names, strict=True)
     )
-    return [total(product(a, b), range(len(result), len(axes)))]
+    if isinstance(a, Whole) and isinstance(b, Whole):
+        a, b = (Whole(each.low, each.high, dtype) for each in (a, b))
+    return [_total(_times_each(a, b), range(len(result), len(axes)))]
 
 
 def _times(a: Form, numbers: np.ndarray, names: str, dtype: np.dtype, terms: int) -> Form:

@@ -78,9 +78,10 @@ def _negative(t: Interpreter, step: Equation, inputs: list[Value]) -> list[Value
 
 @rule("integer_pow")
 def _integer_power(t: Interpreter, step: Equation, inputs: list[Value]) -> list[Value]:
-    if isinstance(inputs[0], Whole):
-        return t.concrete(step, inputs)
-    return [functions.integer_power(inputs[0], int(step.params["y"]))]
+    (value,), exponent = inputs, int(step.params["y"])
+    if isinstance(value, Whole):
+        return t.concrete(step, inputs) if exponent < 0 else [whole.power(value, exponent)]
+    return [functions.integer_power(value, exponent)]
 
 
 @rule("round")
@@ -109,7 +110,8 @@ def _compare(t: Interpreter, step: Equation, inputs: list[Value]) -> list[Value]
     name = step.primitive.name
     if isinstance(a, Whole):
         b = as_whole(b)
-        return [whole.compared(name, a.low - b.high, a.high - b.low)]
+        ends = (whole.exactly(np.subtract, *pair) for pair in ((a.low, b.high), (a.high, b.low)))
+        return [whole.compared(name, *ends)]
     if step.invars[0] is step.invars[1]:
         # Only NaN differs from itself.
         low = np.where(unknown(*a.bounds()), -1, 0)
@@ -176,27 +178,19 @@ def _convert(t: Interpreter, step: Equation, inputs: list[Value]) -> list[Value]
             return [value.of_type(dtype)]
         return [add(value.of_type(dtype), Form.constant(np.zeros(value.shape), dtype))]
     if isinstance(value, Whole):
-        return [_whole_to_whole(value, dtype)]
+        if dtype == np.bool_:
+            return [whole.compared("ne", np.sign(value.low), np.sign(value.high))]
+        if value.is_point:
+            return [Whole(*[value.low.astype(dtype).astype(np.int64)] * 2, dtype)]
+        return [Whole(value.low, value.high, dtype)]
     low, high = value.bounds()
     if dtype == np.bool_:
         return [whole.compared("ne", np.sign(low), np.sign(high))]
-    info = np.iinfo(dtype)
-    inside = (low > info.min) & (high < info.max)
-    low, high = (np.where(inside, np.trunc(end), 0).astype(np.int64) for end in (low, high))
-    top = min(info.max, 2**62)
-    return [Whole(np.where(inside, low, info.min), np.where(inside, high, top), dtype)]
-
-
-def _whole_to_whole(value: Whole, dtype: np.dtype) -> Whole:
-    if dtype == np.bool_:
-        return whole.compared("ne", np.sign(value.low), np.sign(value.high))
-    info = np.iinfo(dtype)
-    if value.is_point:
-        wrapped = value.low.astype(dtype).astype(np.int64)
-        return Whole(wrapped, wrapped, dtype)
-    top = min(info.max, 2**62)
-    fits = (value.low >= info.min) & (value.high <= top)
-    return Whole(np.where(fits, value.low, info.min), np.where(fits, value.high, top), dtype)
+    # Of what does not fit the machine may make any number, as of integers that leave their type.
+    far = ~((np.abs(low) < whole.FAR) & (np.abs(high) < whole.FAR))
+    ends = zip(whole.limits(np.dtype(np.int64)), (low, high), strict=True)
+    ends = (np.where(far, upper, np.trunc(end).astype(np.int64)) for upper, end in ends)
+    return [Whole(*ends, dtype)]
 
 
 @rule(

@@ -96,7 +96,11 @@ class Interpreter:
         if found is None:
             return self.concrete(step, inputs)
         try:
-            return found(self, step, inputs)
+            results = found(self, step, inputs)
+            for value, form in zip(results, (out.aval for out in step.outvars), strict=True):
+                if (value.dtype, value.shape) != (form.dtype, form.shape):
+                    raise NotImplementedError(f"a result of type {form.str_short()}")
+            return results
         except MissingRule:
             raise
         except NotImplementedError as error:
@@ -122,7 +126,7 @@ def constant(value: ArrayLike, dtype: np.dtype) -> Value:
     """Return a constant of a program as a set."""
     if jnp.issubdtype(dtype, jnp.floating):
         return Form.constant(np.asarray(value), np.dtype(dtype))
-    if jnp.issubdtype(dtype, jnp.integer) or dtype == jnp.bool_:
+    if (jnp.issubdtype(dtype, jnp.integer) and dtype != jnp.uint64) or dtype == jnp.bool_:
         return Whole.constant(np.asarray(value), np.dtype(dtype))
     raise MissingRule(f"sets do not support numbers of type {dtype}")
 
@@ -133,12 +137,14 @@ def _where(step: Equation) -> str:
 
 
 def as_form(value: Value) -> Form:
-    """Return a value that is a real number."""
-    assert isinstance(value, Form)
+    """Return a value that is a real number; others raise `NotImplementedError`."""
+    if not isinstance(value, Form):
+        raise NotImplementedError("whole numbers where only real ones are supported")
     return value
 
 
 def as_whole(value: Value) -> Whole:
-    """Return a value that is a whole number or a truth value."""
-    assert isinstance(value, Whole)
+    """Return a whole number or a truth value; others raise `NotImplementedError`."""
+    if not isinstance(value, Whole):
+        raise NotImplementedError("real numbers where only whole ones are supported")
     return value

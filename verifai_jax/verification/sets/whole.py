@@ -3,7 +3,8 @@
 An undecided truth value is the interval from 0 to 1.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from functools import cache
 
 import numpy as np
 
@@ -11,12 +12,25 @@ Numbers = np.ndarray
 """Whole numbers, `[boxes, *shape]`, or `[1, *shape]` where all boxes have the same."""
 
 
+FAR = 2**62
+"""A number from which on nothing is computed: it counts as one that leaves any type."""
+
+
 class Whole:
-    """Integers between `low` and `high`, of one type; truth values are 0 and 1."""
+    """Integers between `low` and `high`, of one type; truth values are 0 and 1.
+
+    Integers that may leave the type wrap around: then the set is all numbers of the type. Every set
+    is made here, so that no operation needs to think of it; `exactly` computes its ends.
+    """
 
     __slots__ = ("dtype", "high", "low")
 
     def __init__(self, low: Numbers, high: Numbers, dtype: np.dtype) -> None:
+        lower, upper = limits(dtype)
+        if low is not high:
+            wraps = (low < max(lower, -FAR)) | (high > min(upper, FAR))
+            if np.any(wraps):
+                low, high = np.where(wraps, lower, low), np.where(wraps, upper, high)
         self.low, self.high, self.dtype = low, high, dtype
 
     @classmethod
@@ -59,29 +73,46 @@ class Whole:
 
     def moved(self, move: Callable[[np.ndarray, int], np.ndarray]) -> "Whole":
         """Return the numbers rearranged by `move(array, leading)`."""
-        return Whole(move(self.low, 1), move(self.high, 1), self.dtype)
+        low = move(self.low, 1)
+        return Whole(low, low if self.high is self.low else move(self.high, 1), self.dtype)
 
 
-def _within(low: Numbers, high: Numbers, dtype: np.dtype) -> Whole:
-    """Return an interval, or all numbers of the type where it may wrap around."""
+@cache
+def limits(dtype: np.dtype) -> tuple[int, int]:
+    """Return the smallest and the greatest number of a type.
+
+    **Raises:** `NotImplementedError` for a type whose numbers do not fit into 64 bits with a sign.
+    """
     if dtype == np.bool_:
-        return Whole(low, high, dtype)
+        return 0, 1
     info = np.iinfo(dtype)
-    wraps = (low < info.min) | (high > min(info.max, 2**62))
-    if np.any(wraps):
-        low, high = np.where(wraps, info.min, low), np.where(wraps, min(info.max, 2**62), high)
-    return Whole(low, high, dtype)
+    if info.max > 2**63 - 1:
+        raise NotImplementedError("whole numbers of 64 bits without a sign")
+    return int(info.min), int(info.max)
 
 
-def _by_corners(operation: Callable[..., Numbers]) -> Callable[[Whole, Whole], Whole]:
-    def applied(a: Whole, b: Whole) -> Whole:
-        values = [operation(x, y) for x in (a.low, a.high) for y in (b.low, b.high)]
-        low, high = values[0], values[0]
-        for value in values[1:]:
-            low, high = np.minimum(low, value), np.maximum(high, value)
-        return _within(low, high, a.dtype)
+def exactly(operation: Callable[..., Numbers], *ends: Numbers) -> Numbers:
+    """Compute in whole numbers; what is `FAR`, or not defined, becomes an end of 64 bits.
 
-    return applied
+    **Arguments:**
+    - `operation`: a function of whole numbers that also takes real ones, to know its size.
+    """
+    size, result = operation(*(np.asarray(end, float) for end in ends)), operation(*ends)
+    far = ~(np.abs(size) < FAR)
+    lower, upper = limits(np.dtype(np.int64))
+    return np.where(far, np.where(size > 0, upper, lower), result) if np.any(far) else result
+
+
+def by_corners(
+    operation: Callable[..., Numbers], a: Whole, b: Whole, *others: Numbers, dtype: np.dtype
+) -> Whole:
+    """Return the results of an operation that is monotone in each of its operands.
+
+    **Arguments:**
+    - `others`: further numbers of the second operand at which it is evaluated.
+    """
+    values = [exactly(operation, x, y) for x in (a.low, a.high) for y in (b.low, b.high, *others)]
+    return Whole(np.minimum.reduce(values), np.maximum.reduce(values), dtype)
 
 
 def _logic(operation: Callable[..., np.ndarray]) -> Callable[[Whole, Whole], Whole]:
@@ -93,36 +124,40 @@ def _logic(operation: Callable[..., np.ndarray]) -> Callable[[Whole, Whole], Who
             return Whole.truth(true, false)
         if a.dtype == np.bool_ or (a.is_point and b.is_point):
             return Whole(operation(a.low, b.low), operation(a.high, b.high), a.dtype)
-        mask = b if b.is_point else a
-        if operation is np.bitwise_and and mask.low.min() >= 0:
-            return Whole(np.zeros_like(mask.low), mask.high, a.dtype)
-        raise NotImplementedError("a bitwise operation on whole numbers that vary in a box")
+        ends = np.broadcast_arrays(a.low, b.low, a.high, b.high)
+        low, high = (np.full(ends[0].shape, end) for end in limits(a.dtype))
+        if operation is np.bitwise_and:
+            # A mask without a sign leaves nothing greater than itself.
+            for lower, upper in (ends[::2], ends[1::2]):
+                low = np.where(lower >= 0, 0, low)
+                high = np.where(lower >= 0, np.minimum(upper, high), high)
+        return Whole(low, high, a.dtype)
 
     return applied
 
 
+def _quotient(x: Numbers, y: Numbers) -> Numbers:
+    return (x - np.fmod(x, y)) // y
+
+
 def _divided(a: Whole, b: Whole) -> Whole:
-    _check_divisor(b)
-    trunc = lambda x, y: np.sign(x) * np.sign(y) * (np.abs(x) // np.abs(y))  # noqa: E731
-    return _by_corners(trunc)(a, b)
+    # By zero, if it is among the divisors, the quotient is not defined, and may be anything.
+    return by_corners(_quotient, a, b, np.clip(0, b.low, b.high), dtype=a.dtype)
 
 
 def _left(a: Whole, b: Whole) -> Whole:
-    _check_divisor(b)
-    top = np.maximum(np.abs(b.low), np.abs(b.high)) - 1
-    low, high = np.maximum(a.low, -top), np.minimum(a.high, top)
-    return Whole(np.where(a.low >= 0, 0, low), np.where(a.high <= 0, 0, high), a.dtype)
-
-
-def _check_divisor(b: Whole) -> None:
-    if np.any((b.low <= 0) & (b.high >= 0)):
-        raise NotImplementedError("a division by whole numbers that may be zero")
+    lower, upper = limits(a.dtype)
+    top = np.maximum(exactly(np.abs, b.low), exactly(np.abs, b.high)) - 1
+    zero = (b.low <= 0) & (b.high >= 0)
+    low = np.where(a.low >= 0, 0, np.maximum(a.low, -top))
+    high = np.where(a.high <= 0, 0, np.minimum(a.high, top))
+    return Whole(np.where(zero, lower, low), np.where(zero, upper, high), a.dtype)
 
 
 OPERATIONS: dict[str, Callable[[Whole, Whole], Whole]] = {
-    "add": lambda a, b: _within(a.low + b.low, a.high + b.high, a.dtype),
-    "sub": lambda a, b: _within(a.low - b.high, a.high - b.low, a.dtype),
-    "mul": _by_corners(np.multiply),
+    "add": lambda a, b: by_corners(np.add, a, b, dtype=a.dtype),
+    "sub": lambda a, b: by_corners(np.subtract, a, b, dtype=a.dtype),
+    "mul": lambda a, b: by_corners(np.multiply, a, b, dtype=a.dtype),
     "div": _divided,
     "rem": _left,
     "max": lambda a, b: Whole(np.maximum(a.low, b.low), np.maximum(a.high, b.high), a.dtype),
@@ -134,9 +169,23 @@ OPERATIONS: dict[str, Callable[[Whole, Whole], Whole]] = {
 """Operations on two sets, by the name of JAX's primitive."""
 
 
+def total(a: Whole, axes: Sequence[int]) -> Whole:
+    """Return the sum over axes."""
+    lead = tuple(axis + 1 for axis in axes)
+    ends = (exactly(lambda end: end.sum(lead), end) for end in (a.low, a.high))
+    return Whole(*ends, a.dtype)
+
+
+def power(a: Whole, n: int) -> Whole:
+    """Return `a ** n`, for `n` of 0 or more."""
+    size = _absolute(a) if n % 2 == 0 else a
+    return Whole(*(exactly(lambda end: end**n, end) for end in (size.low, size.high)), a.dtype)
+
+
 def _absolute(a: Whole) -> Whole:
-    low = np.where((a.low <= 0) & (a.high >= 0), 0, np.minimum(np.abs(a.low), np.abs(a.high)))
-    return _within(low, np.maximum(np.abs(a.low), np.abs(a.high)), a.dtype)
+    ends = exactly(np.abs, a.low), exactly(np.abs, a.high)
+    low = np.where((a.low <= 0) & (a.high >= 0), 0, np.minimum(*ends))
+    return Whole(low, np.maximum(*ends), a.dtype)
 
 
 def _inverted(a: Whole) -> Whole:
@@ -146,17 +195,12 @@ def _inverted(a: Whole) -> Whole:
     return Whole(top - a.high, top - a.low, a.dtype)
 
 
-def _squared(a: Whole) -> Whole:
-    size = _absolute(a)
-    return OPERATIONS["mul"](size, size)
-
-
 FUNCTIONS: dict[str, Callable[[Whole], Whole]] = {
     "abs": _absolute,
-    "neg": lambda a: _within(-a.high, -a.low, a.dtype),
+    "neg": lambda a: Whole(exactly(np.negative, a.high), exactly(np.negative, a.low), a.dtype),
     "not": _inverted,
     "sign": lambda a: Whole(np.sign(a.low), np.sign(a.high), a.dtype),
-    "square": _squared,
+    "square": lambda a: power(a, 2),
 }
 """Operations on one set, by the name of JAX's primitive."""
 COMPARISONS = ("eq", "ne", "lt", "le", "gt", "ge")
