@@ -3,7 +3,7 @@
 found = confirmer(rows, numbers)                    # as `confirmer.py` makes it
 found.verdict                                       # [n]: "confirmed", "fragile", ...
 refused, learned = found.refuse()                   # which rows are not claimed
-describe_checks(found.checks)                       # "in double precision and at a half ..."
+describe_checks(found.checks)                       # "in double precision and at a third ..."
 """
 
 from collections import Counter
@@ -35,8 +35,10 @@ MEANING = {
     "unexamined": "it is unchecked, as it was not replayed",
 }
 """Each verdict as people read it."""
-FINER = {"half_step": 2, "quarter_step": 4}
-"""Checks at a finer step, and how many times finer."""
+FINER = {"third_step": 3, "quarter_step": 4}
+"""Checks at a finer step, and how many times finer. What is periodic and looks constant at one of
+them does not at the other, unless its frequency is a multiple of twelve times that of the steps:
+halving the step twice would keep every alias of the quarter."""
 RAISED = (Status.ERROR, Status.TIMEOUT)
 """Ends of a simulation that gave no trace."""
 SINGLE = "quarter_step_float32"
@@ -44,7 +46,7 @@ SINGLE = "quarter_step_float32"
 CHECK_TEXTS = {
     "float64": "in float64",
     "again": "simulated again",
-    "half_step": "at half the step",
+    "third_step": "at a third of the step",
     "quarter_step": "at a quarter of the step",
     SINGLE: "at a quarter of the step in float32",
     "nudged": "one rounding of the features away",
@@ -70,7 +72,7 @@ def describe_checks(checks: Collection[str], *, of_step: bool = True) -> str:
     **Arguments:**
     - `checks`: their names, as in `Confirmations.checks`.
     - `of_step`: whether to explain why no finer step was checked.
-    **Returns:** the end of a sentence, such as `in double precision and at a half and a quarter of
+    **Returns:** the end of a sentence, such as `in double precision and at a third and a quarter of
     the step`; empty if there was no check.
     """
     parts = []
@@ -79,7 +81,7 @@ def describe_checks(checks: Collection[str], *, of_step: bool = True) -> str:
     elif "again" in checks:
         parts.append("when simulated again")
     if "quarter_step" in checks:
-        parts.append("at a half and a quarter of the step")
+        parts.append("at a third and a quarter of the step")
     if "nudged" in checks:
         parts.append("one rounding of the features away")
     parts += map(describe_check, engines_of(checks))
@@ -165,17 +167,18 @@ class Confirmations(InNotebook):
     - `run_rho`: `[n]`, the robustness computed in the run; NaN if unknown.
     - `verdict`: `[n]`, one of these. `confirmed`: it fails in every check, by more than replays
       move it (if it can only be simulated once more, and no row of the run was safe then, it
-      suffices that it fails again). `refuted`: it fails in none of the finer checks (half and
+      suffices that it fails again). `refuted`: it fails in none of the finer checks (third and
       quarter of the step and the other engines, or double precision if the step cannot be refined).
       `fragile`: the checks disagree, one gave no robustness, the row fails by less than replays
       move it, or it did not fail when simulated again. `raised`: a check raised, and the others
       fail. `unexamined`: left out, see `Confirmer`. Empty for a row that was not to be checked.
     - `rho`: for each check, by name, the least robustness `[n]` of the formulas; NaN if there is
-      none. Names are `float64` (or `again`, in the precision of the run), `half_step`,
+      none. Names are `float64` (or `again`, in the precision of the run), `third_step`,
       `quarter_step`, `quarter_step_float32`, `nudged` (at the finest step, with features moved by
       one rounding of float32), and `engine.NAME` of another engine.
-    - `band`: `[n]`, the change of the robustness. Between half and quarter of the step this is the
-      remaining error of a method of order 1 at the quarter (Richardson extrapolation). By rounding
+    - `band`: `[n]`, the change of the robustness. Between a third and a quarter of the step three
+      times the change is the remaining error of a method of order 1 at the quarter (Richardson
+      extrapolation). By rounding
       it moves between two precisions, two neighbouring features, or the run and its replay if
       `run_rho` is known. A row is confirmed if it fails by more than the former and by four times
       the latter.

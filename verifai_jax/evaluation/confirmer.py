@@ -6,7 +6,7 @@
     found.rho["quarter_step"]                           # [n], robustness at a quarter of the step
 
 A search simulates in single precision at the model's step; both can cause false violations. A
-counterexample is claimed only if it fails in double precision, at half and at a quarter of the step
+counterexample is claimed only if it fails in double precision, at a third and at a quarter of the step
 (there also in single precision), and with features changed by one rounding. It also has to fail by
 more than the finer step changed its robustness, and by far more than rounding did. A host system
 without a finer step is simulated once more with the same features and key: a row that fails again
