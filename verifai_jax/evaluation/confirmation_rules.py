@@ -101,7 +101,7 @@ def hold_to_run(
     fails = np.all([verdicts.violated for verdicts in replayed.values()], axis=0)
     still = (rows["verdict"] == "confirmed") & fails & only_repeats
     found.verdict[still], found.why[still] = "confirmed", ""
-    refused = np.isin(rows["verdict"], confirmations.NOT_CLAIMED)
+    refused = np.isin(rows["verdict"], confirmations.REFUSED)
     refused &= np.isin(found.verdict, ("confirmed", "raised"))
     for i in np.flatnonzero(refused).tolist():
         found.verdict[i] = "fragile"

@@ -2,7 +2,7 @@
 
 found = confirmer(rows, numbers)                    # as `confirmer.py` makes it
 found.verdict                                       # [n]: "confirmed", "fragile", ...
-refused, learned = found.refuse()                   # which rows are not claimed
+refused, learned = found.refuse()                   # which rows are no failures
 describe_checks(found.checks)                       # "in double precision and at a third ..."
 """
 
@@ -10,7 +10,7 @@ from collections import Counter
 from collections.abc import Collection, Iterable
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -25,14 +25,14 @@ VERDICTS = ("confirmed", "refuted", "fragile", "raised", "unexamined")
 """Verdicts of closer replays; see `Confirmations`."""
 UNDECIDED = ("fragile", "raised", "unexamined")
 """Verdicts that leave open whether the failure is the system's or the simulation's."""
-NOT_CLAIMED = ("fragile", "refuted")
+REFUSED = ("fragile", "refuted")
 """Verdicts of rows that violate the property as simulated, and do not when looked at closely."""
 MEANING = {
     "confirmed": "it fails in every replay",
     "refuted": "an artefact of the simulation",
     "fragile": "replays disagree",
     "raised": "it could not be replayed",
-    "unexamined": "it is unchecked, as it was not replayed",
+    "unexamined": "it was not replayed",
 }
 """Each verdict as people read it."""
 FINER = {"third_step": 3, "quarter_step": 4}
@@ -60,10 +60,35 @@ ROUNDED = 1e-4
 """Share of a robustness by which rounding may change it between two simulations, such as of
 threads that add up in any order, or of a batch of another size."""
 SMALLEST_KEPT = 1e-6
-"""Smallest robustness that a search learns of a row that is not claimed, positive since it holds;
+"""Smallest robustness that a search learns of a row that is refused, positive since it holds;
 also the size below which two robustnesses of about zero are taken for equal."""
 SHOWN = 5
 """Reasons of doubtful rows that are printed; the rest are counted, since `table` has them."""
+
+
+class Standing(NamedTuple):
+    """What is said of rows that violate the property as simulated: one of three for each.
+
+    - `claimed`: `[n]`, rows that every closer replay confirmed; of a run that was asked not to
+      replay, all that violate the property.
+    - `refused`: `[n]`, rows that closer replays refuted, or do not agree on.
+    - `not_replayed`: `[n]`, rows that were left out, or could not be replayed.
+    """
+
+    claimed: Bool[np.ndarray, " n"]
+    refused: Bool[np.ndarray, " n"]
+    not_replayed: Bool[np.ndarray, " n"]
+
+    @classmethod
+    def of(cls, violated: Bool[np.ndarray, " n"], verdict: np.ndarray | None) -> "Standing":
+        """Return the standing of rows, given which violate the property, and their verdicts."""
+        none = np.zeros(len(violated), bool)
+        if verdict is None:
+            return cls(violated, none, none)
+        claimed, refused, rows = none, none.copy(), np.flatnonzero(violated)
+        claimed[rows] = verdict[rows] == "confirmed"
+        refused[rows] = np.isin(verdict[rows].astype(str), REFUSED)
+        return cls(claimed, refused, violated & ~claimed & ~refused)
 
 
 def describe_checks(checks: Collection[str], *, of_step: bool = True) -> str:
@@ -227,12 +252,12 @@ class Confirmations(InNotebook):
             self.rho.setdefault(name, np.full(len(self), np.nan))[rows] = values
 
     def refuse(self) -> tuple[Bool[np.ndarray, " n"], Float[np.ndarray, " n"]]:
-        """Return flags of unclaimed rows, and the robustness that a search observes for them.
+        """Return flags of refused rows, and the robustness that a search observes for them.
 
         It is the largest value of the run and its replays, and positive, so that a search leaves
         points that are not failures; NaN without a replay.
         """
-        refused = np.isin(self.verdict, NOT_CLAIMED)
+        refused = np.isin(self.verdict, REFUSED)
         if not self.rho:
             return refused, np.full(len(refused), np.nan)
         greatest = np.fmax.reduce(np.stack([*self.rho.values(), self.run_rho]), axis=0)

@@ -20,8 +20,6 @@ from verifai_jax.problem.problem import Problem
 MORE = 4
 """So many times as many rows of a seed are replayed next, after none of its last was claimed: few
 programs in few calls, and at most four times as many replays as are needed."""
-WITHOUT_BOUND = 2**31 - 1
-"""A number of rows that no run has."""
 DRAWS: Slot[str, bool] = Slot("randomness of the system")
 """Whether the system uses its random key, by precision."""
 
@@ -108,9 +106,7 @@ class SeedConfirmer:
 
     def _confirmer(self, seed: int) -> Confirmer:
         if seed not in self._confirmers:
-            self._confirmers[seed] = Confirmer(
-                self.problem, self.precision, int(self.seeds[seed]), max_rows=WITHOUT_BOUND
-            )
+            self._confirmers[seed] = Confirmer(self.problem, self.precision, int(self.seeds[seed]))
         return self._confirmers[seed]
 
     @property
