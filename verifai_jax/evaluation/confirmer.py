@@ -54,8 +54,8 @@ MORE = 3
 """Further repetitions of rows that fail again, once another row of the run did not: a system that
 fails at every seventh call fails in the first repetition of every seventh row, too."""
 CHECKPOINT = "confirmer"
-"""Entry of a checkpoint: rows examined, the worst row, whether one came again otherwise, and whether
-one did not fail again."""
+"""Entry of a checkpoint: rows examined, the worst row, whether one came again otherwise, and
+whether one did not fail again."""
 Check: TypeAlias = tuple[Replays | HostReplays, int]
 """One kind of replay: in the precision of these replays, with a so many times smaller step."""
 
@@ -209,6 +209,8 @@ class Confirmer:
         checks: dict[str, Check] = {}
         key = run_keys(self.seed)[1]
         base, notes, raised = finest_replays(problem, run, key, self.executor, self.target)
+        if base is not None and raised:
+            self.raised, raised = tuple(notes), ""
         if base is not None:
             checks["float64" if base.precision == "float64" else "again"] = base, 1
             reason = base.refiner.why_not(FINER.values())
@@ -223,9 +225,10 @@ class Confirmer:
         for name, other in self.others.items():
             replays, of_other, raised_too = finest_replays(other, run, key)
             notes += [f"{describe_check(name)}: {note}" for note in of_other]
-            raised = raised or (raised_too and f"{describe_check(name)}: {raised_too}")
             if replays is not None:
                 checks[name] = replays, 1
+            elif raised_too:
+                raised = raised or f"{describe_check(name)}: {raised_too}"
         self._checks, self._notes, self._untraceable = checks, tuple(notes), raised
         self._planned = True
 

@@ -301,8 +301,6 @@ def _not_confirmed(run: Run) -> list[Markup]:
     )
     left = counts.violating - counts.claimed
     return [
-        paragraph(
-            f"{left:,} rows violate as simulated and are not claimed: {listed}. Worst first:"
-        ),
+        paragraph(f"{left:,} rows violate as simulated and are not claimed: {listed}."),
         bullets(not_claimed_rows(run)),
     ]

@@ -196,9 +196,9 @@ def run_claims(run: Run, studies: Studies) -> list[Claim]:
         texts.append((sentence, (table_, "closer replays, column verdict"), common))
     if run.verdict_counts:
         sentence = (
-            f"{counts.claimed:,} violations are claimed as failures, {counts.refused:,} are not, as "
-            f"closer replays do not agree, and {counts.not_replayed:,} are not, as they were not "
-            "replayed."
+            f"{counts.claimed:,} violations are claimed as failures. Not claimed are "
+            f"{counts.refused:,}, on which closer replays do not agree, and "
+            f"{counts.not_replayed:,} that were not replayed."
         )
         texts.append((sentence, ("closer replays, column verdict",), common))
     for name, rate in (

@@ -26,7 +26,7 @@ GROUPS = (
     ("safe", SAFE, 4000),
     ("without a verdict", WITHOUT_VERDICT, 500),
     ("not claimed", NOT_CLAIMED, 500),
-    ("failing", FAILING, 2000),
+    ("claimed", FAILING, 2000),
 )
 """Verdicts from the least grave on: name, colour, and rows shown at most."""
 MAX_ROWS = 4000

@@ -172,12 +172,16 @@ def _all(run: Run, confirmer: Confirmer, limit: int | None) -> Confirmations:
     found = Confirmations.blank(run.name, numbers, rho)
     worst = np.argmin(rho) if len(rho) else 0
     order, done = np.argsort(np.arange(len(rho)) != worst, kind="stable"), 0
+    order, left = np.split(order, [len(order) if limit is None else limit])
     notes: dict[str, None] = {}
+    if len(left):
+        notes[f"{len(left)} of {len(rho)} were not replayed, as max_rows is {limit}"] = None
+        found.why[left] = next(iter(notes))
     try:
         for start in range(0, len(order), BLOCK):
             block = order[start : start + BLOCK]
             taken = {name: column[block] for name, column in columns.items()}
-            part = confirmer(taken, numbers[block], limit)
+            part = confirmer(taken, numbers[block])
             found.put(block, part)
             notes |= dict.fromkeys(part.notes)
             done += len(block)
