@@ -84,7 +84,7 @@ class System(ForUsers):
     _internal = frozenset((
         "abstract", "backend", "backends", "black_box", "can_fold", "can_refine",
         "can_simulate_batch", "can_simulate_each", "constants", "derived", "effort", "exact_step",
-        "fold", "forward_up_to", "known_signals", "lanes", "likely", "links", "may_draw", "passing",
+        "fold", "forward_up_to", "held_signals", "known_signals", "lanes", "likely", "links", "may_draw", "passing",
         "refined", "renewed", "reverse_hint", "simulate_batch", "simulate_each", "switches",
         "traced_factor", "unroll", "why_error", "why_not", "with_backend", "with_links", "workers",
     ))  # fmt: skip
@@ -218,6 +218,14 @@ class System(ForUsers):
             "playground, or apply the faults in the simulator and use with_faults(..., "
             "by_simulator=True)"
         )
+
+    def held_signals(self, features: Features) -> tuple[str, ...]:
+        """Return the names of signals that keep their value from each sample to the next.
+
+        **Arguments:**
+        - `features`: `jax.ShapeDtypeStruct`s.
+        """
+        return ("action",)
 
     def with_links(self, links: tuple[Link, ...]) -> "System":
         """Return the same system with faults between it and its policy; see `passing`."""

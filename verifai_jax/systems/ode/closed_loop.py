@@ -123,6 +123,24 @@ class Ode(System):
         period = self.dt * self.steps_per_control
         return Passing(state, control, period, self.duration)
 
+    def held_signals(self, features: Features) -> tuple[str, ...]:
+        """Return the names of the signals that are parts of the control."""
+        if self.controller is None:
+            return ()
+        held: list[str] = []
+
+        def look(features: Features, key: Seed) -> None:
+            features = set_durations(features, self.duration)
+            state = as_floating(self.initial(features, key), "initial")
+            rollout = _Rollout(self, features, key)
+            control = rollout.decided(state, in_working_precision(self.controller_memory))
+            signals = rollout.signals(jnp.zeros((), _dtype(state)), state, control)
+            parts = jax.tree.leaves(control)
+            held.extend(n for n, v in signals.items() if any(v is part for part in parts))
+
+        jax.eval_shape(look, features, jax.eval_shape(lambda: jax.random.key(0)))
+        return tuple(held)
+
     def with_links(self, links: tuple[Link, ...]) -> "Ode":
         return replace(self, links=joined(self.links, links))
 
