@@ -67,7 +67,7 @@ SHOWN = 5
 
 
 class Standing(NamedTuple):
-    """What is said of rows that violate the property as simulated: one of three for each.
+    """The standing of rows that violate the property as simulated: one of three for each.
 
     - `claimed`: `[n]`, rows that every closer replay confirmed; of a run that was asked not to
       replay, all that violate the property.

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import verifai_jax as vj
-from verifai_jax.reports.plotting.replay import _is_held
+from verifai_jax.reports.plotting.replay import is_held
 
 
 def plant(**options):
@@ -29,9 +29,9 @@ def test_controls_and_held_inputs_are_steps(hold, drawn, period):
 
 def test_what_keeps_its_values_is_recognised():
     time = np.arange(12)
-    assert _is_held(np.repeat(time[:6] % 4, 2).astype(float))
-    assert _is_held(time > 5)
-    assert not _is_held(np.sin(time))
-    assert not _is_held(np.zeros(12))
+    assert is_held(np.repeat(time[:6] % 4, 2).astype(float))
+    assert is_held(time > 5)
+    assert not is_held(np.sin(time))
+    assert not is_held(np.zeros(12))
     # At rest, and then moving.
-    assert not _is_held(np.maximum(time - 8.0, 0))
+    assert not is_held(np.maximum(time - 8.0, 0))

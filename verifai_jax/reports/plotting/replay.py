@@ -88,7 +88,7 @@ def plot_replay(
         color, width = ("#8d99ae", 1.1)
         if signal in monitored or signal in inputs:
             color, width = (BOUND if signal in monitored else INPUT), 1.6
-        steps = "steps-post" if signal in held or _is_held(values) else "default"
+        steps = "steps-post" if signal in held or is_held(values) else "default"
         axes.plot(clock, values, color=color, linewidth=width, drawstyle=steps)
         _name_signal(axes, f"{signal} (input)" if signal in inputs else signal)
         tidy(axes)
@@ -161,7 +161,7 @@ def _held(replay: Replay) -> set[str]:
     return held
 
 
-def _is_held(values: Shaped[np.ndarray, "t *vector"]) -> bool:
+def is_held(values: Shaped[np.ndarray, "t *vector"]) -> bool:
     """Return whether a signal keeps each of its values for two samples or more, as if held."""
     if values.dtype.kind in "biu":
         return True
