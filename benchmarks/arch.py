@@ -8,7 +8,7 @@
 For each requirement and search, from 50 seeds, one simulation a round: the falsification rate FR,
 and the mean number of simulations S of the seeds that falsify, where a simulation that was
 differentiated counts as one and as two; the median of the latter. `claimed`: how many of the first
-failures are confirmed by replays in double precision, at half and at a quarter of the step
+failures are confirmed by replays in double precision, at a third and at a quarter of the step
 (`vj.confirm`), which is what `falsify` claims. Next to them a published FR and mean S with its
 tool: the lowest that could be read for these models, which leaves out tools whose numbers for each
 requirement could not (FReaK of 2024 reports fewer simulations than all participants of 2022 on most

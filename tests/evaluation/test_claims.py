@@ -68,7 +68,7 @@ def test_true_failures_are_claimed():
     row = run.best
     assert row["verdict"] == "confirmed"
     assert row["x0"] * np.exp(-4 * row["rate"]) > 0.3
-    assert "1 confirmed in double precision, at a half and a quarter of the step" in run.summary()
+    assert "1 confirmed in double precision, at a third and a quarter of the step" in run.summary()
 
 
 @pytest.mark.thorough

@@ -7,9 +7,15 @@ import numpy as np
 import pytest
 
 import verifai_jax as vj
+from verifai_jax.analysis.counterexamples.selection import select_row
+from verifai_jax.cli.json_output import describe_run
+from verifai_jax.evaluation import confirmer
 from verifai_jax.evaluation.confirmations import UNDECIDED, VERDICTS
 from verifai_jax.reports.plotting.robustness_history import plot_robustness_history
 from verifai_jax.reports.plotting.scatter import plot_features
+from verifai_jax.reports.run_findings import number_rows
+from verifai_jax.reports.view import view_data
+from verifai_jax.systems.base import System
 
 SPACE = {"a": vj.Box(0.0, 1.0), "b": vj.Box(-1.0, 1.0)}
 
@@ -36,6 +42,23 @@ decay = vj.ode(
     dt=0.1,
     method="euler",
 )
+
+
+class Breaking(System):
+    """A system of which no finer step can be simulated."""
+
+    def __init__(self, factor=1):
+        self.factor = factor
+
+    def __call__(self, features, key=None):
+        if self.factor > 1:
+            raise RuntimeError("too fine")
+        return vj.Trace({"x": features["a"] * jnp.ones(4)}, dt=0.1)
+
+    def refined(self, factor):
+        return Breaking(factor)
+
+
 rounded = constant(lambda f: (f["a"] + 2.0**20) - 2.0**20)
 TWO = {"low": "always x >= 0.1", "high": "always x <= 0.7"}
 
@@ -51,6 +74,8 @@ GALLERY = {
     "nothing is finite": (constant(lambda f: jnp.nan * f["a"]), "always x <= 0.3"),
     "coarse steps": (decay, "always x >= -0.35"),
     "coarse numbers": (rounded, "always x <= 0.5"),
+    "replays that raise": (Breaking(), "always x <= 0.5"),
+    "mostly not replayed": (rounded, "always x <= 0.5"),
     "a black box": (raising(2.0), "always x <= 0.5"),
     "a black box that raises": (raising(0.7), "always x <= 0.5"),
     "a black box that only raises": (raising(-1.0), "always x <= 0.5"),
@@ -65,6 +90,10 @@ def run(request):
         return vj.falsify(problem, "cross_entropy", 64, batch=32, progress=False)
     if request.param == "unconfirmed":
         return vj.falsify(problem, "uniform", 64, batch=64, confirm=False, progress=False)
+    if request.param == "mostly not replayed":
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(confirmer, "LIMIT", 9)
+            return vj.falsify(problem, "uniform", 64, batch=64, progress=False)
     if request.param == "resumed":
         first = vj.falsify(problem, "uniform", 32, batch=32, progress=False)
         return vj.resume(first, budget=64, progress=False)
@@ -106,7 +135,7 @@ def test_the_verdicts_add_up(run):
     assert said == counts
     undecided = sum(count for verdict, count in counts.items() if verdict in UNDECIDED)
     assert re.findall(r"(\d+) undecided", text) == ([str(undecided)] if undecided else [])
-    claimed = ~failing["verdict"].isin(["fragile", "refuted"])
+    claimed = failing["verdict"] == "confirmed"
     assert run.table.counterexamples.index.tolist() == failing.index[claimed].tolist()
     assert len(run.table.counterexamples) + len(run.table.unconfirmed) == len(failing)
 
@@ -206,7 +235,7 @@ def test_titles_and_legends_of_pictures_count_the_same(run):
     assert labels == {
         f"{len(part)} {name}"
         for name, part in (
-            ("failing", run.table.counterexamples),
+            ("claimed" if run.confirm else "failing", run.table.counterexamples),
             ("not claimed", run.table.unconfirmed),
             ("safe", run.table.safe),
             ("without a verdict", run.table.failed),
@@ -222,9 +251,40 @@ def test_the_analysis_counts_the_same(run):
     if not (run.table.all["status"] == "ok").any():
         return
     text = str(run.analyze())
-    violating, doubtful = len(run.table.violating), len(run.table.unconfirmed)
+    violating, counts = len(run.table.violating), run.table.counts
     assert f"{violating} of {run.simulations} simulations violate the property" in text
-    assert (f"{doubtful} of them are not claimed" in text) == (doubtful > 0)
+    assert (f"{counts.refused} of them are not claimed" in text) == (counts.refused > 0)
+    left = counts.not_replayed
+    assert (f"{left} are not claimed, as they were not replayed" in text) == (left > 0)
+
+
+def test_everything_that_counts_claims_counts_the_same(run):
+    """One run, and its table, JSON, gate, evidence and analysis."""
+    table, counts = run.table.all, run.table.counts
+    failing = table.loc[(table["status"] == "ok") & table["violated"]]
+    verdicts = failing["verdict"] if "verdict" in table else ["confirmed"] * len(failing)
+    number = {name: sum(verdict == name for verdict in verdicts) for name in VERDICTS}
+    claimed = number["confirmed"]
+    refused, left = number["refuted"] + number["fragile"], number["raised"] + number["unexamined"]
+    assert (counts.claimed, counts.refused, counts.not_replayed) == (claimed, refused, left)
+    assert len(run.table.counterexamples) == claimed
+    assert len(run.table.unconfirmed) == refused + left
+    assert f"{claimed} counterexamples" in repr(run.table)
+    plain = describe_run(run)
+    keys = ("counterexamples", "refused", "not_replayed", "violating")
+    assert [plain[key] for key in keys] == [claimed, refused, left, len(failing)]
+    assert counts.may_fail == (claimed + left > 0)
+    rows = dict(number_rows(run))
+    assert rows["claimed as failures"] == str(claimed)
+    assert rows["not claimed: not replayed"] == str(left)
+    groups = view_data(run, {})["groups"]
+    shown = {group["name"]: group["count"] for group in groups}
+    assert (shown["claimed"], shown["not claimed"]) == (str(claimed), str(refused + left))
+    if claimed:
+        assert select_row(run, None)[0] in run.table.counterexamples.index
+    else:
+        with pytest.raises(ValueError, match="has no counterexample"):
+            select_row(run, None)
 
 
 def test_the_times_add_up(run):

@@ -24,7 +24,7 @@ from verifai_jax.analysis._pca import pca
 from verifai_jax.analysis._rules import rules
 from verifai_jax.analysis.clustering.clusters import clusters
 from verifai_jax.analysis.data.samples import Samples
-from verifai_jax.analysis.data.verdicts import unconfirmed
+from verifai_jax.analysis.data.verdicts import claimed, refused
 from verifai_jax.core.display.figure import Drawn
 from verifai_jax.core.display.progress import shows_progress
 from verifai_jax.core.messages.errors import unknown_name
@@ -195,10 +195,12 @@ def _part(name: str, reason: str, analysis: Callable[[], Any]) -> Part:
 
 def _describe_failures(source: object, samples: Samples) -> str:
     rows, failures = len(samples.table), int(samples.failing.sum())
-    doubtful = int(unconfirmed(samples.table).sum())
+    doubtful, sure = (int(part(samples.table).sum()) for part in (refused, claimed))
     lines = [f"{failures + doubtful:,} of {rows:,} simulations violate the property"]
     if doubtful:
         lines[0] += f"; {doubtful:,} of them are not claimed, as closer replays disagree"
+    if sure < failures:
+        lines[0] += f"; {failures - sure:,} are not claimed, as they were not replayed"
     if len(samples) + doubtful < rows:
         lines[0] += f"; {rows - len(samples) - doubtful:,} have no verdict"
     if isinstance(source, Run):

@@ -146,6 +146,8 @@ def describe_run(run: Any) -> dict[str, Any]:
         "simulations": run.simulations,
         "violating": counts.violating if known else None,
         "counterexamples": counts.claimed if known else None,
+        "refused": counts.refused if known else None,
+        "not_replayed": counts.not_replayed if known else None,
         "verdicts": run.verdict_counts if known else None,
         "repetitions": asdict(counts.repetitions) if known else None,
         "without_verdict": counts.without_verdict if known else None,

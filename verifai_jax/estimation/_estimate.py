@@ -19,11 +19,13 @@ from verifai_jax.core.compute.precision import in_precision
 from verifai_jax.core.display.progress import SimulationProgress, shows_progress
 from verifai_jax.core.messages.checks import check_fraction, check_options
 from verifai_jax.core.messages.errors import suggests_options, unknown_name
+from verifai_jax.core.messages.text import listed
 from verifai_jax.estimation import answers
 from verifai_jax.estimation.double_precision import DoublePrecisionEvaluator
 from verifai_jax.estimation.methods import (
     SHARE_OF_LEVEL,
     SHARE_OF_REPLICATE,
+    UNSEARCHED,
     estimate_automatically,
     estimate_by_importance_sampling,
 )
@@ -228,13 +230,20 @@ def _result(
     if limit_state.ended:
         notes.append(f"ended early: {limit_state.ended}")
     if answer.method in WEIGHTED:
-        searches = "splitting and the independent searches"
-        if answer.method == "surrogate":
-            searches = "the surrogate"
+        made, found = limit_state.searches
+        searches = ["the surrogate"] if answer.method == "surrogate" else []
+        if answer.method == "splitting" or len(answer.diagnostics.get("reached", ())) > found:
+            searches.append("splitting")
+        if answer.method == "importance" and found:
+            searches.append(f"{found} of {made} independent searches")
         notes.append(
-            f"the interval does not account for failures far from all that {searches} reached; the "
-            "guaranteed bound does"
+            f"the interval does not account for failures far from all that {listed(searches)} "
+            "reached; the guaranteed bound does"
         )
+        if answer.method != "surrogate":
+            answer.diagnostics["independent_searches"] = made
+            if not made:
+                notes.insert(0, UNSEARCHED)
     return Estimate(
         name=problem.name,
         probability=answer.probability,

@@ -64,6 +64,12 @@ PRECISE, SHARE_BEYOND = 20_000, 0.25
 gradients: a region that none has found is the greater error then."""
 MIN_EXPLORED = 600
 """Simulations of a search, below which it says too little to be worth them."""
+UNSEARCHED = (
+    "splitting alone found the failures: of several separate regions it may have missed some, and "
+    "the estimate with them. The default method searches independently with budget="
+    f"{round(MIN_EXPLORED / SHARE_OF_EXPLORATION):,} or more"
+)
+"""Caution of an estimate without independent searches."""
 SHARE_OF_PATHS = 0.03
 """Share of the budget for paths between the failures of different searches."""
 RESERVED = 0.3
@@ -236,7 +242,9 @@ def _explore(limit_state: LimitState, rng: np.random.Generator) -> list[Explorat
     if simulations < MIN_EXPLORED:
         return []
     found = [explore(limit_state, rng, simulations) for _ in range(EXPLORATIONS)]
-    return [exploration for exploration in found if len(exploration.points)]
+    found = [exploration for exploration in found if len(exploration.points)]
+    limit_state.searches = EXPLORATIONS, len(found)
+    return found
 
 
 def _proposals(

@@ -169,7 +169,9 @@ class Estimate(Drawn, Reported, InNotebook):
             )
         if self.p0 is not None:
             lines.append(f"  p < {self.p0:zg}    {self._conclusion(self.p0)}")
-        lines += [f"  note         {note}" for note in self.notes]
+        first = self.diagnostics.get("independent_searches") == 0
+        lines[1:1] = [f"  caution      {note}" for note in self.notes[:first]]
+        lines += [f"  note         {note}" for note in self.notes[first:]]
         return "\n".join(lines)
 
     __repr__ = __str__

@@ -17,6 +17,10 @@ AMPLIFIED = 4.0
 """Times by which a row must fail beyond what rounding has moved it: a chaotic system turns
 roundings into any of its outcomes, and two or three programs may agree by chance."""
 
+REMAINING = 3.0
+"""Error left at a quarter of the step by a method of order 1, as a multiple of the change since a
+third of it."""
+
 
 def decide(
     found: confirmations.Confirmations,
@@ -45,8 +49,8 @@ def decide(
     engines = confirmations.engines_of(replayed)
     finest = next((n for n in ("quarter_step", base, *engines) if n in replayed), "")
     step = rounding = np.zeros(len(found))
-    if "half_step" in replayed:
-        step = _moved(rho["half_step"], rho["quarter_step"])
+    if "quarter_step" in replayed:
+        step = REMAINING * _moved(rho["third_step"], rho["quarter_step"])
     for name in (confirmations.SINGLE, "nudged"):
         if name in replayed:
             rounding = np.maximum(rounding, _moved(rho[name], rho[finest]))
@@ -97,7 +101,7 @@ def hold_to_run(
     fails = np.all([verdicts.violated for verdicts in replayed.values()], axis=0)
     still = (rows["verdict"] == "confirmed") & fails & only_repeats
     found.verdict[still], found.why[still] = "confirmed", ""
-    refused = np.isin(rows["verdict"], confirmations.NOT_CLAIMED)
+    refused = np.isin(rows["verdict"], confirmations.REFUSED)
     refused &= np.isin(found.verdict, ("confirmed", "raised"))
     for i in np.flatnonzero(refused).tolist():
         found.verdict[i] = "fragile"

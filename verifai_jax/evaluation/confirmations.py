@@ -2,15 +2,15 @@
 
 found = confirmer(rows, numbers)                    # as `confirmer.py` makes it
 found.verdict                                       # [n]: "confirmed", "fragile", ...
-refused, learned = found.refuse()                   # which rows are not claimed
-describe_checks(found.checks)                       # "in double precision and at a half ..."
+refused, learned = found.refuse()                   # which rows are no failures
+describe_checks(found.checks)                       # "in double precision and at a third ..."
 """
 
 from collections import Counter
 from collections.abc import Collection, Iterable
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -25,18 +25,20 @@ VERDICTS = ("confirmed", "refuted", "fragile", "raised", "unexamined")
 """Verdicts of closer replays; see `Confirmations`."""
 UNDECIDED = ("fragile", "raised", "unexamined")
 """Verdicts that leave open whether the failure is the system's or the simulation's."""
-NOT_CLAIMED = ("fragile", "refuted")
+REFUSED = ("fragile", "refuted")
 """Verdicts of rows that violate the property as simulated, and do not when looked at closely."""
 MEANING = {
     "confirmed": "it fails in every replay",
     "refuted": "an artefact of the simulation",
     "fragile": "replays disagree",
     "raised": "it could not be replayed",
-    "unexamined": "it is unchecked, as it was not replayed",
+    "unexamined": "it was not replayed",
 }
 """Each verdict as people read it."""
-FINER = {"half_step": 2, "quarter_step": 4}
-"""Checks at a finer step, and how many times finer."""
+FINER = {"third_step": 3, "quarter_step": 4}
+"""Checks at a finer step, and how many times finer. What is periodic and looks constant at one of
+them does not at the other, unless its frequency is a multiple of twelve times that of the steps:
+halving the step twice would keep every alias of the quarter."""
 RAISED = (Status.ERROR, Status.TIMEOUT)
 """Ends of a simulation that gave no trace."""
 SINGLE = "quarter_step_float32"
@@ -44,7 +46,7 @@ SINGLE = "quarter_step_float32"
 CHECK_TEXTS = {
     "float64": "in float64",
     "again": "simulated again",
-    "half_step": "at half the step",
+    "third_step": "at a third of the step",
     "quarter_step": "at a quarter of the step",
     SINGLE: "at a quarter of the step in float32",
     "nudged": "one rounding of the features away",
@@ -58,10 +60,35 @@ ROUNDED = 1e-4
 """Share of a robustness by which rounding may change it between two simulations, such as of
 threads that add up in any order, or of a batch of another size."""
 SMALLEST_KEPT = 1e-6
-"""Smallest robustness that a search learns of a row that is not claimed, positive since it holds;
+"""Smallest robustness that a search learns of a row that is refused, positive since it holds;
 also the size below which two robustnesses of about zero are taken for equal."""
 SHOWN = 5
 """Reasons of doubtful rows that are printed; the rest are counted, since `table` has them."""
+
+
+class Standing(NamedTuple):
+    """The standing of rows that violate the property as simulated: one of three for each.
+
+    - `claimed`: `[n]`, rows that every closer replay confirmed; of a run that was asked not to
+      replay, all that violate the property.
+    - `refused`: `[n]`, rows that closer replays refuted, or do not agree on.
+    - `not_replayed`: `[n]`, rows that were left out, or could not be replayed.
+    """
+
+    claimed: Bool[np.ndarray, " n"]
+    refused: Bool[np.ndarray, " n"]
+    not_replayed: Bool[np.ndarray, " n"]
+
+    @classmethod
+    def of(cls, violated: Bool[np.ndarray, " n"], verdict: np.ndarray | None) -> "Standing":
+        """Return the standing of rows, given which violate the property, and their verdicts."""
+        none = np.zeros(len(violated), bool)
+        if verdict is None:
+            return cls(violated, none, none)
+        claimed, refused, rows = none, none.copy(), np.flatnonzero(violated)
+        claimed[rows] = verdict[rows] == "confirmed"
+        refused[rows] = np.isin(verdict[rows].astype(str), REFUSED)
+        return cls(claimed, refused, violated & ~claimed & ~refused)
 
 
 def describe_checks(checks: Collection[str], *, of_step: bool = True) -> str:
@@ -70,7 +97,7 @@ def describe_checks(checks: Collection[str], *, of_step: bool = True) -> str:
     **Arguments:**
     - `checks`: their names, as in `Confirmations.checks`.
     - `of_step`: whether to explain why no finer step was checked.
-    **Returns:** the end of a sentence, such as `in double precision and at a half and a quarter of
+    **Returns:** the end of a sentence, such as `in double precision and at a third and a quarter of
     the step`; empty if there was no check.
     """
     parts = []
@@ -79,7 +106,7 @@ def describe_checks(checks: Collection[str], *, of_step: bool = True) -> str:
     elif "again" in checks:
         parts.append("when simulated again")
     if "quarter_step" in checks:
-        parts.append("at a half and a quarter of the step")
+        parts.append("at a third and a quarter of the step")
     if "nudged" in checks:
         parts.append("one rounding of the features away")
     parts += map(describe_check, engines_of(checks))
@@ -165,17 +192,18 @@ class Confirmations(InNotebook):
     - `run_rho`: `[n]`, the robustness computed in the run; NaN if unknown.
     - `verdict`: `[n]`, one of these. `confirmed`: it fails in every check, by more than replays
       move it (if it can only be simulated once more, and no row of the run was safe then, it
-      suffices that it fails again). `refuted`: it fails in none of the finer checks (half and
+      suffices that it fails again). `refuted`: it fails in none of the finer checks (third and
       quarter of the step and the other engines, or double precision if the step cannot be refined).
       `fragile`: the checks disagree, one gave no robustness, the row fails by less than replays
       move it, or it did not fail when simulated again. `raised`: a check raised, and the others
       fail. `unexamined`: left out, see `Confirmer`. Empty for a row that was not to be checked.
     - `rho`: for each check, by name, the least robustness `[n]` of the formulas; NaN if there is
-      none. Names are `float64` (or `again`, in the precision of the run), `half_step`,
+      none. Names are `float64` (or `again`, in the precision of the run), `third_step`,
       `quarter_step`, `quarter_step_float32`, `nudged` (at the finest step, with features moved by
       one rounding of float32), and `engine.NAME` of another engine.
-    - `band`: `[n]`, the change of the robustness. Between half and quarter of the step this is the
-      remaining error of a method of order 1 at the quarter (Richardson extrapolation). By rounding
+    - `band`: `[n]`, the change of the robustness. Between a third and a quarter of the step three
+      times the change is the remaining error of a method of order 1 at the quarter (Richardson
+      extrapolation). By rounding
       it moves between two precisions, two neighbouring features, or the run and its replay if
       `run_rho` is known. A row is confirmed if it fails by more than the former and by four times
       the latter.
@@ -224,12 +252,12 @@ class Confirmations(InNotebook):
             self.rho.setdefault(name, np.full(len(self), np.nan))[rows] = values
 
     def refuse(self) -> tuple[Bool[np.ndarray, " n"], Float[np.ndarray, " n"]]:
-        """Return flags of unclaimed rows, and the robustness that a search observes for them.
+        """Return flags of refused rows, and the robustness that a search observes for them.
 
         It is the largest value of the run and its replays, and positive, so that a search leaves
         points that are not failures; NaN without a replay.
         """
-        refused = np.isin(self.verdict, NOT_CLAIMED)
+        refused = np.isin(self.verdict, REFUSED)
         if not self.rho:
             return refused, np.full(len(refused), np.nan)
         greatest = np.fmax.reduce(np.stack([*self.rho.values(), self.run_rho]), axis=0)

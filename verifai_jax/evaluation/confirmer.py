@@ -6,9 +6,10 @@
     found.rho["quarter_step"]                           # [n], robustness at a quarter of the step
 
 A search simulates in single precision at the model's step; both can cause false violations. A
-counterexample is claimed only if it fails in double precision, at half and at a quarter of the step
-(there also in single precision), and with features changed by one rounding. It also has to fail by
-more than the finer step changed its robustness, and by far more than rounding did. A host system
+counterexample is claimed only if it was replayed, and fails in double precision, at a third and at
+a quarter of the step (there also in single precision), and with features changed by one rounding.
+It also has to fail by more than the finer step changed its robustness, and by far more than
+rounding did. A host system
 without a finer step is simulated once more with the same features and key: a row that fails again
 is confirmed. Otherwise it is fragile, since the system remembers earlier simulations or draws
 numbers that do not come from its key. `confirmation_rules.py` decides from the replays,
@@ -38,47 +39,23 @@ from verifai_jax.evaluation.confirmations import (
     describe_check,
     engines_of,
 )
-from verifai_jax.evaluation.resimulate import (
-    LANES,
-    ONE_BY_ONE,
-    HostReplays,
-    Replays,
-    finest_replays,
-)
+from verifai_jax.evaluation.resimulate import ONE_BY_ONE, HostReplays, Replays, finest_replays
 from verifai_jax.evaluation.verdicts import Verdicts
 from verifai_jax.problem.problem import Problem
 
 if TYPE_CHECKING:
     from verifai_jax.core.compute.executors import Executor
-ROWS = 256
-"""Rows that are examined in any case, ..."""
-COST = 4096
-"""... or as many as cost so many simulations, where these are more: 15 a row with finer steps."""
-LIMIT = 1024
-"""Rows that a falsification examines at most, ..."""
-SHARE = 128
-"""... or one for so many simulations, where that is more."""
-REPEATED = 32
-"""Rows that a falsification of a host system without finer steps simulates again at most, ..."""
-SHARE_REPEATED = 25
-"""... or one for so many simulations, where that is more: 4 % of the budget, which leaves another
-hundredth for rows that are worse than all before. `LIMIT` and `SHARE` hold once a row came again
-otherwise."""
+LIMIT, SHARE = 1024, 128
+"""Rows that a falsification replays at most, or one for so many simulations where that is more."""
+REPEATED, SHARE_REPEATED = 32, 25
+"""The same where all that can be done is to simulate a host system once more, as long as each row
+comes again: 4 % of the budget."""
 MORE = 3
 """Further repetitions of rows that fail again, once another row of the run did not: a system that
 fails at every seventh call fails in the first repetition of every seventh row, too."""
-SAFE = 10.0
-"""Further rows stay unexamined if they are so many times farther from zero than replays have moved
-any row: a margin, since replays move rows by unequal amounts."""
-BLOCK = 2 * LANES[1]
-"""Rows examined between two looks at whether the rest may stay unexamined: two calls of the larger
-program."""
-WITH_WORST = ONE_BY_ONE
-"""Rows examined together with one that is worse than all examined before, so that no other program
-is compiled for it."""
 CHECKPOINT = "confirmer"
-"""Entry of a checkpoint: rows examined, how far replays moved one, the worst row, whether one came
-again otherwise, and whether one did not fail again."""
+"""Entry of a checkpoint: rows examined, the worst row, whether one came again otherwise, and
+whether one did not fail again."""
 Check: TypeAlias = tuple[Replays | HostReplays, int]
 """One kind of replay: in the precision of these replays, with a so many times smaller step."""
 
@@ -91,11 +68,6 @@ class Confirmer:
     - `precision`: the precision of the run.
     - `seed`: the seed of the run; each simulation gets its original random key.
     - `engines`: engines that have to agree, as in `engines_for`.
-    - `max_rows`: maximum number of rows examined; by default 256, or 2048 if the step is not
-      refined, so that a row takes few replays. If there are more rows with a column `rho`, those
-      nearest to zero are examined, and further ones until the rest is ten times farther from zero
-      than any replay has moved a row; the rest stays `unexamined`. A row that is worse than all
-      examined before is always examined.
     - `executor`, `target`: an executor whose workers simulate a host system again, and the name
       with which they find the problem; this process when left out.
 
@@ -113,19 +85,14 @@ class Confirmer:
         seed: int = 0,
         *,
         engines: Engines = None,
-        max_rows: int | None = None,
         executor: "Executor | None" = None,
         target: str | None = None,
     ) -> None:
-        if max_rows is not None and (
-            isinstance(max_rows, bool) or not isinstance(max_rows, int | np.integer) or max_rows < 1
-        ):
-            raise ValueError(f"max_rows must be a positive integer; got {max_rows!r}")
         in_precision(precision)
-        self.problem, self.precision, self.seed, self.max_rows = problem, precision, seed, max_rows
+        self.problem, self.precision, self.seed = problem, precision, seed
         self.executor, self.target = executor, target
         self.others = engines_for(problem, engines)
-        self.examined, self.band, self.worst = 0, 0.0, np.inf
+        self.examined, self.worst = 0, np.inf
         self.wavers = self.flips = self._came_again = False
         self.check_names: tuple[str, ...] = ()
         self.raised: tuple[str, ...] = ()
@@ -152,9 +119,9 @@ class Confirmer:
         **Arguments:**
         - `rows`: columns `[n]` by name, as the table has them: those of the features, and `rho`.
         - `numbers`: `[n]`, of the rows, which decide on their random keys.
-        - `limit`: rows that are examined in all calls together; no limit when left out. Of more,
-          the worst row and those nearest to zero are. A worse row than all before, together with
-          some others, is examined beyond the limit, which is 1024 at least where the system wavers.
+        - `limit`: rows that are examined in all calls together; no limit when left out. The worst
+          row comes first, and the others in their order. Beyond the limit a row that is worse than
+          all before is examined, and 1024 rows in all where the system wavers.
         **Raises:** as `FeatureSpace.from_row`, for columns that are no rows of this problem.
         """
         numbers = np.asarray(numbers, int)
@@ -168,15 +135,10 @@ class Confirmer:
         if self.problem.system.exact_step:
             self.check_names += (EXACT_STEP,)
         found.rho.update({name: np.full(len(numbers), np.nan) for name in self._checks})
-        max_rows = self.max_rows
-        if max_rows is None:
-            cost = max(1, sum(factor for _, factor in self._checks.values()))
-            max_rows = max(ROWS, COST // cost)
-        rest = np.arange(len(numbers)) if run is None else _order(run)
-        while len(rest):
-            size = self._block_size(rest, run, max_rows, limit)
-            if not size:
-                break
+        rest = np.arange(len(numbers))
+        if run is not None:
+            rest = np.argsort(rest != np.argmin(run), kind="stable")  # The worst comes first.
+        while size := self._room(rest, run, limit):
             block, rest = np.split(rest, [size])
             taken = {name: column[block] for name, column in rows.items()}
             found.put(block, self._examine(taken, numbers[block]))
@@ -184,23 +146,29 @@ class Confirmer:
                 limit = max(limit, LIMIT)
         notes = list(self._notes)
         if len(rest):
-            notes.append(self._left_out(rest, found))
+            notes.append(
+                f"{len(rest)} of {len(found)} were not replayed, and are not claimed: "
+                f"{self.examined} rows of this run were"
+            )
             found.why[rest] = notes[-1]
         return replace(found, notes=tuple(notes), checks=self.check_names)
 
     def check_round(
-        self, columns: Mapping[str, np.ndarray], first: int
+        self, columns: Mapping[str, np.ndarray], first: int, wanted: int = 0
     ) -> tuple[Int[np.ndarray, " violating"], Confirmations]:
         """Check the violating rows among a run's new rows, at most `limit` of them.
 
         **Arguments:**
         - `columns`: the columns of all new rows, as in the table.
         - `first`: number of the first new row in the run.
+        - `wanted`: number of confirmed rows that the run still waits for, whatever the limit.
         **Returns:** which of the new rows violate the property, and their verdicts.
         """
         violating = np.flatnonzero(columns["violated"])
         taken = {name: column[violating] for name, column in columns.items()}
-        limit = self.limit(first + len(columns["rho"])) if len(violating) else None
+        limit = None
+        if len(violating):
+            limit = max(self.limit(first + len(columns["rho"])), self.examined + wanted)
         return violating, self(taken, first + violating, limit)
 
     @property
@@ -216,29 +184,21 @@ class Confirmer:
         simulations, or 32, unless a row was not reproduced, or the simulator has finer steps of its
         own.
         """
-        if self.problem.black_box and not self.wavers:
-            self._plan()
-            if self._only_repeats:
-                return max(REPEATED, simulations // SHARE_REPEATED)
-        return max(LIMIT, simulations // SHARE)
-
-    def far(self, rho: float) -> bool:
-        """Return whether a robustness is so far from zero that no replay would change its sign.
-
-        It is if it is ten times larger than any change by a replay so far.
-        """
-        return bool(abs(rho) > SAFE * self.band)
+        self._plan()
+        once = self._only_repeats and not self.wavers
+        rows, share = (REPEATED, SHARE_REPEATED) if once else (LIMIT, SHARE)
+        return max(rows, simulations // share)
 
     def checkpoint(self) -> dict[str, np.ndarray]:
         """Return the state that decides which rows are examined next, for a checkpoint."""
-        numbers = [self.examined, self.band, self.worst, self.wavers, self.flips]
+        numbers = [self.examined, self.worst, self.wavers, self.flips]
         return {CHECKPOINT: np.array(numbers, np.float64)}
 
     def restore(self, checkpoint: Mapping[str, Any]) -> None:
         """Continue from a checkpoint."""
         if CHECKPOINT in checkpoint:
-            examined, band, worst, wavers, flips = checkpoint[CHECKPOINT]
-            self.examined, self.band, self.worst = int(examined), float(band), float(worst)
+            examined, worst, wavers, flips = checkpoint[CHECKPOINT]
+            self.examined, self.worst = int(examined), float(worst)
             self.wavers, self.flips = bool(wavers), bool(flips)
 
     def _plan(self) -> None:
@@ -249,6 +209,8 @@ class Confirmer:
         checks: dict[str, Check] = {}
         key = run_keys(self.seed)[1]
         base, notes, raised = finest_replays(problem, run, key, self.executor, self.target)
+        if base is not None and raised:
+            self.raised, raised = tuple(notes), ""
         if base is not None:
             checks["float64" if base.precision == "float64" else "again"] = base, 1
             reason = base.refiner.why_not(FINER.values())
@@ -263,9 +225,10 @@ class Confirmer:
         for name, other in self.others.items():
             replays, of_other, raised_too = finest_replays(other, run, key)
             notes += [f"{describe_check(name)}: {note}" for note in of_other]
-            raised = raised or (raised_too and f"{describe_check(name)}: {raised_too}")
             if replays is not None:
                 checks[name] = replays, 1
+            elif raised_too:
+                raised = raised or f"{describe_check(name)}: {raised_too}"
         self._checks, self._notes, self._untraceable = checks, tuple(notes), raised
         self._planned = True
 
@@ -281,32 +244,20 @@ class Confirmer:
         more_precise = "float64" in checks and self.precision != "float64"
         return more_precise or "quarter_step" in checks or bool(engines_of(checks))
 
-    def _block_size(
-        self,
-        rest: Int[np.ndarray, " rest"],
-        run: Float[np.ndarray, " n"] | None,
-        max_rows: int,
-        limit: int | None,
+    def _room(
+        self, rest: Int[np.ndarray, " rest"], run: Float[np.ndarray, " n"] | None, limit: int | None
     ) -> int:
         """Return how many of the rows that are left are examined next; 0 to leave them."""
-        if run is None:
-            size = len(rest)
-        elif self.examined < max_rows:
-            size = max_rows - self.examined
-        else:
-            size = 0 if self.far(float(np.min(np.abs(run[rest])))) else BLOCK
-        if limit is not None:
-            size = min(size, limit - self.examined)
-        if size > 0:
-            return size
-        if run is None or run[rest[0]] >= self.worst:
-            return 0
-        return 1 if self.problem.black_box else 1 + WITH_WORST
+        room = len(rest) if limit is None else min(len(rest), limit - self.examined)
+        if room > 0 or not len(rest) or run is None or run[rest[0]] >= self.worst:
+            return max(room, 0)
+        # With others, so that no other program is compiled for it.
+        return 1 if self.problem.black_box else min(len(rest), 1 + ONE_BY_ONE)
 
     def _examine(
         self, rows: Mapping[str, np.ndarray], numbers: Int[np.ndarray, " n"]
     ) -> Confirmations:
-        """Replay rows by all checks, decide, and note how far the replays have moved them."""
+        """Replay rows by all checks, and decide."""
         run = rows.get("rho")
         replayed = self._replay(rows, numbers, run)
         found = decide(
@@ -326,7 +277,6 @@ class Confirmer:
         lost = np.flatnonzero(found.verdict == "raised")
         if len(lost) and not self.raised:
             self.raised = (f"not confirmed: {found.why[lost[0]]}",)
-        self.band = max(self.band, float(np.max(found.band)))
         return found
 
     def _replay(
@@ -390,21 +340,3 @@ class Confirmer:
             notice(left, more)
             again = lowest_failing(again, more, left)
         return again
-
-    def _left_out(self, rest: Int[np.ndarray, " rest"], found: Confirmations) -> str:
-        """Say why rows were not replayed."""
-        nearest = float(np.min(np.abs(found.run_rho[rest])))
-        note = f"{len(rest)} of {len(found)} were not replayed"
-        if self.far(nearest):
-            return (
-                f"{note}: {nearest:z.3g} or more from zero, where none of {self.examined} replays "
-                f"moved a row by more than {self.band:z.2g}"
-            )
-        return f"{note}, as {self.examined} rows of this run were before"
-
-
-def _order(run: Float[np.ndarray, " n"]) -> np.ndarray:
-    """Return the rows in the order in which they are examined: the worst one, then from zero on."""
-    order = np.argsort(np.abs(run), kind="stable")
-    worst = int(np.argmin(run))
-    return np.concatenate([[worst], order[order != worst]])

@@ -118,12 +118,12 @@ def falsify(
     - `backend`: the backend of a system that has several (`"mjx"`, `"native"`). By default both are
       timed here and the faster one that the search can use is taken, so name it for the same table
       on every machine.
-    - `confirm`: replay violations in double precision and, if the system has finer steps, at a half
-      and a quarter of its step. Violations that disappear are not claimed: they stay in the table
-      as `unconfirmed`. At most 1024 rows are replayed, or one for every 128 simulations if that is
-      more; the others are `unexamined` (`vj.confirm` replays them). A host system without finer
-      steps only repeats violations: 32 rows, or one for every 25 simulations, and up to 1024 if a
-      repetition gave another result.
+    - `confirm`: replay violations in double precision and, if the system has finer steps, at a
+      third and a quarter of its step. Only violations that every replay confirms are claimed; the
+      others stay in the table as `unconfirmed`. At most 1024 rows are replayed, or one for every
+      128 simulations if that is more; the others are `unexamined` (`vj.confirm` replays them). A
+      host system without finer steps only repeats violations: 32 rows, or one for every 25
+      simulations, and up to 1024 if a repetition gave another result.
     - `diverse`: look for failures of kinds not found yet; `stop_after` then counts failures that
       are far from each other (`search.Diverse`). True or `"inputs"`: far apart in their inputs.
       `"behaviour"`: far apart in the deciding predicate, its time and the shape of the trace.

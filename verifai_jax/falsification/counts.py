@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from verifai_jax.evaluation.confirmations import NOT_CLAIMED, Repetitions
+from verifai_jax.evaluation.confirmations import Repetitions, Standing
 from verifai_jax.evaluation.verdicts import Verdicts
 from verifai_jax.falsification.columns import Columns
 
@@ -17,7 +17,8 @@ class Counts:
     """Counts over a table, computed without its ordinary safe rows.
 
     - `violating`: rows that violate the property as simulated.
-    - `claimed`: violating rows that closer replays did not refute.
+    - `claimed`, `refused`, `not_replayed`: the standing of these, which they add up to; see
+      `confirmations.Standing`.
     - `failing_alone`: violating rows that violate only this formula, if there are several.
     - `failed`: number of rows without a verdict by status, the most frequent first.
     - `verdicts`: number of violating rows by verdict of closer replays, the most frequent first.
@@ -32,6 +33,8 @@ class Counts:
 
     violating: int = 0
     claimed: int = 0
+    refused: int = 0
+    not_replayed: int = 0
     failing_alone: Counter[str] = field(default_factory=Counter)
     failed: dict[str, int] = field(default_factory=dict)
     verdicts: dict[str, int] = field(default_factory=dict)
@@ -41,6 +44,11 @@ class Counts:
     lowest: float = float("nan")
     first_message: tuple[int, str] | None = None
     not_differentiated: int = 0
+
+    @property
+    def may_fail(self) -> bool:
+        """True unless closer replays refused each violation: what a gate or a test fails on."""
+        return self.claimed + self.not_replayed > 0
 
     @property
     def without_verdict(self) -> int:
@@ -57,7 +65,7 @@ class Counts:
 class Tally:
     """Counts over the rows of a running run.
 
-    - `claimed`: counterexamples that closer replays did not refute.
+    - `claimed`: counterexamples that closer replays confirmed; without these, all of them.
     - `violating`: simulations that violate the property.
     - `without_verdict`: simulations without a verdict.
     - `lowest`: the least robustness.
@@ -86,13 +94,9 @@ class Tally:
         }
 
 
-def claimed_rows(columns: Columns) -> Bool[np.ndarray, " n"]:
-    """Mark rows that violate the property and are claimed as counterexamples."""
-    claimed = violating_rows(columns)
-    if "verdict" in columns:
-        indices = np.flatnonzero(claimed)
-        claimed[indices] = ~np.isin(columns["verdict"][indices], NOT_CLAIMED)
-    return claimed
+def standing(columns: Columns) -> Standing:
+    """Return which rows are claimed as counterexamples, refused by replays, or not replayed."""
+    return Standing.of(violating_rows(columns), columns.get("verdict"))
 
 
 def violating_rows(columns: Columns) -> Bool[np.ndarray, " n"]:
@@ -108,9 +112,11 @@ def count(parts: Iterable[tuple[Int[np.ndarray, " n"], Columns]]) -> Counts:
         if not len(numbers):
             continue
         proper = columns["status"] == "ok"
-        violating, claimed = violating_rows(columns), claimed_rows(columns)
+        violating, (claimed, refused, not_replayed) = violating_rows(columns), standing(columns)
         counts.violating += int(np.sum(violating))
         counts.claimed += int(np.sum(claimed))
+        counts.refused += int(np.sum(refused))
+        counts.not_replayed += int(np.sum(not_replayed))
         statuses.update(map(str, columns["status"][~proper]))
         if "verdict" in columns:
             verdicts.update(map(str, columns["verdict"][violating]))

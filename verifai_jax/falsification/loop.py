@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
 from verifai_jax.core.compute.compilation import while_compiling
 from verifai_jax.core.compute.keys import run_keys
@@ -28,7 +28,7 @@ from verifai_jax.evaluation.kept_work import present
 from verifai_jax.evaluation.raising import Raising
 from verifai_jax.evaluation.verdicts import Verdicts
 from verifai_jax.falsification.columns import import_tables, rows_of, without_failure
-from verifai_jax.falsification.counts import Tally
+from verifai_jax.falsification.counts import Tally, standing
 from verifai_jax.falsification.learning import Batch, Learning
 from verifai_jax.falsification.run_folder import write_checkpoint
 from verifai_jax.falsification.simulations import MEASURED, Simulations
@@ -94,6 +94,7 @@ class Rounds:
         if confirm:
             self._confirmer = Confirmer(problem, precision, seed, executor=executor, target=target)
         self.tally = Tally()
+        self.stop_after = 0
         self.watch = Stopwatch(COMPILE)
         self.checks: tuple[str, ...] = ()
         self.chosen: tuple[str, ...] = ()
@@ -215,30 +216,31 @@ class Rounds:
             columns["new_coverage"] = book.add(coverage_ids)
             coverage_ids = book.of_kinds(coverage_ids)
         objective = self.learning.objective(verdicts)
-        claimed = verdicts.violated
         if self._confirmer is not None:
-            claimed, objective = self._confirm(self._confirmer, columns, objective)
-            verdicts = without_failure(verdicts, verdicts.violated & ~claimed)
+            objective = self._confirm(self._confirmer, columns, objective)
+        stands = standing(columns)
+        verdicts = without_failure(verdicts, stands.refused)
         if learns:
             with self._searching():
                 self.learning.learn(batch, objective, verdicts, coverage_ids)
         self.table.append(columns)
-        self.tally.add(verdicts, claimed)
+        self.tally.add(verdicts, stands.claimed)
 
     def _confirm(
         self,
         confirmer: Confirmer,
         columns: dict[str, np.ndarray],
         objective: Float[np.ndarray, " n"],
-    ) -> tuple[Bool[np.ndarray, " n"], Float[np.ndarray, " n"]]:
+    ) -> Float[np.ndarray, " n"]:
         """Replay violations, and write the verdicts into the columns.
 
-        **Returns:** flags of the claimed rows, and the objective, in which unclaimed rows count as
-        safe, so that a search does not stay with them.
+        **Returns:** the objective, in which refused rows count as safe, so that a search does not
+        stay with them.
         """
         with self.watch.on(CONFIRM):
             compiled = confirmer.compile_seconds
-            rows, found = confirmer.check_round(columns, len(self.table))
+            wanted = max(self.stop_after - self.distinct, 0)
+            rows, found = confirmer.check_round(columns, len(self.table), wanted)
             self.watch.move(confirmer.compile_seconds - compiled, COMPILE)
         count = len(columns["violated"])
         columns["verdict"] = np.full(count, "", object)
@@ -248,11 +250,10 @@ class Rounds:
             columns["rho_again"][rows] = found.rho.get("again", np.nan)
         self.checks = confirmer.check_names or self.checks
         refused, greatest = found.refuse()
-        if not refused.any():
-            return columns["violated"], objective
-        claimed, objective = columns["violated"].copy(), objective.copy()
-        claimed[rows[refused]], objective[rows[refused]] = False, greatest[refused]
-        return claimed, objective
+        if refused.any():
+            objective = objective.copy()
+            objective[rows[refused]] = greatest[refused]
+        return objective
 
     @contextmanager
     def _searching(self) -> Iterator[None]:

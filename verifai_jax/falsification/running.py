@@ -209,6 +209,7 @@ class Running:
     ) -> str:
         """Run rounds; return the condition that ended them."""
         rounds, budget, settled = self.rounds, self.ends.budget, False
+        rounds.stop_after = self.ends.stop_after or 0
         stopped = "exhausted" if rounds.exhausted else None
         if self._is_hopeless:
             rounds.take_in_measured()

@@ -148,8 +148,8 @@ def _closer_look(run: Run) -> str:
 
 _UNDECIDED_IN_WORDS = {
     "fragile": "not claimed, as replays disagree",
-    "raised": "a replay raised",
-    "unexamined": "unchecked, as not replayed",
+    "raised": "not claimed, as a replay raised",
+    "unexamined": "not claimed, as not replayed",
 }
 
 

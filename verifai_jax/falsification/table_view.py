@@ -1,9 +1,10 @@
 """The rows of an error table as they are read, in memory and in segments on disk.
 
-table.all               every simulation: features, rho, violated, status table.violating
-rows that ended properly and broke the property, as simulated table.counterexamples   violating rows
-that closer replays did not refute table.unconfirmed       the others: refuted, or not sure
-table.safe              rows that ended properly and kept it
+table.all               # every simulation: features, rho, violated, status
+table.violating         # rows that ended properly and broke the property, as simulated
+table.counterexamples   # of these, rows that closer replays confirmed
+table.unconfirmed       # the others: refused, or not replayed
+table.safe              # rows that ended properly and kept it
 """
 
 import warnings
@@ -28,7 +29,7 @@ from verifai_jax.falsification.columns import (
     row_numbers,
     to_frame,
 )
-from verifai_jax.falsification.counts import Counts, claimed_rows, count, violating_rows
+from verifai_jax.falsification.counts import Counts, count, standing, violating_rows
 from verifai_jax.falsification.segments import Segment, standing_out
 
 if TYPE_CHECKING:
@@ -137,16 +138,21 @@ class TableView(InNotebook):
 
     @property
     def counterexamples(self) -> "pd.DataFrame":
-        """Rows that ended properly and violate the property, unless closer replays reject them.
+        """Rows that violate the property and that closer replays confirmed.
 
-        Rows whose `verdict` is `fragile` or `refuted` are left out.
+        Without closer replays (`confirm=False`), all rows that violate the property.
         """
-        return self._select(claimed_rows)
+        return self._select(lambda columns: standing(columns).claimed)
 
     @property
     def unconfirmed(self) -> "pd.DataFrame":
         """Rows that violate the property as simulated, but were not confirmed by closer replays."""
-        return self._select(lambda columns: violating_rows(columns) & ~claimed_rows(columns))
+        return self._select(lambda columns: violating_rows(columns) & ~standing(columns).claimed)
+
+    @property
+    def not_refused(self) -> "pd.DataFrame":
+        """Rows that violate the property and that closer replays confirmed or did not reach."""
+        return self._select(lambda columns: violating_rows(columns) & ~standing(columns).refused)
 
     @property
     def violating(self) -> "pd.DataFrame":

@@ -5,7 +5,7 @@ from collections.abc import Iterable
 
 from verifai_jax.core.messages.errors import UnknownNameError
 from verifai_jax.core.messages.text import format_percent
-from verifai_jax.evaluation.confirmations import MEANING, NOT_CLAIMED, VERDICTS
+from verifai_jax.evaluation.confirmations import MEANING, VERDICTS
 from verifai_jax.falsification.no_rate import what_lies_between, why_no_rate
 from verifai_jax.falsification.run import Run
 from verifai_jax.falsification.run_folder import replay_command
@@ -17,7 +17,6 @@ from verifai_jax.reports.markup import (
     Markup,
     bullets,
     element,
-    join,
     paragraph,
     picture,
     preformatted,
@@ -59,6 +58,8 @@ def number_rows(run: Run) -> list[tuple[str, Child]]:
     if counts.repetitions.moved or counts.repetitions.rounded:
         rows.append(("simulated again", str(counts.repetitions)))
     rows.append(("claimed as failures", f"{counts.claimed:,}"))
+    rows.append(("not claimed: closer replays do not agree", f"{counts.refused:,}"))
+    rows.append(("not claimed: not replayed", f"{counts.not_replayed:,}"))
     if run.checked and run.verdict_counts.get("confirmed"):
         rows.append(("a confirmed failure fails", run.checked))
     if run.failure_rate is not None:
@@ -291,19 +292,15 @@ def _not_confirmed(run: Run) -> list[Markup]:
         return [paragraph("There was no violation to confirm.")]
     if not run.confirm:
         return [paragraph("Violations were not replayed more closely: all are as simulated.")]
-    claimed = [v for v in VERDICTS if verdicts.get(v) and v not in (*NOT_CLAIMED, "confirmed")]
-    content: list[Markup] = []
-    if claimed:
-        listed = join(
-            [f"{verdicts[v]:,} {v} ({MEANING[v]})" + "; " * (v != claimed[-1]) for v in claimed]
-        )
-        content.append(paragraph("Claimed, but not confirmed: ", listed, "."))
-    refused = sum(verdicts.get(verdict, 0) for verdict in NOT_CLAIMED)
-    if refused:
-        content.append(
-            paragraph(
-                f"{refused:,} rows violate as simulated and are not claimed, the worst first:"
-            )
-        )
-        content.append(bullets(not_claimed_rows(run)))
-    return content or [paragraph("Every violation was confirmed.")]
+    if counts.claimed == counts.violating:
+        return [paragraph("Every violation was confirmed.")]
+    listed = "; ".join(
+        f"{verdicts[v]:,} {v} ({MEANING[v]})"
+        for v in VERDICTS
+        if verdicts.get(v) and v != "confirmed"
+    )
+    left = counts.violating - counts.claimed
+    return [
+        paragraph(f"{left:,} rows violate as simulated and are not claimed: {listed}."),
+        bullets(not_claimed_rows(run)),
+    ]

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from verifai_jax.core.messages.text import format_features
-from verifai_jax.evaluation.confirmations import UNDECIDED, describe_checks
+from verifai_jax.evaluation.confirmations import describe_checks
 from verifai_jax.falsification.no_rate import why_no_rate
 from verifai_jax.falsification.run import Run
 from verifai_jax.falsification.run_folder import RECORD, STATE, replay_command
@@ -194,9 +194,12 @@ def run_claims(run: Run, studies: Studies) -> list[Claim]:
         checked = describe_checks(run.checks, of_step=False)
         sentence = f"{confirmed:,} of these failures were seen again {checked}."
         texts.append((sentence, (table_, "closer replays, column verdict"), common))
-    if (undecided := sum(run.verdict_counts.get(v, 0) for v in UNDECIDED)) or run.verdict_counts:
-        refuted = run.verdict_counts.get("refuted", 0)
-        sentence = f"{refuted:,} violations are refuted and {undecided:,} undecided."
+    if run.verdict_counts:
+        sentence = (
+            f"{counts.claimed:,} violations are claimed as failures. Not claimed are "
+            f"{counts.refused:,}, on which closer replays do not agree, and "
+            f"{counts.not_replayed:,} that were not replayed."
+        )
         texts.append((sentence, ("closer replays, column verdict",), common))
     for name, rate in (
         ("as simulated", run.failure_rate),

@@ -14,7 +14,7 @@ from jaxtyping import Int
 
 from verifai_jax.core.messages.text import one_line
 from verifai_jax.evaluation.replay import Replay
-from verifai_jax.falsification.counts import claimed_rows, violating_rows
+from verifai_jax.falsification.counts import standing, violating_rows
 from verifai_jax.falsification.run import Run
 from verifai_jax.mtl.bounds import signal_bounds
 from verifai_jax.mtl.expression import constant_value
@@ -26,7 +26,7 @@ GROUPS = (
     ("safe", SAFE, 4000),
     ("without a verdict", WITHOUT_VERDICT, 500),
     ("not claimed", NOT_CLAIMED, 500),
-    ("failing", FAILING, 2000),
+    ("claimed", FAILING, 2000),
 )
 """Verdicts from the least grave on: name, colour, and rows shown at most."""
 MAX_ROWS = 4000
@@ -63,7 +63,7 @@ def view_data(
     group = np.zeros(len(table), int)
     group[columns["status"] != "ok"] = 1
     group[violating_rows(columns)] = 2
-    group[claimed_rows(columns)] = 3
+    group[standing(columns).claimed] = 3
     features = [*distinguishing_features(run)[:MAX_COLUMNS]]
     features += [name for name in run.table.features if name not in features]
     features = features[:MAX_COLUMNS]

@@ -194,7 +194,7 @@ def test_empty_parts_say_what_there_is():
     safe_only = table.all.loc[[0, 2]]
     with pytest.raises(
         ValueError,
-        match=r"no counterexamples among 2 simulations \(0 counterexamples, 1 safe, 1 without",
+        match=r"no counterexamples among 2 simulations \(0 failing, 1 safe, 1 without",
     ):
         Samples.of(safe_only)
     with pytest.raises(ValueError, match="the table is empty: there are no simulations"):

@@ -16,6 +16,7 @@ import pandas as pd
 
 from verifai_jax.analysis.counterexamples.selection import Row
 from verifai_jax.core.display.progress import shows_progress
+from verifai_jax.core.messages.checks import check_count
 from verifai_jax.core.messages.errors import suggests_options
 from verifai_jax.evaluation.backends import Engines, resolved
 from verifai_jax.evaluation.confirmations import Confirmation, Confirmations, Repetitions
@@ -64,15 +65,16 @@ def confirm(
       `"all"` for those that are installed, another system for the same features and signals, a
       problem with one, or several of these by name. A failure that is confirmed in each of them is
       `transferable`.
-    - `max_rows`: minimum number of rows to replay, by default 256; more if a row takes few replays.
-      If there are more counterexamples, the worst and those nearest to zero are replayed, until the
-      rest is far from zero (see `evaluation.confirmer.Confirmer`).
+    - `max_rows`: maximum number of rows to replay, the worst and the first ones; all of them, also
+      those that the run left out, by default.
     - `progress`: whether to show one line of progress; see `core.display.progress` for the default.
     **Returns:** a `Confirmation` for a row, `Confirmations` for all; after Ctrl-C the finished
     ones.
     **Raises:** `ValueError` for a run without its problem, a row that is not a counterexample, or
     an engine that does not fit; `IndexError` for a row that is not in the table.
     """
+    if max_rows is not None:
+        check_count("max_rows", max_rows)
     if not isinstance(run, Run):
         raise TypeError(f"confirm needs a Run; got {type(run).__name__}")
     if run.problem is None:
@@ -82,11 +84,11 @@ def confirm(
         )
     # On the backend of the run, whose verdicts these are.
     problem = resolved(run.problem, wanted=run.backend).problem
-    confirmer = Confirmer(problem, run.precision, run.seed, engines=engines, max_rows=max_rows)
+    confirmer = Confirmer(problem, run.precision, run.seed, engines=engines)
     known = run.table.counts.repetitions
     confirmer.wavers, confirmer.flips = known.moved > 0, known.lost > 0
     if row is None:
-        return _with_changes_of_all(run, _all(run, confirmer))
+        return _with_changes_of_all(run, _all(run, confirmer, max_rows))
     return _with_changes(run, _one(run, confirmer, row))
 
 
@@ -163,13 +165,18 @@ def _check_fails(number: int | None, values: Mapping[str, Any]) -> None:
         )
 
 
-def _all(run: Run, confirmer: Confirmer) -> Confirmations:
-    failing = run.table.counterexamples
+def _all(run: Run, confirmer: Confirmer, limit: int | None) -> Confirmations:
+    failing = run.table.not_refused
     numbers, rho = failing.index.to_numpy(), failing["rho"].to_numpy(np.float64)
     columns = {str(name): failing[name].to_numpy() for name in failing.columns}
     found = Confirmations.blank(run.name, numbers, rho)
-    order, done = np.argsort(np.abs(rho), kind="stable"), 0
+    worst = np.argmin(rho) if len(rho) else 0
+    order, done = np.argsort(np.arange(len(rho)) != worst, kind="stable"), 0
+    order, left = np.split(order, [len(order) if limit is None else limit])
     notes: dict[str, None] = {}
+    if len(left):
+        notes[f"{len(left)} of {len(rho)} were not replayed, as max_rows is {limit}"] = None
+        found.why[left] = next(iter(notes))
     try:
         for start in range(0, len(order), BLOCK):
             block = order[start : start + BLOCK]

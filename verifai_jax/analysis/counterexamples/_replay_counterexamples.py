@@ -21,6 +21,7 @@ from verifai_jax.core.messages.text import format_error, one_line, printable
 from verifai_jax.core.user_code.sources import Change, Sources
 from verifai_jax.core.values.trace import Status
 from verifai_jax.evaluation.backends import resolved
+from verifai_jax.evaluation.confirmer import Confirmer
 from verifai_jax.evaluation.resimulate import HostReplays, Replays
 from verifai_jax.features import FeatureSpace
 from verifai_jax.features.given import given_features
@@ -218,10 +219,16 @@ def _replay_batch(
         replays = Replays(problem, precision, key)
     numbers = np.array([entry.row for _, entry, _ in batch], np.int32)
     [verdicts] = replays(1, [features], numbers)
-    again = None
-    if problem.black_box and np.any(verdicts.violated):
-        # A failure that is claimed has come twice.
-        [again] = replays(1, [features], numbers)
+    failing = np.flatnonzero(verdicts.violated)
+    rho = {**rows, "rho": verdicts.lowest}
+    found = Confirmer(problem, precision, seed)(
+        {name: column[failing] for name, column in rho.items()}, numbers[failing]
+    )
+    refused = {
+        int(i): str(why)
+        for i, why, lost in zip(failing, found.why, found.refuse()[0], strict=True)
+        if lost
+    }
     formulas = {name: str(formula) for name, formula in problem.formulas.items()}
     now = problem.sources()
     results = {}
@@ -237,12 +244,9 @@ def _replay_batch(
             state = FAILING if bool(verdicts.violated[i]) else FIXED
             if entry.formulas == formulas:
                 notes += _not_again(path, entry, changes, robustness)
-            if state == FAILING and again is not None and not bool(again.violated[i]):
+            if i in refused:
                 state = WITHOUT_VERDICT
-                notes.append(
-                    f"simulated again it has robustness {float(np.min(again.rho[i])):z.4g}: the "
-                    "system has memory or chance of its own"
-                )
+                notes.append(f"closer replays do not confirm it: {refused[i]}")
         else:
             message = "" if verdicts.messages is None else verdicts.messages[i]
             notes.append(message or status.name.lower())

@@ -42,9 +42,10 @@ def select_row(run: Run, row: Row) -> tuple[int, dict[str, Any]]:
     `TypeError` or `IndexError` for anything that is not a row of the table.
     """
     failing = run.table.counterexamples
-    if not len(failing):
+    if not len(failing) and (row is None or not run.table.counts.violating):
         raise ValueError(
             f"the run of {run.name!r} has no counterexample in {run.simulations} simulations"
+            + "; name a row of run.table.unconfirmed" * (run.table.counts.violating > 0)
         )
     number = failing["rho"].idxmin() if row is None else getattr(row, "name", row)
     if isinstance(number, bool) or not isinstance(number, int | np.integer):

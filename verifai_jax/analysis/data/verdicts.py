@@ -1,17 +1,33 @@
-"""Verdicts of the rows of a table: a counterexample, safe, not claimed, or none."""
+"""Verdicts of the rows of a table: failing, safe, refused by closer replays, or none."""
 
 import numpy as np
 import pandas as pd
 from jaxtyping import Bool
 
-from verifai_jax.evaluation.confirmations import NOT_CLAIMED
+from verifai_jax.evaluation.confirmations import Standing
 
 
 def verdicts(table: pd.DataFrame) -> tuple[Bool[np.ndarray, " n"], Bool[np.ndarray, " n"]]:
-    """Return the counterexamples and the rows that keep the property.
+    """Return the failing rows and the rows that keep the property.
 
-    A violating row that closer replays did not confirm (column `verdict`) is in neither.
+    What the failing rows have in common shows in those, too, that were not replayed. A violating
+    row that closer replays refused is in neither.
     """
+    stands, safe = _standing(table)
+    return stands.claimed | stands.not_replayed, safe
+
+
+def refused(table: pd.DataFrame) -> Bool[np.ndarray, " n"]:
+    """Return the rows that violate the property, which closer replays do not confirm."""
+    return _standing(table)[0].refused
+
+
+def claimed(table: pd.DataFrame) -> Bool[np.ndarray, " n"]:
+    """Return the rows that are claimed as counterexamples."""
+    return _standing(table)[0].claimed
+
+
+def _standing(table: pd.DataFrame) -> tuple[Standing, Bool[np.ndarray, " n"]]:
     ended = np.ones(len(table), bool)
     if "status" in table:
         ended = np.asarray(table["status"] == "ok", bool)
@@ -23,18 +39,12 @@ def verdicts(table: pd.DataFrame) -> tuple[Bool[np.ndarray, " n"], Bool[np.ndarr
         violated = rho < 0
     else:
         violated = np.ones(len(table), bool)
-    return ended & violated & ~unconfirmed(table), ended & ~violated
-
-
-def unconfirmed(table: pd.DataFrame) -> Bool[np.ndarray, " n"]:
-    """Return the rows that violate the property but are not claimed as counterexamples."""
-    if "verdict" not in table:
-        return np.zeros(len(table), bool)
-    return np.asarray(table["verdict"].isin(NOT_CLAIMED), bool)
+    verdict = table["verdict"].to_numpy(object) if "verdict" in table else None
+    return Standing.of(ended & violated, verdict), ended & ~violated
 
 
 def select_rows(table: pd.DataFrame, which: str) -> Bool[np.ndarray, " n"]:
-    """Select rows: `"counterexamples"`, `"safe"`, `"failed"` or `"all"` with a verdict."""
+    """Select rows: failing `"counterexamples"`, `"safe"`, `"failed"` or `"all"` with a verdict."""
     violating, safe = verdicts(table)
     if which == "counterexamples":
         return violating
@@ -42,7 +52,7 @@ def select_rows(table: pd.DataFrame, which: str) -> Bool[np.ndarray, " n"]:
         return safe
     if which == "all":
         return violating | safe
-    return ~(violating | safe | unconfirmed(table))
+    return ~(violating | safe | refused(table))
 
 
 def explain_empty(table: pd.DataFrame, which: str) -> str:
@@ -50,12 +60,12 @@ def explain_empty(table: pd.DataFrame, which: str) -> str:
     if not len(table):
         return "the table is empty: there are no simulations to analyse"
     violating, safe = (int(part.sum()) for part in verdicts(table))
-    doubtful = int(unconfirmed(table).sum())
+    doubtful = int(refused(table).sum())
     more = f"{doubtful:,} not claimed, " if doubtful else ""
     what = {"safe": "safe rows", "failed": "rows without a verdict", "all": "rows with a verdict"}
     return (
         f"no {what.get(which, which)} among {len(table):,} simulations ({violating:,} "
-        f"counterexamples, {safe:,} safe, {more}{len(table) - violating - safe - doubtful:,} "
+        f"failing, {safe:,} safe, {more}{len(table) - violating - safe - doubtful:,} "
         "without a verdict); "
         "which=... looks at other rows"
     )

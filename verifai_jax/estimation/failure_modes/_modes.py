@@ -42,7 +42,7 @@ from verifai_jax.estimation.methods import SHARE_OF_LEVEL, estimate_by_importanc
 from verifai_jax.estimation.moved_priors import notice_lost_failures, notice_own_chance
 from verifai_jax.estimation.normal_space import Ended, LimitState, Spent, to_unit_cube
 from verifai_jax.evaluation.backends import resolved
-from verifai_jax.evaluation.confirmations import NOT_CLAIMED
+from verifai_jax.evaluation.confirmations import REFUSED
 from verifai_jax.evaluation.replay import replay
 from verifai_jax.falsification import simulate
 from verifai_jax.falsification.run import Run
@@ -401,7 +401,7 @@ def _simulate(
     if numbers.problem.black_box and failing and len(outward) > 1:
         # What it claims has been simulated at least once more.
         checked = confirm(run)
-        lost = np.isin(checked.table["verdict"].to_numpy(), NOT_CLAIMED)
+        lost = np.isin(checked.table["verdict"].to_numpy(), REFUSED)
         failing -= set(checked.table.index.to_numpy()[lost])
         numbers.notes.extend(checked.wavering)
     rows: list[tuple[Run, int | None]] = []

@@ -17,7 +17,7 @@ from jaxtyping import Real
 from verifai_jax.core.messages.checks import check_count, check_fraction
 from verifai_jax.core.messages.errors import suggests_options
 from verifai_jax.core.messages.text import counted
-from verifai_jax.estimation.trials.reading import TrialTable, read_trials
+from verifai_jax.estimation.trials.reading import TrialTable, copies, read_trials
 from verifai_jax.estimation.trials.result import RealTrials
 from verifai_jax.falsification import falsify, simulate
 from verifai_jax.falsification.run import Run
@@ -101,6 +101,7 @@ def real_trials(
         at_any_time=at_any_time,
     )
     notes = [f"{counted(n, 'recording')} without a verdict: {why}" for why, n in unread.items()]
+    notes += copies(features)
     if not (allocated or at_any_time):
         notes += _unlike_prior(problem, features)
     without = int(table["robustness"].isna().sum())

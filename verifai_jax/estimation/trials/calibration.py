@@ -19,6 +19,7 @@ from jaxtyping import Float
 from verifai_jax.core.display.notebook import InNotebook
 from verifai_jax.core.messages.checks import check_count
 from verifai_jax.core.messages.errors import check_names, suggests_options
+from verifai_jax.core.messages.text import format_percent
 from verifai_jax.estimation.fitting import effective_size
 from verifai_jax.estimation.trials.reading import FAILED, TrialTable, table_of, verdicts_of
 from verifai_jax.falsification import simulate
@@ -33,6 +34,8 @@ TAIL = 1e-3
 """Posterior probability outside the second stage's range, at each end of each feature."""
 TRUSTED = 9.0
 """Trials that the prior takes for explained, for one that nothing explains."""
+AT_END, PILED = 0.05, 2.0
+"""Share of the prior at each end of a domain, and times as many draws as that there are noted."""
 DRAWN = 50
 """Draws of the prior for each one that is simulated in the second stage, at most."""
 
@@ -47,6 +50,7 @@ class Calibration(InNotebook):
     - `trials`: the number of trials with a verdict.
     - `unexplained`: number of trials that contradict even the best values.
     - `effective`: effective number of independent draws.
+    - `notes`: features whose draws lie at an end of their domain.
     """
 
     samples: "pd.DataFrame"
@@ -54,6 +58,7 @@ class Calibration(InNotebook):
     trials: int
     unexplained: int
     effective: float
+    notes: tuple[str, ...] = ()
 
     def __str__(self) -> str:
         lines = [f"{self.problem.name}: calibrated by {self.trials:,} trials"]
@@ -61,6 +66,7 @@ class Calibration(InNotebook):
             low, middle, high = self.samples[name].quantile([0.025, 0.5, 0.975])
             lines.append(f"  {name:12} {middle:z.4g} (95 % between {low:z.4g} and {high:z.4g})")
         lines.append(f"  unexplained  {self.unexplained:,} trials, by the best values too")
+        lines += [f"  note         {note}" for note in self.notes]
         if self.effective < 50:
             lines.append(f"  note         worth {self.effective:z.0f} draws only: simulate more")
         return "\n".join(lines)
@@ -134,8 +140,25 @@ def calibrate(
     space = FeatureSpace({**problem.space.domains, **domains}, problem.space.where)
     return Calibration(
         samples, replace(problem, space=space, nominal=None), len(table),
-        int(unexplained[evidence.argmax()]), effective_size(weight),
+        int(unexplained[evidence.argmax()]), effective_size(weight), _at_ends(samples, more),
     )  # fmt: skip
+
+
+def _at_ends(samples: "pd.DataFrame", prior: Float[np.ndarray, "n k"]) -> tuple[str, ...]:
+    """Say which features have draws at an end of the prior's, where the truth may lie beyond it."""
+    notes = []
+    for name, column in zip(samples.columns, prior.T, strict=True):
+        values = samples[name].to_numpy(float)
+        for sign, word in ((1, "lowest"), (-1, "highest")):
+            at = np.quantile(sign * column, AT_END)
+            share, usual = np.mean(sign * values <= at), np.mean(sign * column <= at)
+            if share > PILED * usual:
+                notes.append(
+                    f"{name}: {format_percent(share)} of the draws lie among the {word} "
+                    f"{format_percent(usual)} of the prior: the interval ends at the edge of its "
+                    "domain, and the true value may lie beyond it"
+                )
+    return tuple(notes)
 
 
 def _prior(problem: Problem, names: list[str], count: int, seed: int) -> Float[np.ndarray, "n k"]:

@@ -14,7 +14,13 @@ from verifai_jax.core.display.notebook import InNotebook
 from verifai_jax.core.messages.checks import check_fraction
 from verifai_jax.core.messages.errors import missing_name, unknown_name
 from verifai_jax.estimation.comparison.result import UNDECIDED, judge
-from verifai_jax.estimation.trials.reading import TrialTable, table_of, verdicts_of
+from verifai_jax.estimation.trials.reading import (
+    FAILED,
+    TrialTable,
+    copies,
+    table_of,
+    verdicts_of,
+)
 from verifai_jax.statistics.paired_rates import PairedRates, paired_rates
 
 MAX_FACTOR = 1024
@@ -29,6 +35,7 @@ class TrialComparison(InNotebook):
     - `rates`: the difference of their failure rates, candidate minus baseline.
     - `both`: pairs in which both fail.
     - `margin`: the largest difference that does not matter.
+    - `notes`: sentences on anything surprising.
     """
 
     baseline: str
@@ -36,6 +43,7 @@ class TrialComparison(InNotebook):
     rates: PairedRates
     both: int
     margin: float = 0.0
+    notes: tuple[str, ...] = ()
 
     @property
     def verdict(self) -> str:
@@ -72,7 +80,7 @@ class TrialComparison(InNotebook):
                 if more is None
                 else f"  about {more:,} more pairs like these would decide"
             )
-        return "\n".join(lines)
+        return "\n".join([*lines, *(f"  note: {note}" for note in self.notes)])
 
     __repr__ = __str__
 
@@ -132,4 +140,8 @@ def compare_trials(
         confidence,
         sum(None in pair for pair in pairs),
     )
-    return TrialComparison(baseline, candidate, rates, pairs.count((True, True)), margin)
+    firsts = table.loc[[name == baseline for name in names]]
+    notes = copies(firsts.drop(columns=["pair", "policy", FAILED]))
+    return TrialComparison(
+        baseline, candidate, rates, pairs.count((True, True)), margin, tuple(notes)
+    )

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, TypeAlias
 
 from verifai_jax.core.messages.errors import missing_name
+from verifai_jax.core.messages.text import listed
 from verifai_jax.mtl.judging import judge
 from verifai_jax.problem.problem import Problem
 
@@ -15,6 +16,8 @@ if TYPE_CHECKING:
     import pandas as pd
 TrialTable: TypeAlias = "str | Path | pd.DataFrame"
 """Trials: the path of a CSV or Parquet file, or a data frame, with a row for each."""
+SHOWN = 5
+"""Groups of equal trials that are named."""
 FAILED, RECORDING = "failed", "recording"
 """Columns that say whether a trial failed, or which recording says so."""
 WORDS = {
@@ -62,6 +65,27 @@ def read_trials(
     import pandas as pd
 
     return features.assign(failed=pd.Series(verdicts, dtype=object)), notes
+
+
+def copies(features: "pd.DataFrame") -> list[str]:
+    """Return a note on trials that agree in all real numbers, as copies of one trial would.
+
+    **Arguments:**
+    - `features`: a row for each trial.
+    """
+    real = features.select_dtypes("floating")
+    real = real.loc[:, real.nunique() > 1]
+    if not real.shape[1]:
+        return []
+    groups = real.groupby([*real.columns], dropna=False, sort=False).indices.values()
+    same = [", ".join(map(str, rows)) for rows in groups if len(rows) > 1]
+    if not same:
+        return []
+    return [
+        f"trials that agree in every digit of all real features ({listed(list(real.columns))}) "
+        f"count as separate ones: rows {'; '.join(same[:SHOWN])}{'; ...' * (len(same) > SHOWN)}. "
+        "If they are copies, the interval is too narrow"
+    ]
 
 
 def table_of(trials: TrialTable) -> "tuple[pd.DataFrame, Path]":

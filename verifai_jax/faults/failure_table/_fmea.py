@@ -108,7 +108,7 @@ def fmea(
             found += [each for each in both if each[0].fails]
         run, verdicts, last = _run_of(rows, [points for _, points in found], folder, target), {}, 0
         if run is not None:
-            again = confirm(run, max_rows=len(run.table), progress=False)
+            again = confirm(run, progress=False)
             verdicts = dict(zip(again.numbers.tolist(), again.verdict.tolist(), strict=True))
         for effect, points in found:
             first, last = last, last + len(points)

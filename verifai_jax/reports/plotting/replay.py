@@ -1,6 +1,7 @@
 """One simulation: its signals, their bounds, and the deciding instant."""
 
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -13,7 +14,7 @@ from verifai_jax.core.display.figure import Axes, Figure
 from verifai_jax.core.messages.errors import check_names
 from verifai_jax.core.messages.text import format_seconds, shorten
 from verifai_jax.core.values.trace import Status, Trace
-from verifai_jax.core.values.waveform import is_waveform
+from verifai_jax.core.values.waveform import HELD, is_waveform
 from verifai_jax.evaluation.replay import Replay
 from verifai_jax.mtl import Expression, Formula, explain, nnf, robustness_signal
 from verifai_jax.mtl.bounds import predicates_of, signal_bounds
@@ -79,7 +80,7 @@ def plot_replay(
     name = replay.worst
     clock = np.asarray(trace.clock())
     decisive = decisive_instant(formulas[name], trace, replay.problem.end)
-    to_blame = _predicates_to_blame(replay)
+    to_blame, held = _predicates_to_blame(replay), _held(replay)
     figure = new_figure(figsize=(8, 1.2 + 1.45 * len(shown)))
     panels = figure.subplots(len(shown), 1, sharex=True, squeeze=False).ravel()
     for axes, signal in zip(panels, shown, strict=True):
@@ -87,7 +88,8 @@ def plot_replay(
         color, width = ("#8d99ae", 1.1)
         if signal in monitored or signal in inputs:
             color, width = (BOUND if signal in monitored else INPUT), 1.6
-        axes.plot(clock, values, color=color, linewidth=width)
+        steps = "steps-post" if signal in held or is_held(values) else "default"
+        axes.plot(clock, values, color=color, linewidth=width, drawstyle=steps)
         _name_signal(axes, f"{signal} (input)" if signal in inputs else signal)
         tidy(axes)
         # A power of ten above the axis, as matplotlib writes it, would cover the predicates there.
@@ -143,6 +145,28 @@ def _input_signals(replay: Replay) -> dict[str, Float[np.ndarray, "time *k"]]:
     at_all = jax.jit(lambda waveforms, clock: {n: jax.vmap(w)(clock) for n, w in waveforms.items()})
     found = at_all(waveforms, clock)
     return {name: np.asarray(found[name]) for name in waveforms}
+
+
+def _held(replay: Replay) -> set[str]:
+    """Return the signals and the inputs whose value is held from each sample to the next."""
+    leaves = jax.tree_util.tree_flatten_with_path(replay.features, is_leaf=is_waveform)[0]
+    held = {
+        jax.tree_util.keystr(keys, simple=True, separator=".")
+        for keys, value in leaves
+        if is_waveform(value) and value.hold in HELD
+    }
+    with suppress(Exception):  # A user's functions may take only what they took in the simulation.
+        named = replay.problem.system.held_signals(replay.features)
+        held |= {n for n in replay.trace.signals if n in named or n.split(".")[0] in named}
+    return held
+
+
+def is_held(values: Shaped[np.ndarray, "t *vector"]) -> bool:
+    """Return whether a signal keeps each of its values for two samples or more, as if held."""
+    if values.dtype.kind in "biu":
+        return True
+    changes = np.any((values[1:] != values[:-1]).reshape(len(values) - 1, -1), axis=1)
+    return bool(changes.any() and not np.any(changes[1:] & changes[:-1]))
 
 
 def telling_signals(

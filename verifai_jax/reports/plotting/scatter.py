@@ -48,13 +48,14 @@ def plot_features(
     rows = -(-len(pairs) // columns)
     figure = style.new_figure(figsize=(3.6 * columns + 0.4, 3.2 * rows + 0.5))
     panels = figure.subplots(rows, columns, squeeze=False).ravel()
+    claimed = run.table.counterexamples
     groups = [
         (f"{len(part):,} {name}", part, color, size, marker)
         for name, part, color, size, marker in (
             ("safe", run.table.safe, style.SAFE, 5, "o"),
             ("without a verdict", run.table.failed, style.WITHOUT_VERDICT, 12, "x"),
             ("not claimed", run.table.unconfirmed, style.NOT_CLAIMED, 12, "^"),
-            ("failing", run.table.counterexamples, style.FAILING, 9, "o"),
+            ("claimed" if run.confirm else "failing", claimed, style.FAILING, 9, "o"),
         )
         if len(part)
     ]

@@ -180,7 +180,7 @@ def brax(
     - `options`: keyword arguments of an environment by name.
     - `exact_step`: whether the environment is defined by its `step`; counterexamples are then
       confirmed in double precision and under rounding. False if the step approximates continuous
-      motion: counterexamples are then also replayed at a half and a quarter of it (backends
+      motion: counterexamples are then also replayed at a third and a quarter of it (backends
       generalized and mjx).
     - `observation_delay`, `action_delay`: number of steps after which an observation reaches the
       policy, and an action takes effect: a number, or `{feature: maximum}` for a number given by a

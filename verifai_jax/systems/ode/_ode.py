@@ -69,7 +69,7 @@ def ode(
     - `exact_step`: True if the method and its step define the plant, as in an environment that is
       published as a difference equation. A counterexample is then confirmed only in double
       precision and under rounding. False for a plant that moves continuously, which a step
-      approximates: counterexamples are also replayed at a half and a quarter of it.
+      approximates: counterexamples are also replayed at a third and a quarter of it.
     - `update(time, state, features) -> state`: makes instantaneous changes at each sample except
       the first, before the controller runs: a delay line, a latch, a counter. The derivative of
       such a part is 0.

@@ -28,6 +28,11 @@ from verifai_jax.systems.pytree_checks import (
     outline,
 )
 
+SPREAD = (0.7548776662466927, 0.5698402909980532)
+"""Numbers whose multiples, modulo 1, fill the unit square evenly (the plastic ratio's powers)."""
+LONGER = 0.4
+"""Share by which the first and the last of an odd number of steps are longer, at most."""
+
 
 @dataclass(frozen=True, eq=False)
 class Ode(System):
@@ -63,7 +68,9 @@ class Ode(System):
     def refined(self, factor: int | Int[Array, ""]) -> "Ode":
         """Return the same loop with a finer step; samples, decisions and end keep their times.
 
-        JAX may trace the factor; the loop then has no reverse-mode derivative.
+        An odd number of steps is divided differently between each two samples, so that nothing
+        periodic has the same phase in all of them. JAX may trace the factor; the loop then has no
+        reverse-mode derivative.
 
         **Raises:** `ValueError` unless the factor is a positive integer, and for a loop with
         `exact_step`.
@@ -115,6 +122,24 @@ class Ode(System):
         state, control = jax.eval_shape(first, features, key)
         period = self.dt * self.steps_per_control
         return Passing(state, control, period, self.duration)
+
+    def held_signals(self, features: Features) -> tuple[str, ...]:
+        """Return the names of the signals that are parts of the control."""
+        if self.controller is None:
+            return ()
+        held: list[str] = []
+
+        def look(features: Features, key: Seed) -> None:
+            features = set_durations(features, self.duration)
+            state = as_floating(self.initial(features, key), "initial")
+            rollout = _Rollout(self, features, key)
+            control = rollout.decided(state, in_working_precision(self.controller_memory))
+            signals = rollout.signals(jnp.zeros((), _dtype(state)), state, control)
+            parts = jax.tree.leaves(control)
+            held.extend(n for n, v in signals.items() if any(v is part for part in parts))
+
+        jax.eval_shape(look, features, jax.eval_shape(lambda: jax.random.key(0)))
+        return tuple(held)
 
     def with_links(self, links: tuple[Link, ...]) -> "Ode":
         return replace(self, links=joined(self.links, links))
@@ -297,11 +322,21 @@ class _Rollout:
         count = self.loop.substeps
         if isinstance(count, int) and count == 1:
             return substep(self.loop, self.features, control, time, state, self.loop.dt)
-        dt: Any = jnp.asarray(self.loop.dt / count, _dtype(state))
+        fine: Any = jnp.asarray(self.loop.dt / count, _dtype(state))
+        sample = jnp.asarray(time, fine.dtype) / self.loop.dt
+        # The outer steps are longer than the others, by as much as differs from sample to sample:
+        # what happens at samples alone weighs the more, and not the same as with other counts.
+        odd = (count % 2 == 1) & (count > 1)
+        first, last = (jnp.where(odd, LONGER * (sample * spread % 1), 0) for spread in SPREAD)
+
+        def edge(j: Int[Array, ""]) -> Any:
+            inner = jnp.clip(j, 1, count - 1)
+            moved = first - (first + last) * (inner - 1) / jnp.maximum(count - 2, 1)
+            return (j + jnp.where(inner == j, moved, 0)) * fine
 
         def advance(j: Int[Array, ""], state: PyTree) -> Any:
-            begin = time + j.astype(dt.dtype) * dt
-            return substep(self.loop, self.features, control, begin, state, dt)
+            begin, length = edge(j), edge(j + 1) - edge(j)
+            return substep(self.loop, self.features, control, time + begin, state, length)
 
         return jax.lax.fori_loop(0, count, advance, state)
 

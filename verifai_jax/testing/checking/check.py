@@ -165,7 +165,10 @@ class CheckOutcome(InNotebook):
         """True unless the corpus is fixed and the run shows what was required."""
         if self.run is None or self.refuted:
             return True
-        if self.run.table.counts.without_verdict == self.run.simulations:
+        counts = self.run.table.counts
+        if counts.without_verdict == self.run.simulations:
+            return True
+        if self.rate is None and counts.may_fail:
             return True
         return self.rate is not None and self.rate.high > (self.check.max_failure_probability or 0)
 
