@@ -115,7 +115,7 @@ def test_a_formula_that_looks_beyond_the_trace():
     for spec in ("always eventually[0, 0.5] x + y > 0", "always[0, 1.1] x + y < 3"):
         assert notes_of(both, spec) == ()
     assert notes_of(both, {"a": "always[0, 1] eventually[0, 0.5] x + y > 0"}) == (
-        "in the formula, always[0,1] asks for eventually[0,0.5] as late as 1 s, when 0 s of its "
+        "in the formula, always[0,1] asks for eventually[0,0.5] that begins as late as 1 s, when 0 s of its "
         "0.5 s are left of a trace of 1 s, so that the end alone may break it. Probably meant: "
         "always[0,0.5] eventually[0,0.5] (x + y > 0)",
     )

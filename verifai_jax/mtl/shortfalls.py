@@ -53,11 +53,10 @@ class Shortfall(NamedTuple):
 
 
 class _Outer(NamedTuple):
-    """A window around a part, as what may choose the instant at which the part is evaluated.
+    """A window ahead around a part, which chooses when the part is evaluated.
 
     - `sign`: 1 if one good instant is enough, -1 if each has to be good.
-    - `asked`: the instant, in seconds, at which the window itself is evaluated: the first one, or
-      the last one for a window that looks back.
+    - `asked`: the first instant at which the window itself is evaluated, in seconds.
     - `later`, `sooner`: how far the windows in between move the part.
     - `joined`: whether another part has a say in the choice.
     """
@@ -68,16 +67,6 @@ class _Outer(NamedTuple):
     later: float = 0.0
     sooner: float = 0.0
     joined: bool = False
-
-
-class _State(NamedTuple):
-    """A part, its polarity, and the first and last instant at which it is evaluated."""
-
-    part: Formula
-    positive: bool
-    first: float
-    last: float
-    around: tuple[_Outer, ...] = ()
 
 
 @functools.lru_cache(1024)
@@ -95,8 +84,7 @@ def shortfalls(
         return ()
     whole = math.inf if duration is None else duration
     # A trace of n samples lasts n - 1 periods, and many count n.
-    walk = _Walk(whole, 1.01 * dt, END_OF_TRACE[end])
-    walk.over(formula)
+    walk = _Walk(formula, whole, 1.01 * dt, END_OF_TRACE[end])
     return *_at_the_start(formula, dt, whole), *walk.beyond.values(), *walk.cuts(formula, dt)
 
 
@@ -153,97 +141,83 @@ def _changed(f: Formula, intervals: Mapping[Formula, Interval]) -> Formula:
 class _Walk:
     """A walk over a formula that compares its windows with the duration of a trace."""
 
-    def __init__(self, duration: float, slack: float, end: str) -> None:
+    def __init__(self, formula: Formula, duration: float, slack: float, end: str) -> None:
         self.duration, self.slack, self.end = duration, slack, end
         self.beyond: dict[Formula, Shortfall] = {}
         self.cut: dict[Formula, tuple[_Outer, Formula, Interval | None]] = {}
         """By outer window: the inner one that is cut, and the outer interval in which it fits."""
-
-    def over(self, formula: Formula) -> None:
-        todo, seen = [_State(formula, True, 0.0, 0.0)], set[_State]()
+        # A part, whether it stands below no negation, when it is first evaluated, what is around.
+        todo: list[tuple[Formula, bool, float, tuple[_Outer, ...]]] = [(formula, True, 0.0, ())]
+        seen = set[object]()
         while todo and len(seen) < MAX_STATES:
             state = todo.pop()
             if state not in seen:
                 seen.add(state)
-                todo += self._below(state)
+                todo += self._below(*state)
 
-    def _below(self, at: _State) -> Iterator[_State]:
-        part = at.part
-        if isinstance(part, ast.Not):
-            yield at._replace(part=part.operand, positive=not at.positive)
-        elif isinstance(part, ast.Join):
-            sign = part.sign if at.positive else -part.sign
-            around = tuple(o._replace(joined=o.joined or sign != o.sign) for o in at.around)
-            yield from (at._replace(part=each, around=around) for each in part.parts)
-        elif part.side and part.operator.timed:
-            yield from self._window(at, part.interval, part.side == "ahead")
-        else:  # The next and the previous sample are within the slack.
-            yield from (at._replace(part=each) for each in part.valued())
-
-    def _window(self, at: _State, span: Interval, ahead: bool) -> Iterator[_State]:
-        part, a, b = at.part, span.start, span.end
-        sign = (part.sign if isinstance(part, ast.Window) else 1) * (1 if at.positive else -1)
-        endless = math.isinf(b)
-        reach = at.first + (a if endless else b)
+    def _below(
+        self, part: Formula, positive: bool, first: float, around: tuple[_Outer, ...]
+    ) -> Iterator[tuple[Formula, bool, float, tuple[_Outer, ...]]]:
+        sign = getattr(part, "sign", 1) * (1 if positive else -1)
+        if isinstance(part, ast.Join):
+            around = tuple(o._replace(joined=o.joined or sign != o.sign) for o in around)
+        if not (part.side and part.operator.timed):
+            # The next and the previous sample are within the slack.
+            positive ^= isinstance(part, ast.Not)
+            yield from ((each, positive, first, around) for each in part.valued())
+            return
+        start, end, ahead = part.interval.start, part.interval.end, part.side == "ahead"
+        endless = math.isinf(end)
+        reach = first + (start if endless else end)
         # An endless window that is there for one sample alone might as well not be.
-        slack = -self.slack / 2 if endless and a else self.slack
-        if ahead and reach > self.duration + slack:
+        if ahead and reach > self.duration + (-self.slack / 2 if endless and start else self.slack):
             text = f"{part} looks {format_seconds(reach)} ahead and a trace lasts "
             text += f"{format_seconds(self.duration)}: {self.end}"
             self.beyond.setdefault(part, Shortfall("beyond", part, text))
             return
-        for outer in at.around:
+        for outer in around:
             if outer.sign != sign:
-                self._compare(outer, part, ahead)
-        if ahead:
-            around = tuple(o._replace(later=o.later + b) for o in at.around)
-            first, last = at.first + a, min(at.last + b, max(self.duration, at.first + a))
-        else:
-            around = tuple(o._replace(sooner=o.sooner + b) for o in at.around)
-            first, last = max(at.first - b, 0.0), max(at.last - a, 0.0)
-        own = _Outer(part, sign, at.first if ahead else at.last)
-        chosen = (*around, own) if b > a else around
-        if isinstance(part, ast.Window):
-            yield _State(part.operand, at.positive, first, last, chosen)
-        elif isinstance(part, ast.Witness):
-            yield _State(part.right, at.positive, first, last, chosen)
-            # From now on to the witness.
-            first, last = (at.first, last) if ahead else (first, at.last)
-            yield _State(part.left, at.positive, first, last, around)
+                (self._cut_at_the_end if ahead else self._cut_at_the_start)(outer, part)
+        moved = "later" if ahead else "sooner"
+        around = tuple(o._replace(**{moved: getattr(o, moved) + end}) for o in around)
+        left, *rest = part.valued()
+        if rest:  # From now on to the witness.
+            yield left, positive, first if ahead else max(first - end, 0.0), around
+        first = first + start if ahead else max(first - end, 0.0)
+        chosen = (*around, _Outer(part, sign, first - start)) if ahead and end > start else around
+        yield (rest or [left])[-1], positive, first, chosen
 
-    def _compare(self, outer: _Outer, inner: Formula, ahead: bool) -> None:
-        """Keep an inner window that is cut where an outer one may choose to begin it."""
+    def _cut_at_the_end(self, outer: _Outer, inner: Formula) -> None:
         start, end = outer.window.interval.start, outer.window.interval.end
-        length, lets = inner.interval.end, outer.sign > 0
-        follows = outer.window.side == "ahead"
-        fitted = None
-        if not ahead:
-            earliest = outer.asked - outer.sooner + (start if follows else -end)
-            wrong = lets and (earliest <= 0 if math.isinf(length) else length - earliest > 1e-9)
-            wrong &= math.isfinite(length) or not outer.joined
-            start += length - earliest
-            if follows and start <= min(end, self.duration) < math.inf:
-                fitted = Interval(start, end)
-        elif not follows:
-            return
-        elif math.isinf(length):
-            latest = outer.asked + end + outer.later
-            wrong = math.isinf(latest) or latest >= self.duration - self.slack / 2
-            wrong &= lets or not outer.joined
-            # Nobody knows what was meant: half of the trace is an example.
-            middle = (start + self.duration - outer.asked) / 2
-            if start < middle < math.inf:
-                fitted = Interval(start, middle)
-        else:
-            latest = self.duration - outer.asked - outer.later - length
+        length = inner.interval.end
+        latest = self.duration - outer.asked - outer.later
+        if math.isfinite(length):
+            latest -= length
             # Everybody writes always (x -> eventually[0,5] y) for traces that end.
-            wrong = lets if math.isinf(end) else end - latest > self.slack
-            if start <= latest < math.inf:
-                fitted = Interval(start, latest)
-            # One that fits nowhere is beyond the trace.
-            wrong &= math.isinf(self.duration) or fitted is not None
-        _, _, known = self.cut.get(outer.window, (None, None, None))
-        if wrong and not (known and (not fitted or known.end <= fitted.end)):
+            wrong = outer.sign > 0 if math.isinf(end) else end - latest > self.slack
+        else:
+            wrong = math.isinf(end + outer.later) or end >= latest - self.slack / 2
+            wrong &= outer.sign > 0 or not outer.joined
+            # Nobody knows what was meant: half of the trace is an example.
+            latest = (start + latest) / 2
+        fits = start <= latest < math.inf
+        # One that fits nowhere is beyond the trace.
+        if wrong and (fits or math.isinf(latest) or math.isinf(length)):
+            self._keep(outer, inner, Interval(start, latest) if fits else None)
+
+    def _cut_at_the_start(self, outer: _Outer, inner: Formula) -> None:
+        start, end = outer.window.interval.start, outer.window.interval.end
+        length, earliest = inner.interval.end, outer.asked + start - outer.sooner
+        endless = math.isinf(length)
+        wrong = earliest <= 0 and not outer.joined if endless else length - earliest > 1e-9
+        if wrong and outer.sign > 0:
+            start += length - earliest
+            fits = start <= min(end, self.duration) and not endless
+            self._keep(outer, inner, Interval(start, end) if fits else None)
+
+    def _keep(self, outer: _Outer, inner: Formula, fitted: Interval | None) -> None:
+        known = self.cut.get(outer.window, (None, None, None))[2]
+        if not (known and (fitted is None or known.end <= fitted.end)):
             self.cut[outer.window] = outer, inner, fitted
 
     def cuts(self, formula: Formula, dt: float) -> Iterator[Shortfall]:
@@ -258,47 +232,40 @@ class _Walk:
                 changes[inner] = Interval(inner.interval.start, inner.interval.start + wait)
         meant = _changed(formula, {part: _on_grid(each, dt) for part, each in changes.items()})
         for outer, inner, _ in self.cut.values():
-            sentence = self._sentence(outer, inner)
             advice = "" if meant == formula else str(meant)
-            yield Shortfall("cut", outer.window, sentence, advice)
+            yield Shortfall("cut", outer.window, self._sentence(outer, inner), advice)
 
     def _sentence(self, outer: _Outer, inner: Formula) -> str:
         span, length = outer.window.interval, inner.interval.end
-        lets = f"{_head(outer.window)} {'lets' if outer.sign > 0 else 'asks for'} {_head(inner)}"
-        begin = " begin" if outer.sign > 0 else ""
-        alone = "where that sample alone decides"
-        if inner.side == "back":
-            seen = outer.asked - outer.sooner
-            seen = max(seen + (span.start if outer.window.side == "ahead" else -span.end), 0.0)
-            if math.isinf(length):
-                return f"{lets} end at the first sample, {alone}"
-            passed = f"{format_seconds(seen)} of its {format_seconds(length)}"
-            return f"{lets} end at {format_seconds(seen)}, when {passed} have passed"
+        verb = "lets" if outer.sign > 0 else "asks for"
+        text = f"{_head(outer.window)} {verb} {_head(inner)} "
+        back, alone = inner.side == "back", "sample, where that sample alone decides"
+        text += "end" if back else "begin" if outer.sign > 0 else "that begins"
         if math.isinf(length):
-            return f"{lets}{begin} at the last sample, {alone}"
+            return f"{text} at the {'first' if back else 'last'} {alone}"
+        if back:
+            at = max(outer.asked + span.start - outer.sooner, 0.0)
+            return (
+                f"{text} at {format_seconds(at)}, before its {format_seconds(length)} have passed"
+            )
         if math.isinf(self.duration):
-            return f"{lets}{begin} up to the end of the trace, which cuts its window"
-        latest = min(outer.asked + span.end + outer.later, self.duration)
-        left = f"{format_seconds(self.duration - latest)} of its {format_seconds(length)}"
-        return (
-            f"{lets}{begin} as late as {format_seconds(latest)}, when {left} are left of a trace "
-            f"of {format_seconds(self.duration)}"
-            f"{'' if begin else ', so that the end alone may break it'}"
-        )
+            return f"{text} up to the end of the trace, which cuts its window"
+        at = min(outer.asked + span.end + outer.later, self.duration)
+        left = f"{format_seconds(self.duration - at)} of its {format_seconds(length)}"
+        text += f" as late as {format_seconds(at)}, when {left} are left of a trace of "
+        text += format_seconds(self.duration)
+        return text if outer.sign > 0 else f"{text}, so that the end alone may break it"
 
 
 def _head(window: Formula) -> str:
     """Return the operator of a window with its interval."""
-    span = window.interval
-    return f"{window.word}{'' if span.everything else span}"
+    return f"{window.word}{'' if window.interval.everything else window.interval}"
 
 
 def _on_grid(span: Interval, dt: float) -> Interval:
-    """Return an interval whose ends are multiples of the sampling period, where there is one."""
-
-    def rounded(time: float) -> float:
-        steps = time / dt if dt else math.nan
-        return float(f"{math.floor(steps + 1e-6) * dt:.10g}") if math.isfinite(steps) else time
-
-    start = -rounded(-span.start) if dt else span.start
-    return Interval(start, max(rounded(span.end), start))
+    """Return the widest interval in another one whose ends are multiples of the period."""
+    if not dt:
+        return span
+    start, end = math.ceil(span.start / dt - 1e-6), span.end / dt + 1e-6
+    last = end if math.isinf(end) else max(math.floor(end), start)
+    return Interval(*(float(f"{steps * dt:.10g}") for steps in (start, last)))
