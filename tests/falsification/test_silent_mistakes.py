@@ -115,8 +115,9 @@ def test_a_formula_that_looks_beyond_the_trace():
     for spec in ("always eventually[0, 0.5] x + y > 0", "always[0, 1.1] x + y < 3"):
         assert notes_of(both, spec) == ()
     assert notes_of(both, {"a": "always[0, 1] eventually[0, 0.5] x + y > 0"}) == (
-        "in the formula, always[0,1] asks for eventually[0,0.5] that begins as late as 1 s, when 0 s of its "
-        "0.5 s are left of a trace of 1 s, so that the end alone may break it. Probably meant: "
+        "in the formula, always[0,1] asks for eventually[0,0.5] that begins as late as 1 s, when "
+        "0 s of its 0.5 s are left of a trace of 1 s, so that the end alone may break it. "
+        "Probably meant: "
         "always[0,0.5] eventually[0,0.5] (x + y > 0)",
     )
 
@@ -213,6 +214,11 @@ class TestRuns:
         )
         rows = vj.simulate(problem, [{"a": 0.5, "b": 0.5}] * 40)
         assert rows.notes == ()
+
+    def test_nearly_everything_fails(self):
+        problem = vj.Problem("p", SPACE, both, "always (x > 0.98 & y < 2)")
+        (note,) = vj.falsify(problem, "uniform", 200, batch=40).notes
+        assert "of 200 simulations with a verdict violate the property, nearly all of the" in note
 
     def test_nothing_comes_near(self):
         spec = {"far": "always x < 1000", "near": "always y < 1.01"}

@@ -247,16 +247,17 @@ def _draw_limits(
 
 def _shade(axes: Axes, clock: Float[np.ndarray, " t"], fails: Bool[np.ndarray, " t"]) -> None:
     """Shade the instants at which a predicate fails."""
+    edges = np.concatenate([clock[:1], (clock[1:] + clock[:-1]) / 2, clock[-1:]])
+    # From edge to edge, so that a single instant is seen, too.
     axes.fill_between(
-        clock,
+        np.repeat(edges, 2)[1:-1],
         0,
         1,
-        where=fails,
+        where=np.repeat(fails, 2).tolist(),
         transform=axes.get_xaxis_transform(),
         color=FAILING,
         alpha=0.13,
         linewidth=0,
-        step="mid",
     )
 
 
