@@ -52,7 +52,7 @@ def test_mutants_and_pairs(log):
 
 
 def test_templates_are_found_by_words():
-    found = json.loads(call("templates", "10 000 ft", "--json"))
+    found = json.loads(call("templates", "aircraft 250 kt", "--json"))
     assert [each["id"] for each in found["templates"]] == ["speed-below-10000"]
     assert call("templates", "no", "such", "words") == "no template has all of these words\n"
     assert "industrial robots" in call("templates", "--domain", "robots")

@@ -100,6 +100,14 @@ def test_what_fits_is_not(text):
     assert not shortfalls(parse(text), 0.1, 5.0)
 
 
+def test_a_formula_that_holds_its_parts_often_takes_no_longer():
+    deep = parse("x > 0")
+    for i in range(40):
+        deep = parse(f"always[0,0.1] y > {i}").iff(deep)
+    (found,) = shortfalls(deep, 0.1, 5.0)
+    assert found.part == parse("x > 0")
+
+
 def test_single_samples_need_no_temporal_operator():
     assert not shortfalls(parse("x > 0"), 0.1, 0.0)
 

@@ -18,9 +18,11 @@ import numpy as np
 
 from verifai_jax.core.messages.text import format_seconds
 from verifai_jax.mtl import formula as ast
+from verifai_jax.mtl._explain import heading
 from verifai_jax.mtl.evaluate import End
 from verifai_jax.mtl.formula import Formula, Interval, surface
-from verifai_jax.mtl.rewriting import rebuild, replaced
+from verifai_jax.mtl.rewriting import rebuild
+from verifai_jax.mtl.tree import postorder
 from verifai_jax.mtl.words import OPERATORS
 
 MAX_STATES = 5000
@@ -117,7 +119,7 @@ def _at_the_start(formula: Formula, dt: float, duration: float) -> Iterator[Shor
         seen.add(part)
         word, operands, span = surface(part) if part.operands() else ("", (), None)
         last = min(asked[part][1], duration) if part in asked else math.inf
-        meant = replaced(formula, {whole: ast.Always(whole)}) if last == 0 else ""
+        meant = _changed(formula, {whole: None}) if last == 0 else ""
         if word and OPERATORS[word].side == "back" and last <= (span.start if span else 0.0):
             where = "at the first sample" if last == 0 else f"up to {format_seconds(last)}"
             text = f"{part} is evaluated only {where}, and there is nothing where it looks"
@@ -132,10 +134,17 @@ def _at_the_start(formula: Formula, dt: float, duration: float) -> Iterator[Shor
         yield Shortfall("start", part, text, str(meant))
 
 
-def _changed(f: Formula, intervals: Mapping[Formula, Interval]) -> Formula:
-    """Return a formula with other intervals for some of its windows."""
-    same = rebuild(f, tuple(_changed(part, intervals) for part in f.operands()))
-    return replace(same, interval=intervals[f]) if f in intervals else same  # pyright: ignore
+def _changed(f: Formula, changes: Mapping[Formula, Interval | None]) -> Formula:
+    """Return a formula with other intervals for some parts, or, for None, always these parts."""
+    known: dict[Formula, Formula] = {}
+    for part in postorder(f):
+        if isinstance(part, Formula):
+            same = rebuild(part, tuple(known[each] for each in part.operands()))
+            if part in changes:
+                span = changes[part]
+                same = replace(same, interval=span) if span else ast.Always(same)  # pyright: ignore
+            known[part] = same
+    return known[f]
 
 
 class _Walk:
@@ -144,8 +153,8 @@ class _Walk:
     def __init__(self, formula: Formula, duration: float, slack: float, end: str) -> None:
         self.duration, self.slack, self.end = duration, slack, end
         self.beyond: dict[Formula, Shortfall] = {}
-        self.cut: dict[Formula, tuple[_Outer, Formula, Interval | None]] = {}
-        """By outer window: the inner one that is cut, and the outer interval in which it fits."""
+        self.cut: dict[Formula, tuple[str, dict[Formula, Interval]]] = {}
+        """By outer window: what is the matter, and the intervals with which all windows fit."""
         # A part, whether it stands below no negation, when it is first evaluated, what is around.
         todo: list[tuple[Formula, bool, float, tuple[_Outer, ...]]] = [(formula, True, 0.0, ())]
         seen = set[object]()
@@ -171,95 +180,88 @@ class _Walk:
         reach = first + (start if endless else end)
         # An endless window that is there for one sample alone might as well not be.
         if ahead and reach > self.duration + (-self.slack / 2 if endless and start else self.slack):
-            text = f"{part} looks {format_seconds(reach)} ahead and a trace lasts "
-            text += f"{format_seconds(self.duration)}: {self.end}"
+            lasts = f"and a trace lasts {format_seconds(self.duration)}: {self.end}"
+            text = f"{part} looks {format_seconds(reach)} ahead {lasts}"
             self.beyond.setdefault(part, Shortfall("beyond", part, text))
             return
         for outer in around:
-            if outer.sign != sign:
+            if outer.sign != sign and (ahead or outer.sign > 0):
                 (self._cut_at_the_end if ahead else self._cut_at_the_start)(outer, part)
         moved = "later" if ahead else "sooner"
         around = tuple(o._replace(**{moved: getattr(o, moved) + end}) for o in around)
         left, *rest = part.valued()
         if rest:  # From now on to the witness.
             yield left, positive, first if ahead else max(first - end, 0.0), around
+        chosen = (*around, _Outer(part, sign, first)) if ahead and end > start else around
         first = first + start if ahead else max(first - end, 0.0)
-        chosen = (*around, _Outer(part, sign, first - start)) if ahead and end > start else around
         yield (rest or [left])[-1], positive, first, chosen
 
     def _cut_at_the_end(self, outer: _Outer, inner: Formula) -> None:
-        start, end = outer.window.interval.start, outer.window.interval.end
-        length = inner.interval.end
+        (start, end), length = _ends(outer.window), inner.interval.end
+        fits = {}
+        text = "begin" if outer.sign > 0 else "that begins"
         latest = self.duration - outer.asked - outer.later
-        if math.isfinite(length):
+        if math.isinf(length):
+            wrong = math.isinf(end + outer.later) or end >= latest - self.slack / 2
+            wrong &= outer.sign > 0 or not outer.joined
+            text += " at the last sample, where that sample alone decides"
+            # Nobody knows what was meant: half of the trace is an example.
+            latest = (start + latest) / 2
+            if outer.sign < 0 and math.isfinite(latest):
+                wait = self.duration - outer.asked - latest + inner.interval.start
+                fits[inner] = Interval(inner.interval.start, wait)
+        else:
             latest -= length
             # Everybody writes always (x -> eventually[0,5] y) for traces that end.
             wrong = outer.sign > 0 if math.isinf(end) else end - latest > self.slack
-        else:
-            wrong = math.isinf(end + outer.later) or end >= latest - self.slack / 2
-            wrong &= outer.sign > 0 or not outer.joined
-            # Nobody knows what was meant: half of the trace is an example.
-            latest = (start + latest) / 2
-        fits = start <= latest < math.inf
-        # One that fits nowhere is beyond the trace.
-        if wrong and (fits or math.isinf(latest) or math.isinf(length)):
-            self._keep(outer, inner, Interval(start, latest) if fits else None)
+            # One that fits nowhere is beyond the trace.
+            wrong &= start <= latest
+            text += " up to the end of the trace, which cuts its window"
+            if math.isfinite(self.duration):
+                at = min(outer.asked + end + outer.later, self.duration)
+                left = f"{format_seconds(self.duration - at)} of its {format_seconds(length)}"
+                lasts = format_seconds(self.duration)
+                text = text.partition(" up to")[0] + f" as late as {format_seconds(at)}, when "
+                text += f"{left} are left of a trace of {lasts}"
+                text += "" if outer.sign > 0 else ", so that the end alone may break it"
+        if wrong:
+            fits = {outer.window: Interval(start, latest), **fits} if latest < math.inf else {}
+            self._keep(outer, inner, text, fits)
 
     def _cut_at_the_start(self, outer: _Outer, inner: Formula) -> None:
-        start, end = outer.window.interval.start, outer.window.interval.end
-        length, earliest = inner.interval.end, outer.asked + start - outer.sooner
-        endless = math.isinf(length)
-        wrong = earliest <= 0 and not outer.joined if endless else length - earliest > 1e-9
-        if wrong and outer.sign > 0:
-            start += length - earliest
-            fits = start <= min(end, self.duration) and not endless
-            self._keep(outer, inner, Interval(start, end) if fits else None)
+        (start, end), length = _ends(outer.window), inner.interval.end
+        earliest = outer.asked + start - outer.sooner
+        missing = length - earliest
+        if math.isinf(length):
+            if earliest <= 0 and not outer.joined:
+                text = "end at the first sample, where that sample alone decides"
+                self._keep(outer, inner, text, {})
+        elif missing > 1e-9:
+            at = format_seconds(max(earliest, 0.0))
+            text = f"end at {at}, before its {format_seconds(length)} have passed"
+            fits = start + missing <= min(end, self.duration)
+            fitted = {outer.window: Interval(start + missing, end)} if fits else {}
+            self._keep(outer, inner, text, fitted)
 
-    def _keep(self, outer: _Outer, inner: Formula, fitted: Interval | None) -> None:
-        known = self.cut.get(outer.window, (None, None, None))[2]
-        if not (known and (fitted is None or known.end <= fitted.end)):
-            self.cut[outer.window] = outer, inner, fitted
+    def _keep(
+        self, outer: _Outer, inner: Formula, text: str, fitted: dict[Formula, Interval]
+    ) -> None:
+        window = outer.window
+        known = self.cut.get(window, ("", {}))[1]
+        if not known or (fitted and fitted[window].end < known[window].end):
+            verb = "lets" if outer.sign > 0 else "asks for"
+            self.cut[window] = f"{heading(window)} {verb} {heading(inner)} {text}", fitted
 
     def cuts(self, formula: Formula, dt: float) -> Iterator[Shortfall]:
         """Yield the windows that are cut, with the formula in which none is."""
-        changes: dict[Formula, Interval] = {}
-        for outer, inner, fitted in self.cut.values():
-            if fitted is None:
-                continue
-            changes[outer.window] = fitted
-            if math.isinf(inner.interval.end) and outer.sign < 0:
-                wait = self.duration - outer.asked - fitted.end
-                changes[inner] = Interval(inner.interval.start, inner.interval.start + wait)
-        meant = _changed(formula, {part: _on_grid(each, dt) for part, each in changes.items()})
-        for outer, inner, _ in self.cut.values():
-            advice = "" if meant == formula else str(meant)
-            yield Shortfall("cut", outer.window, self._sentence(outer, inner), advice)
-
-    def _sentence(self, outer: _Outer, inner: Formula) -> str:
-        span, length = outer.window.interval, inner.interval.end
-        verb = "lets" if outer.sign > 0 else "asks for"
-        text = f"{_head(outer.window)} {verb} {_head(inner)} "
-        back, alone = inner.side == "back", "sample, where that sample alone decides"
-        text += "end" if back else "begin" if outer.sign > 0 else "that begins"
-        if math.isinf(length):
-            return f"{text} at the {'first' if back else 'last'} {alone}"
-        if back:
-            at = max(outer.asked + span.start - outer.sooner, 0.0)
-            return (
-                f"{text} at {format_seconds(at)}, before its {format_seconds(length)} have passed"
-            )
-        if math.isinf(self.duration):
-            return f"{text} up to the end of the trace, which cuts its window"
-        at = min(outer.asked + span.end + outer.later, self.duration)
-        left = f"{format_seconds(self.duration - at)} of its {format_seconds(length)}"
-        text += f" as late as {format_seconds(at)}, when {left} are left of a trace of "
-        text += format_seconds(self.duration)
-        return text if outer.sign > 0 else f"{text}, so that the end alone may break it"
+        changes = {part: span for _, fitted in self.cut.values() for part, span in fitted.items()}
+        meant = _changed(formula, {part: _on_grid(span, dt) for part, span in changes.items()})
+        for window, (sentence, _) in self.cut.items():
+            yield Shortfall("cut", window, sentence, "" if meant == formula else str(meant))
 
 
-def _head(window: Formula) -> str:
-    """Return the operator of a window with its interval."""
-    return f"{window.word}{'' if window.interval.everything else window.interval}"
+def _ends(window: Formula) -> tuple[float, float]:
+    return window.interval.start, window.interval.end
 
 
 def _on_grid(span: Interval, dt: float) -> Interval:
