@@ -26,6 +26,8 @@ def pages(monkeypatch):
         vars(module).update({member: type(member, (), {}) for member in members})
         monkeypatch.setitem(sys.modules, name, module)
     spec = importlib.util.spec_from_file_location("site_pages", ROOT / "website" / "pages.py")
+    assert spec is not None
+    assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     return module

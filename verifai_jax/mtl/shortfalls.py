@@ -270,4 +270,4 @@ def _on_grid(span: Interval, dt: float) -> Interval:
         return span
     start, end = math.ceil(span.start / dt - 1e-6), span.end / dt + 1e-6
     last = end if math.isinf(end) else max(math.floor(end), start)
-    return Interval(*(float(f"{steps * dt:.10g}") for steps in (start, last)))
+    return Interval(*(float(f"{steps * dt:z.10g}") for steps in (start, last)))
