@@ -215,6 +215,13 @@ class TestRuns:
         rows = vj.simulate(problem, [{"a": 0.5, "b": 0.5}] * 40)
         assert rows.notes == ()
 
+    def test_the_first_trace_of_a_black_box_shows_its_duration(self):
+        for length, start in ((11, "in the formula, there is no temporal operator"), (1, "")):
+            box = vj.blackbox(lambda f, n=length: vj.Trace({"x": f["a"] * np.arange(n)}, dt=0.1))
+            problem = vj.Problem("p", {"a": vj.Box(0, 1)}, box, "x > -1")
+            notes = vj.falsify(problem, "uniform", 4, confirm=False).notes
+            assert [note[: len(start)] for note in notes] == ([start] if start else [])
+
     def test_nearly_everything_fails(self):
         problem = vj.Problem("p", SPACE, both, "always (x > 0.98 & y < 2)")
         (note,) = vj.falsify(problem, "uniform", 200, batch=40).notes
