@@ -4,8 +4,8 @@
     verifai-jax falsify specs/lane_keeping.py:learned --search cross_entropy --stop-after 1
 
 A lane of 3.5 m and a car of 1.8 m leave 0.85 m on each side. Roads are 300 m of clothoids between
-random curvatures; the bounds on acceleration and jerk are those of ISO 11270 for lane-keeping
-assistance (3 m/s^2 and 5 m/s^3).
+random curvatures. Acceleration and jerk are bounded as is usual for assistance in the lane (here by
+3 m/s^2 and 5 m/s^3).
 """
 
 import verifai_jax as vj
@@ -107,7 +107,7 @@ comfort = vj.Problem(
     },
     priority=[("lane", "acceleration"), ("lane", "jerk")],
     nominal={**as_built, "acceleration": 0.0, "offset0": 0.0, "heading0": 0.0, "curvature": 0.0},
-    description="in the lane first; then lateral acceleration and jerk within ISO 11270",
+    description="in the lane first; then lateral acceleration and jerk within their limits",
     draw=draw,
 )
 

@@ -1,20 +1,33 @@
 """The code of the pages runs as it stands there, block after block, in an empty folder.
 
 A comment before a block says where it cannot: `<!-- needs PACKAGE -->` runs it where the package is
-installed, `<!-- not run: why -->` compiles it only.
+installed, `<!-- not run: why -->` compiles it only. What a block prints is as the page says:
+
+- in a block without a language right below it, in words and numbers, where lines may be
+  left out or broken and times differ, and ` ...` stands for the rest of a line;
+- in a comment behind `print(...)` that begins with a value: each number of it is printed there.
+
+On a page that shows what a command prints, its commands run, too.
 """
 
+import contextlib
 import importlib.util
+import io
+import itertools
 import os
 import re
+import shlex
 import subprocess
 import sys
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import pytest
+from click.testing import CliRunner
 
 import verifai_jax
+from notebooks.outputs import NUMBER, SPENT, agree
+from verifai_jax.cli.main import main
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
@@ -26,8 +39,10 @@ PAGES = [
 ]
 """Pages with code."""
 CODE = re.compile(r"```.*?```|`[^`\n]*`", re.DOTALL)
-SHOWN = re.compile(r"```python\n(.*?)```\n\n```\n(.*?)```", re.DOTALL)
-"""A block of code, and below it what it prints."""
+FENCE = re.compile(r"^(?:<!-- ([^>]*?) -->\n)?```(\w*)\n(.*?)^```\n", re.DOTALL | re.MULTILINE)
+"""A block of any language, and the comment before it."""
+COMMENTED = re.compile(r"print\(.*\)\s+# ((?:[-\d\[({]|True|False).*)")
+"""A line that prints, with a comment that begins with a value."""
 LINK = re.compile(r"\]\(([\w./-]+)(?:#[\w-]+)?\)")
 """A link to a file; those with a scheme lead elsewhere."""
 
@@ -72,37 +87,148 @@ def test_links_lead_to_files(file):
     assert [link for link in LINK.findall(prose) if not (file.parent / link).exists()] == []
 
 
+class Shown(NamedTuple):
+    """A block that runs, the number of its first line, and what the page says that it prints."""
+
+    language: str
+    code: str
+    line: int
+    output: str
+
+
+def shown_on(page: str) -> list[Shown]:
+    """Return the blocks of a page that run, each with the blocks of output right below it."""
+    text, found, end = (DOCS / f"{page}.md").read_text(), list[Shown](), -1
+    for fence in FENCE.finditer(text):
+        about, language, code = fence.groups()
+        kind, _, package = (about or "").partition(" ")
+        if language in ("python", "sh"):
+            line = text.count("\n", 0, fence.start(3))
+            runs = not about or (kind == "needs" and importlib.util.find_spec(package))
+            end = fence.end() if runs else -1
+            found += [Shown(language, code, line, "")] if runs else []
+        elif not language and not text[end : fence.start()].strip() and end > 0:
+            found[-1] = found[-1]._replace(output=found[-1].output + code)
+            end = fence.end()
+    commands = any(each.language == "sh" and each.output for each in found)
+    return [each for each in found if each.language == "python" or commands]
+
+
+def is_printed(shown: str, printed: str) -> bool:
+    """Return whether what is shown are lines that were printed, in their order, broken or not.
+
+    Numbers agree as those of notebooks do, and ` ...` stands for the rest of a line.
+    """
+    words = iter(timeless(shown).split())
+    word = next(words, None)
+    for line in timeless(printed).splitlines():
+        kept, words = itertools.tee(words)
+        rest, at = line.split(), word
+        for each in rest:
+            if at is None or at == "..." or not agree(at, each):
+                break
+            at = next(words, None)
+        else:
+            each = None
+        if rest and (each is None or at == "..."):
+            word = next(words, None) if at == "..." else at
+        else:
+            words = kept
+    return word is None
+
+
+def timeless(text: str) -> str:
+    """Return a text without the time that the machine needed."""
+    return re.sub(r"(?m)(?<=, )[\d.,]+ (?:ms|s|min|h)$", "TIME", SPENT.sub("TIME ", text))
+
+
+def is_value(comment: str, printed: str) -> bool:
+    """Return whether the value with which a comment begins, and its numbers, were printed."""
+    if comment.startswith(("True", "False")):
+        return comment.split()[0].strip(",.:") in printed.split()
+    rest = iter(NUMBER.findall(printed))
+    return all(any(is_rounded(number, each) for each in rest) for number in NUMBER.findall(comment))
+
+
+def is_rounded(number: str, printed: str) -> bool:
+    one, other = (float(each.replace(",", "")) for each in (number, printed))
+    digits = len(number.partition(".")[2])
+    return abs(one - other) <= 0.5 * 10.0**-digits * (1 + 1e-9) * bool(digits or "." in printed)
+
+
+def run_commands(code: str) -> str:
+    """Run those lines that are commands of the package, and return what they print."""
+    printed = ""
+    for line in code.splitlines():
+        words = shlex.split(line, comments=True)
+        if words[:1] == ["cd"]:
+            os.chdir(words[1])
+        elif words[:1] == ["verifai-jax"]:
+            done = CliRunner().invoke(main, words[1:])
+            assert done.exit_code == 0, done.output
+            printed += done.stdout
+    return printed
+
+
+def run_page(page: str) -> None:
+    """Run the code of a page in this folder, and compare what it prints with what the page says."""
+    printed: dict[int, str] = {}
+
+    def record(*values: object, **options: Any) -> None:
+        text = io.StringIO()
+        print(*values, **{"file": text, **options})
+        line = sys._getframe(1).f_lineno
+        printed[line] = printed.get(line, "") + text.getvalue()
+        print(text.getvalue(), end="")
+
+    names: dict = {"__name__": page, "print": record}
+    for block in shown_on(page):
+        with contextlib.redirect_stdout(io.StringIO()) as out:
+            if block.language == "sh":
+                print(run_commands(block.code), end="")
+            else:
+                # Lines of an error are those of the page.
+                code = "\n" * block.line + block.code
+                exec(compile(code, str(DOCS / f"{page}.md"), "exec"), names)
+        said = out.getvalue()
+        assert is_printed(block.output, said), f"{page}, line {block.line}: it prints\n{said}"
+        for number, line in enumerate(block.code.splitlines(), block.line + 1):
+            if found := COMMENTED.search(line):
+                text = printed.get(number, "")
+                assert is_value(found[1], text), f"{page}: {line}\nprints {text}"
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("page", PAGES)
-def test_the_code_of_a_page_runs(page, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    names: dict = {"__name__": page}
-    for block in blocks(page):
-        if block.runs:
-            # Lines of an error are those of the page.
-            code = "\n" * block.line + block.code
-            exec(compile(code, str(DOCS / f"{page}.md"), "exec"), names)
+def test_the_code_of_a_page_runs_and_prints_what_the_page_says(page, tmp_path):
+    # As a user compiles it: what adapts to what it finds depends on the last digits.
+    own = ("XLA_FLAGS", "JAX_DISABLE_MOST_OPTIMIZATIONS")
+    env = {name: value for name, value in os.environ.items() if name not in own}
+    env["PYTHONPATH"] = os.pathsep.join([str(ROOT), env.get("PYTHONPATH", "")])
+    done = subprocess.run(
+        [sys.executable, __file__, page], cwd=tmp_path, env=env, capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stderr
+
+
+def test_what_a_page_says_is_compared():
+    assert is_value("0.05, and 2 as well", "7 0.0501 2")
+    assert not is_value("2, and 0.05", "7 0.0501 2")
+    assert is_value("True: within 1 s", "True")
+    assert not is_value("True", "False")
+    printed = "a 1\n  b 2.5 of 7\nc, 1956 simulations, 3 s\nd"
+    assert is_printed("a 1\nc, 1956\n  simulations, 7 s", printed)
+    assert is_printed("b 2.5 ...\nd", printed)
+    assert is_printed("", printed)
+    for wrong in ("c, 1996 simulations, 3 s", "b 2.5", "d\na 1", "b 2.6 ...", "e"):
+        assert not is_printed(wrong, printed), wrong
+    blocks = [each for page in PAGES for each in shown_on(page) if each.output]
+    assert len(blocks) > 10
+    assert any(each.language == "sh" for each in blocks)
 
 
 def test_the_first_page_is_short():
     assert len((ROOT / "README.md").read_text().split()) <= 900
-
-
-@pytest.mark.slow
-def test_the_first_page_shows_what_its_code_prints(tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
-    shown = SHOWN.search((ROOT / "README.md").read_text())
-    assert shown is not None
-    exec(compile(shown[1], "README.md", "exec"), {"__name__": "first"})
-    printed = capsys.readouterr().out.splitlines()
-    expected = shown[2].splitlines()
-    assert len(printed) == len(expected)
-    for line, said in zip(expected, printed, strict=True):
-        if line.startswith("  time "):  # Seconds differ.
-            line, said = (re.sub(r"\d[\d.,]*", "0", text) for text in (line, said))
-        beginning, dots, _ = line.partition(" ...")
-        assert said.startswith(beginning) if dots else said == line
-    assert (tmp_path / "worst.png").exists()
 
 
 def test_the_citation_has_the_version():
@@ -133,3 +259,18 @@ def test_the_site_is_built_strictly(tmp_path):
     )
     assert done.returncode == 0, done.stderr.decode()
     assert "Fuzz" in (tmp_path / "reference" / "falsification.html").read_text()
+    pictures = [
+        page.parent / source
+        for page in tmp_path.glob("**/*.html")
+        for source in re.findall(r'<img [^>]*?src="([^"]+)"', page.read_text())
+        if not source.startswith(("data:", "http"))
+    ]
+    # Each one opens, as its beginning shows.
+    beginnings = {b"\x89PNG", b"GIF8"}
+    broken = [p for p in pictures if not p.exists() or p.read_bytes()[:4] not in beginnings]
+    assert not broken
+    assert len(pictures) > 50
+
+
+if __name__ == "__main__":
+    run_page(sys.argv[1])

@@ -104,15 +104,17 @@ def on_page_markdown(markdown: str, page: Any, config: Any, files: Files) -> str
 def _links(text: str, folder: str, page: str) -> str:
     def link(found: re.Match[str]) -> str:
         mark, words, path, anchor = found.groups()
-        place = _place(posixpath.normpath(posixpath.join(folder, path)))
+        place = relative(path)
         if place is None:
             return words if words.startswith("`") else f"{words} (`{path.replace('../', '')}`)"
-        relative = posixpath.relpath(place, posixpath.dirname(page) or ".")
-        return f"{mark}[{words}]({relative}{anchor or ''})"
+        return f"{mark}[{words}]({place}{anchor or ''})"
 
     def image(found: re.Match[str]) -> str:
-        place = _place(posixpath.normpath(posixpath.join(folder, found[2])))
-        return f"{found[1]}{place or found[2]}{found[3]}"
+        return f"{found[1]}{relative(found[2]) or found[2]}{found[3]}"
+
+    def relative(path: str) -> str | None:
+        place = _place(posixpath.normpath(posixpath.join(folder, path)))
+        return place and posixpath.relpath(place, posixpath.dirname(page) or ".")
 
     return IMAGE.sub(image, LINK.sub(link, text))
 
@@ -125,7 +127,8 @@ def _place(path: str) -> str | None:
         return path.removeprefix("docs/")
     if path.startswith("notebooks/") and path.endswith(".ipynb"):
         return _page_of(ROOT / path)
-    return path if path.startswith(("notebooks/", "reference/")) and path.endswith(".png") else None
+    picture = path.endswith((".png", ".gif"))
+    return path if path.startswith(("notebooks/", "reference/")) and picture else None
 
 
 def _notebooks() -> list[Path]:

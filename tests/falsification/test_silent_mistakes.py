@@ -11,7 +11,6 @@ import pytest
 
 import verifai_jax as vj
 from verifai_jax.core.user_code.targets import definitions
-from verifai_jax.mtl import parse
 from verifai_jax.problem.silent_mistakes import (
     difference,
     programs_read,
@@ -106,30 +105,38 @@ def test_a_state_of_a_loop_that_is_not_monitored():
     assert notes_of(loop, "always x + y < 2") == ()
 
 
-@pytest.mark.parametrize(
-    ("spec", "seconds"),
-    [
-        ("always[0, 3] x < 2", 3),
-        ("always x < 2", 0),
-        ("always[2, 4] (x < 1 -> eventually[1, 3] x > 1)", 5),
-        ("(x > 1) until[1, 6] (x < 1)", 6),
-        ("always[1, inf] historically[0, 9] x < 1", 1),
-        ("next next x < 1", 0.2),
-    ],
-)
-def test_the_first_look_ahead(spec, seconds):
-    assert parse(spec).first_look_ahead(0.1) == pytest.approx(seconds)
-
-
 def test_a_formula_that_looks_beyond_the_trace():
     (note,) = notes_of(both, "always[0, 3] (x < 2 & y < 2)")
     assert note == (
-        "the formula looks 3 s ahead and a trace lasts 1 s: its last sample is taken for all that "
-        "comes after"
+        "in the formula, always[0,3] (x < 2 & y < 2) looks 3 s ahead and a trace lasts 1 s: its "
+        "last sample is taken for all that comes after"
     )
     # A window that slides over the end is no mistake, nor is one period more than there is.
-    for spec in ("always[0, 1] eventually[0, 0.5] x + y > 0", "always[0, 1.1] x + y < 3"):
+    for spec in ("always eventually[0, 0.5] x + y > 0", "always[0, 1.1] x + y < 3"):
         assert notes_of(both, spec) == ()
+    assert notes_of(both, {"a": "always[0, 1] eventually[0, 0.5] x + y > 0"}) == (
+        "in the formula, always[0,1] asks for eventually[0,0.5] that begins as late as 1 s, when "
+        "0 s of its 0.5 s are left of a trace of 1 s, so that the end alone may break it. "
+        "Probably meant: "
+        "always[0,0.5] eventually[0,0.5] (x + y > 0)",
+    )
+
+
+def test_parts_of_formulas_that_say_less_than_they_seem_to():
+    short = "eventually[0, 1] always[0, 0.5] abs(x) <= 0.1"
+    (note,) = notes_of(both, {"settles": short, "b": "always y < 2"})
+    assert note.startswith("in formula 'settles', eventually[0,1] lets always[0,0.5] begin")
+    assert note.endswith("Probably meant: eventually[0,0.5] always[0,0.5] (abs(x) <= 0.1)")
+    (note,) = notes_of(both, "x + y < 2")
+    assert note == (
+        "in the formula, there is no temporal operator, so that only the first sample is tested. "
+        "Probably meant: always (x + y < 2)"
+    )
+
+    def single(f, key):
+        return vj.Trace({"x": (f["a"] + f["b"])[None]}, dt=0.1)
+
+    assert notes_of(single, "x < 2") == ()
 
 
 @pytest.mark.slow
@@ -207,6 +214,18 @@ class TestRuns:
         )
         rows = vj.simulate(problem, [{"a": 0.5, "b": 0.5}] * 40)
         assert rows.notes == ()
+
+    def test_the_first_trace_of_a_black_box_shows_its_duration(self):
+        for length, start in ((11, "in the formula, there is no temporal operator"), (1, "")):
+            box = vj.blackbox(lambda f, n=length: vj.Trace({"x": f["a"] * np.arange(n)}, dt=0.1))
+            problem = vj.Problem("p", {"a": vj.Box(0, 1)}, box, "x > -1")
+            notes = vj.falsify(problem, "uniform", 4, confirm=False).notes
+            assert [note[: len(start)] for note in notes] == ([start] if start else [])
+
+    def test_nearly_everything_fails(self):
+        problem = vj.Problem("p", SPACE, both, "always (x > 0.98 & y < 2)")
+        (note,) = vj.falsify(problem, "uniform", 200, batch=40).notes
+        assert "of 200 simulations with a verdict violate the property, nearly all of the" in note
 
     def test_nothing_comes_near(self):
         spec = {"far": "always x < 1000", "near": "always y < 1.01"}

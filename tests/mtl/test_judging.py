@@ -164,3 +164,14 @@ def test_files_of_requirements(tmp_path):
     (tmp_path / "some.txt").write_text("")
     with pytest.raises(ValueError, match=r"ends with .toml, .yaml, .* got some.txt"):
         read_requirements(tmp_path / "some.txt")
+
+
+def test_a_requirement_that_says_less_than_it_seems_to_has_a_note():
+    trace = Trace({"x": np.sin(np.arange(51) * 0.5), "still": np.zeros(51, bool)}, dt=0.1)
+    asked = {"settles": "eventually[0, 5] always[0, 1] x < 0", "at once": "x >= 0", "off": "!still"}
+    found = judge({**asked, "sound": "always x < 2"}, [trace, trace])
+    notes = [row.note for row in found.rows[:4]]
+    assert notes[0].endswith("Probably meant: eventually[0,4] always[0,1] (x < 0)")
+    assert notes[1].startswith("there is no temporal operator")
+    assert notes[2:] == ["", ""]
+    assert str(found).count("\nNote on ") == 2

@@ -79,6 +79,18 @@ PLANTED = [
     ("window", "eventually[60, 90] dist < 10"),
     ("window", "historically speed < 30"),
     ("window", "once brake"),
+    ("window", "always (brake -> once[25, 30] speed > 5)"),
+    # Windows that the end cuts where the formula chooses or asks, and tests of one sample.
+    ("window", "eventually always temp > 60"),
+    ("window", "eventually always[0, 1] speed > 20"),
+    ("window", "eventually[0, 20] always[0, 5] speed < 20"),
+    ("window", "speed < 30 until[0, 20] always[0, 5] speed < 20"),
+    ("window", "always[0, 10] eventually[0, 12] dist < 10"),
+    ("window", "eventually[0, 20] historically[0, 5] dist > 10"),
+    ("window", "always eventually brake"),
+    ("window", "dist > 2 & always speed < 30"),
+    ("window", "speed < 30"),
+    ("window", "speed < 30 | dist < 40"),
     ("no verdict", "always (request > 0 -> eventually[0, 0.25] grant > 0)"),
     # Until where weak until is meant.
     ("until", "speed < 30 until mode == 3"),
@@ -140,10 +152,8 @@ SOUND = [
     "always glucose > 70",
     "always (glucose < 190)",
     "always (glucose > 180 -> eventually[0, 6] glucose < 180)",
-    "eventually always temp > 60",
     "always temp < 90",
     "always eventually[0, 12] brake",
-    "eventually always[0, 1] speed > 20",
     "always (speed < 30 | brake)",
     "speed < 30 weak_until mode == 3",
     "mode == 2 release speed < 30",
@@ -160,11 +170,13 @@ SOUND = [
     "always (mode == 2 -> historically[0, 1] speed < 30)",
     "always (grant > 0 -> (speed < 30 since request > 0))",
     "always (speed > 20 & dist < 10 -> eventually[0, 5] speed < 20)",
-    "always[0, 10] eventually[0, 12] dist < 10",
     "always (request > 0 -> next[0] grant <= 0)".replace("next[0]", "next"),
     "always (speed > 25 -> always[0, 1] speed > 10)",
     "eventually[5, 15] always[0, 1] dist > 30",
-    "dist > 2 & always speed < 30",
+    "eventually[0, 18.9] always[0, 1] speed > 20",
+    "eventually[0, 15] always temp > 60",
+    "always[0, 7] eventually[0, 12] dist < 10",
+    "(always[0, 10] speed < 30) & (always dist > 2)",
     "always (abs(heading) <= 90.5)",
     "always (heading > 45 -> eventually[0, 8] heading < 45)",
     "always (!(speed > 28.5) & !(dist < 3))",
@@ -225,7 +237,20 @@ def test_few_seconds_that_are_counted_are_near_their_limit(drives):
     assert not mtl.lint("always duration(speed > 28, 10) <= 3", drives, units=UNITS)
 
 
+def test_findings_say_what_was_probably_meant(drives):
+    (found,) = mtl.lint("eventually[0, 20] always[0, 5] speed < 20", drives)
+    assert found.sentence == (
+        "eventually[0,20] lets always[0,5] begin as late as 19.9 s, when 0 s of its 5 s are left "
+        "of a trace of 19.9 s, in 3 of 3 recordings, such as recording 1"
+    )
+    assert found.advice == "Probably meant: eventually[0,14.9] always[0,5] (speed < 20)"
+    # The time at which a constant is tested does not matter.
+    assert not [each for each in mtl.lint("mass > 1400", drives) if each.kind == "window"]
+
+
 def test_a_formula_alone_is_looked_at_without_recordings():
+    assert [f.kind for f in mtl.lint("x > 5")] == ["window"]
+    assert [f.kind for f in mtl.lint("eventually always[0, 1] x > 5")] == ["window"]
     assert [f.kind for f in mtl.lint("always (x > 5 & x < 3)")] == ["always false"]
     assert not mtl.lint("always (x > 5 -> eventually[0, 2] y < 3)")
     assert str(mtl.lint("always x > 5")) == "0 findings on 1 formula, with 0 recordings"

@@ -39,6 +39,7 @@ from verifai_jax.falsification.cheap import check_same_features
 from verifai_jax.falsification.validation import SLOW, can_be_slow
 from verifai_jax.problem.dependence import depends_on_key, without_derivative
 from verifai_jax.problem.problem import Problem
+from verifai_jax.problem.silent_mistakes import formula_notes
 from verifai_jax.statistics.binomial import clopper_pearson
 
 if TYPE_CHECKING:
@@ -210,7 +211,8 @@ def _result(
     p0: float | None,
     seconds: float,
 ) -> Estimate:
-    notes = [text for text in (limit_state.own_chance,) if text] + list(answer.notes)
+    notes = [text for text in (limit_state.own_chance, *formula_notes(problem)) if text]
+    notes += answer.notes
     bound = answer.prior.upper_bound(plan.confidence)
     high = answer.high
     if answer.prior.no_verdict and answer.method in WEIGHTED:

@@ -31,6 +31,7 @@ from verifai_jax.evaluation.remarks import Remarks
 from verifai_jax.evaluation.verdicts import RowVerdict, Verdicts, violations
 from verifai_jax.mtl.setting import period
 from verifai_jax.problem.problem import Problem
+from verifai_jax.problem.silent_mistakes import formula_notes
 from verifai_jax.systems.base import Outcome, System, outcome_of
 from verifai_jax.systems.blackbox._blackbox import plain_leaves
 
@@ -81,12 +82,13 @@ class HostEngine:
         self.compile_seconds = 0.0
         self.simulation_seconds = 0.0
         self.remarks = Remarks()
+        self.formula_notes: tuple[str, ...] = ()
         self._prepare = jax.jit(self._prepared)
 
     @property
     def notes(self) -> tuple[str, ...]:
         """Notes of the simulations so far, with their counts."""
-        return self.remarks.texts
+        return (*self.formula_notes, *self.remarks.texts)
 
     def begin_compiling(self) -> None:
         """Do nothing; see `compile`."""
@@ -229,8 +231,12 @@ class HostEngine:
         try:
             for index, outcome in self._outcomes(each, [int(seeds[i]) for i in todo]):
                 self.simulation_seconds = time.perf_counter() - started
-                said = outcome.trace.notes if isinstance(outcome.trace, Trace) else {}
-                self.remarks.add(said)
+                if isinstance(outcome.trace, Trace):
+                    if not self.remarks.simulations and self.problem.form() is None:
+                        self.formula_notes = formula_notes(self.problem, outcome.trace)
+                    self.remarks.add(outcome.trace.notes)
+                else:
+                    self.remarks.add({})
                 waiting.add(todo[index], outcome)
         finally:
             # Also when interrupted: what has been simulated goes into the journal.

@@ -27,6 +27,8 @@ ENOUGH = 32
 """Minimum number of simulations with a verdict for a note on a common property."""
 MAX_SAMPLES = 5_000_000
 """Maximum samples of a batch that is simulated for the nominal features alone."""
+NEARLY_ALL = 0.95
+"""Share of the prior that violates the property, above which that is hardly meant."""
 HARDLY_MOVES = 0.05
 """Range of the robustness, as a share of its least value, that counts as no change."""
 
@@ -124,6 +126,11 @@ def notes_after(
         return (
             f"all {count} simulations with a verdict violate the property: are the formula and "
             "its units right?",
+        )
+    if search.samples_prior and table.counts.violating > NEARLY_ALL * count:
+        return (
+            f"{table.counts.violating} of {count} simulations with a verdict violate the property, "
+            "nearly all of the prior: are the formula and its units right?",
         )
     if len(formulas) == 1:
         # The least robustness is known: most tables need not be read for it.

@@ -187,8 +187,24 @@ def explain_error(error: Exception, text: str) -> FormulaSyntaxError:
     expected |= set(getattr(error, "allowed", None) or ())
     words = [word for names, word in _GROUPS if names & expected]
     wanted = " or ".join(filter(None, (", ".join(words[:-1]), words[-1] if words else "")))
-    message = f"expected {wanted}, but found {found}{_misspelt_word(text[:position])}"
+    advice = _habit(text, position, bool(expected & {"NUMBER"})) or _misspelt_word(text[:position])
+    message = f"expected {wanted}, but found {found}{advice}"
     return FormulaSyntaxError(message, text, position, width)
+
+
+def _habit(text: str, position: int, operand: bool) -> str:
+    """Return advice on what is written otherwise elsewhere: `|x|`, and units of numbers."""
+    bars = re.match(r"\|([^|]+)\|", text[position:]) if operand else None
+    if bars:
+        return f"; write abs({bars[1].strip()}) for {bars[0]}"
+    number = re.search(r"(?<![\w.])([\d.]+)\s*$", text[:position])
+    unit = re.match(r"%|[A-Za-z][\w/^]*", text[position:])
+    if not (number and unit and unit[0] not in RESERVED):
+        return ""
+    return (
+        f"; if {unit[0]!r} is a unit, leave it out and give the number in the unit of the signal "
+        "(only deg and rad may follow a number)"
+    )
 
 
 def _misspelt_word(before: str) -> str:

@@ -32,6 +32,7 @@ class Row(NamedTuple):
     - `instant`: time of the deciding sample in seconds; NaN if there is none.
     - `explanation`: the predicate that decides at that time, with its margin.
     - `error`: the reason why there is no verdict.
+    - `note`: what the requirement says otherwise than it seems to, of a recording this long.
     """
 
     file: str
@@ -41,6 +42,7 @@ class Row(NamedTuple):
     instant: float = math.nan
     explanation: str = ""
     error: str = ""
+    note: str = ""
 
 
 @dataclass(frozen=True)
@@ -181,6 +183,9 @@ class Judgement(InNotebook):
         if (tightest := self.tightest) is not None and not failing:
             lines += ["", f"Tightest: {tightest.requirement} on {tightest.file}"]
             lines += [f"  {tightest.explanation}"] if tightest.explanation else []
+        noted = {(row.requirement, row.note): row.file for row in reversed(self.rows) if row.note}
+        for (requirement, note), file in reversed(noted.items()):
+            lines += ["", f"Note on {requirement}, as on {file}:", f"  {note}"]
         return "\n".join(lines)
 
     def __str__(self) -> str:

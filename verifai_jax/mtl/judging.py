@@ -31,6 +31,7 @@ from verifai_jax.mtl.recording import read
 from verifai_jax.mtl.requirements import Requirement, Requirements, requirements_of
 from verifai_jax.mtl.resampling import Method, Missing, resample, without_gaps
 from verifai_jax.mtl.setting import check_horizon
+from verifai_jax.mtl.shortfalls import shortfalls_in
 
 _signals = functools.lru_cache(1024)(Formula.signals)
 _text = functools.lru_cache(1024)(Formula.__str__)
@@ -176,7 +177,10 @@ def _row(
     # At a robustness of zero the comparison decides.
     holds = robustness > 0 or (robustness == 0 and float(values.first(formula, boolean=True)) > 0)
     instant, why = _decision(values, formula, clock) if reading.explain else (math.nan, "")
-    return Row(name, requirement.id, "holds" if holds else "fails", robustness, instant, why)
+    lasts = (values.length // values.stride - 1) * values.dt
+    falls = shortfalls_in(values.signals, formula, values.dt, lasts, reading.end)
+    verdict, note = "holds" if holds else "fails", "; ".join(map(str, falls))
+    return Row(name, requirement.id, verdict, robustness, instant, why, note=note)
 
 
 def _decision(

@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 
 from verifai_jax.core.messages.errors import nearest_names
-from verifai_jax.core.messages.text import counted, format_seconds, listed
+from verifai_jax.core.messages.text import counted, listed
 from verifai_jax.core.values.trace import Trace
 from verifai_jax.mtl import formula as ast
 from verifai_jax.mtl.bounds import predicates_of
@@ -30,6 +30,7 @@ from verifai_jax.mtl.host_values import HostValues
 from verifai_jax.mtl.recorded import Recordings, named_traces
 from verifai_jax.mtl.requirements import Requirement, Requirements, requirements_of
 from verifai_jax.mtl.rewriting import nnf, replaced
+from verifai_jax.mtl.shortfalls import Shortfall, shortfalls, shortfalls_in
 from verifai_jax.mtl.units import plain_unit, unit_of, units_of
 
 FAR, NEVER = 2.5, 0.5
@@ -101,10 +102,10 @@ class _Linter:
         dt = self.recordings[0].values.dt if self.recordings else 0.0
         spans = self.formula.asked(dt).items()
         self.asked = {part: span for part, span in spans if isinstance(part, Formula)}
-        found += [*self._first_sample(), *self._implications(), *self._without_effect()]
+        found += [*self._shortfalls(), *self._implications(), *self._without_effect()]
         if self.recordings:
             idle = {f.part for f in found if f.kind == "vacuous"}
-            found += [*self._beyond(), *self._predicates(idle), *self._witnesses()]
+            found += [*self._predicates(idle), *self._witnesses()]
         first: dict[tuple[str, str], Finding] = {}
         for finding in found:
             first.setdefault((finding.kind, finding.part), finding)
@@ -166,15 +167,24 @@ class _Linter:
         count = len(self.recordings)
         return "the recording" if count == 1 else f"any of {count} recordings"
 
-    def _first_sample(self) -> Check:
-        """Find operators that look back from the first sample, before which there is nothing."""
-        for part, (_, last) in self.asked.items():
-            if part.side == "back" and last <= part.span(0.0)[0]:
-                yield self._found(
-                    "window", part,
-                    f"{part} is evaluated only at the first sample, before which there is nothing",
-                    f"Write always ({part}) if it is meant at every instant.",
-                )  # fmt: skip
+    def _shortfalls(self) -> Check:
+        """Find windows that the ends of recordings cut, and parts that one sample decides."""
+        found: dict[tuple[str, Formula], tuple[Shortfall, list[str]]] = {}
+        for each in self.recordings:
+            signals, dt = each.values.signals, each.values.dt
+            for fall in shortfalls_in(signals, self.formula, dt, each.duration, self.end):
+                found.setdefault((fall.kind, fall.part), (fall, []))[1].append(each.name)
+        if not self.recordings:
+            found = {(each.kind, each.part): (each, []) for each in shortfalls(self.formula)}
+        for fall, names in found.values():
+            if 2 * len(names) < len(self.recordings):
+                continue
+            where = f"{len(names)} of {counted(len(self.recordings), 'recording')}"
+            said = f"{fall.sentence}, in {where}, such as {names[0]}" if names else fall.sentence
+            advice = f"Probably meant: {fall.meant}" if fall.meant else ""
+            if fall.kind == "beyond":
+                advice = "Times are in seconds unless a unit follows, as in [0, 500 ms]."
+            yield self._found("window", fall.part, said, advice)
 
     def _implications(self) -> Check:
         """Find implications that mean nothing: under eventually, or whose left side never holds."""
@@ -247,23 +257,6 @@ class _Linter:
         """Return whether no trace is found on which two formulas differ."""
         differ = (drawn.truth(one) > 0) != (drawn.truth(other) > 0)
         return not differ.any() and free_difference(one, other, end=self.end) is None
-
-    def _beyond(self) -> Check:
-        """Find windows that begin or end after the recordings, even where they are first asked."""
-        for part, (first, _) in self.asked.items():
-            if part.side != "ahead" or not part.operator.timed:
-                continue
-            start, last = part.interval.start, part.interval.end
-            reach = first + (last if math.isfinite(last) else start)
-            short = [e for e in self.recordings if reach > e.duration + 1.01 * e.values.dt]
-            if 2 * len(short) >= len(self.recordings):
-                yield self._found(
-                    "window", part,
-                    f"{part} looks {format_seconds(reach)} ahead, and "
-                    f"{len(short)} of {counted(len(self.recordings), 'recording')} end before: "
-                    f"{short[0].name} lasts {format_seconds(short[0].duration)}",
-                    "Times are in seconds unless a unit follows, as in [0, 500 ms].",
-                )  # fmt: skip
 
     def _predicates(self, idle: set[str]) -> Check:
         """Find predicates that never hold, and those whose bound no value comes near."""

@@ -8,7 +8,7 @@
 A text is parsed once. In the tree a numeric parameter is a signal named `?d`, and a time parameter
 is a float that no text contains; a walk over the tree substitutes values for them.
 
-The file `templates.toml` is a library of requirements that people often write, with their sources:
+The file `templates.toml` is a library of requirements that people often write:
 
     (gap,) = templates("time-gap")
     gap.requirement(time_gap=1.2)                # a Requirement with another constant
@@ -253,10 +253,10 @@ class Template:
     - `domain`: its field, such as `"driving"`, `"flight"`, `"medical"`.
     - `text`: the sentence that the formula formalises.
     - `expression`: the formula as text, with names of `constants`.
-    - `source`: a standard or a paper, with its number.
+    - `source`: a paper that has the idea, a benchmark, or what kind of document decides.
     - `signals`: units of the signals by name; `"1"` for flags and ratios.
     - `unit`: the unit of the robustness, if it has one.
-    - `example`: whether the source gives only the form, so that the numbers are examples.
+    - `example`: whether the numbers are examples.
     """
 
     id: str

@@ -41,7 +41,7 @@ class Node(ForUsers):
     """A node of a tree; nodes are compared by kind and fields."""
 
     _internal = frozenset((
-        "asked", "below", "children", "compared", "depth", "first_look_ahead", "interval",
+        "asked", "below", "children", "compared", "depth", "interval",
         "is_predicate", "is_signal", "meaning", "number", "operands", "operator", "side", "span",
         "temporal_depth", "terms", "text", "timeless", "valued", "word",
     ))  # fmt: skip
@@ -223,20 +223,6 @@ class Tree(Node):
                 below = max((reach[id(p)] for p in part.valued()), default=0.0)
                 reach[id(part)] = below + (part.span(dt)[1] if part.side == side else 0.0)
         return reach[id(self)]
-
-    def first_look_ahead(self, dt: float, start: float = 0.0) -> float:
-        """Return the end of the latest window if each operator is evaluated at its first instant.
-
-        Unbounded windows end with the trace and are ignored.
-
-        **Arguments:**
-        - `dt`: sampling period in seconds, by which `next` looks ahead.
-        - `start`: instant at which the formula is evaluated, in seconds.
-        """
-        first, last = self.span(dt) if self.side == "ahead" else (0.0, 0.0)
-        latest = start + (last if math.isfinite(last) else first)
-        below = [part.first_look_ahead(dt, start + first) for part in self.valued()]
-        return max([latest, *below])
 
     def asked(self, dt: float = 0.0) -> dict["Tree", tuple[float, float]]:
         """Return the interval in seconds in which each part is evaluated if the whole is at 0.

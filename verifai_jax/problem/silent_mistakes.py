@@ -7,7 +7,6 @@ is not a function of its features and its key. Nothing compiles: the system is t
 takes a fraction of a second. Only certain mistakes are reported.
 """
 
-import math
 import time
 from collections.abc import Iterator
 from typing import Any, TypeAlias
@@ -20,18 +19,15 @@ from jaxtyping import PyTree
 from verifai_jax.core.compute.compilation import Slot
 from verifai_jax.core.compute.fingerprint import PROGRAM, used_inputs
 from verifai_jax.core.compute.precision import truncate_silently
-from verifai_jax.core.messages.text import format_seconds
 from verifai_jax.core.user_code.user_errors import source_line
+from verifai_jax.core.values.trace import Trace
 from verifai_jax.features import Domain
+from verifai_jax.mtl.shortfalls import shortfalls
 from verifai_jax.problem.problem import Problem
 from verifai_jax.systems.base import System
 
 PATIENCE = 1.0
 """Seconds of a first tracing above which there is no second one."""
-END_OF_TRACE = {
-    "hold": "its last sample is taken for all that comes after",
-    "truncate": "what comes after is left out",
-}
 COMPARED = ". A Categorical of texts has the place of the choice as its value, which no text equals"
 """Advice on a choice that seems to be read: a comparison with a text is false, silently."""
 MISTAKES: Slot[None, tuple[str, ...]] = Slot("silent mistakes")
@@ -49,29 +45,27 @@ def silent_mistakes(problem: Problem) -> tuple[str, ...]:
     """
 
     def found() -> tuple[str, ...]:
-        return (*beyond_the_trace(problem), *mistakes_of_the_system(problem))
+        return (*formula_notes(problem), *mistakes_of_the_system(problem))
 
     return problem.programs.get(MISTAKES, None, found)
 
 
-def beyond_the_trace(problem: Problem) -> Iterator[str]:
-    """Yield the formulas that look beyond the end of a whole trace already at its first instant.
+def formula_notes(problem: Problem, trace: Trace | None = None) -> tuple[str, ...]:
+    """Return a sentence for each part of a formula that says less, or more, than it seems to say.
 
-    Evaluated at later instants many formulas look beyond the end: sliding windows do.
+    **Arguments:**
+    - `trace`: a simulation, for a problem whose traces are not known before.
     """
-    form, duration = problem.form(), problem.duration
-    if form is None or form.dt is None or duration is None or problem.end not in END_OF_TRACE:
-        return
-    for name, formula in problem.formulas.items():
-        ahead = formula.first_look_ahead(form.dt)
-        # A trace of n samples lasts n - 1 periods, and many count n.
-        if math.isfinite(ahead) and ahead > duration + 1.01 * form.dt:
-            which = "the formula" if len(problem.formulas) == 1 else f"formula {name!r}"
-            yield (
-                f"{which} looks {format_seconds(ahead)} ahead and a trace lasts "
-                f"{format_seconds(duration)}: "
-                f"{END_OF_TRACE[problem.end]}"
-            )
+    known = problem.form() or trace
+    length = None if known is None else known.length
+    dt = (known and known.dt) or 0.0
+    duration = None if length is None or not (dt or length == 1) else (length - 1) * dt
+    # A black box whose traces are not known may return single samples.
+    return tuple(
+        f"in {'the formula' if len(problem.formulas) == 1 else f'formula {name!r}'}, {fall}"
+        for name, formula in problem.formulas.items()
+        for fall in (() if known is None else shortfalls(formula, dt, duration, problem.end))
+    )
 
 
 def mistakes_of_the_system(problem: Problem) -> Iterator[str]:

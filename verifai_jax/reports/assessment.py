@@ -2,12 +2,10 @@
 
     with_assessment(page)                           # the page with three sections more
 
-The steps are those of FDA, Assessing the Credibility of Computational Modeling and Simulation in
-Medical Device Submissions (November 2023). A step refers to the parts of the report that answer it.
-All other questions get an empty box, since the tool cannot know the answers.
+The steps are questions that assessors of simulations ask. A step refers to the parts of the report
+that answer it. All other questions get an empty box, since the tool cannot know the answers.
 
-The claims are drawn as a tree in Goal Structuring Notation. Source: Goal Structuring Notation
-Community Standard, version 3 (SCSC-141C, 2021): goals are rectangles, a strategy is a
+The claims are drawn as a tree in Goal Structuring Notation: goals are rectangles, a strategy is a
 parallelogram, solutions are circles, assumptions are ellipses with an A, the context is a rounded
 rectangle, and a diamond marks a goal that is not developed.
 """

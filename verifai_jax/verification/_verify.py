@@ -10,6 +10,7 @@ from verifai_jax.core.messages.checks import check_count, check_fraction, check_
 from verifai_jax.core.messages.errors import suggests_options
 from verifai_jax.features.continuous import OUTERMOST
 from verifai_jax.problem.problem import Problem
+from verifai_jax.problem.silent_mistakes import formula_notes
 from verifai_jax.verification.boxes import Boxes
 from verifai_jax.verification.branch_and_bound import BranchAndBound
 from verifai_jax.verification.continuous import between_samples
@@ -112,7 +113,10 @@ def verify(
         simulations=work.evaluator.simulations + (0 if before is None else before.simulations),
         seconds=seconds + (0 if before is None else before.seconds),
         stopped=stopped,
-        notes=(f"{work.contradicted} {CONTRADICTED}",) if work.contradicted else (),
+        notes=(
+            *([f"{work.contradicted} {CONTRADICTED}"] if work.contradicted else []),
+            *formula_notes(problem),
+        ),
         continuous=continuous,
         version=__version__,
         sources=sources.settled(begun).to_json(),

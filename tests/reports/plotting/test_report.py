@@ -203,6 +203,29 @@ def test_the_bounds_of_all_formulas_are_solved_for_their_signals(tmp_path):
 
 
 @pytest.mark.thorough
+def test_only_instants_that_a_formula_asks_about_are_shaded():
+    specs = {
+        "window": "always[1, 2] abs(y) < 1",  # broken from 1 s on, and not yet at 0.75 s
+        "nested": "eventually[0, 0.5] always[0, 0.5] z > 1.5",
+        "response": "always (gear == 2 -> hit > 0)",
+    }
+    problem = vj.Problem("p", {"a": vj.Box(2, 3)}, ramp, specs)
+    figure = vj.falsify(problem, "uniform", 4, batch=4).replay(0).plot()
+    panels = dict(zip([a.get_ylabel() for a in figure.axes], figure.axes, strict=True))
+
+    def shaded(name):
+        ends = np.concatenate(
+            [path.vertices[:, 0] for path in panels[name].collections[0].get_paths()]
+        )
+        return ends.min(), ends.max()
+
+    assert shaded("y") == pytest.approx((0.875, 2))
+    assert shaded("z") == pytest.approx((0, 1.125))
+    assert shaded("hit") == pytest.approx((1.125, 2))
+    assert not panels["gear"].collections
+
+
+@pytest.mark.thorough
 def test_many_monitored_signals_leave_room_for_the_inputs():
     space = {"air": vj.Struct({"wind": vj.Signal(vj.Box(1, 2), knots=2, duration=1.0)})}
     spec = "always (s0 + s1 + s2 + s3 + s4 + s5 + s6 < 900)"

@@ -34,6 +34,7 @@ from verifai_jax.evaluation.confirmer import LIMIT, MORE, REPEATED, SHARE_REPEAT
 from verifai_jax.features import FeatureSpace
 from verifai_jax.problem.dependence import depends_on_key
 from verifai_jax.problem.problem import Problem
+from verifai_jax.problem.silent_mistakes import formula_notes
 from verifai_jax.search import Search
 from verifai_jax.statistics.confidence_sequences import simultaneous_interval, verdict
 
@@ -166,7 +167,12 @@ def certify(
         budget=budget,
         stopped=stopped,
         seconds=time.perf_counter() - started,
-        notes=(*notes, *blocks.notes, *_chance(blocks.problem, rows)),
+        notes=(
+            *formula_notes(blocks.problem),
+            *notes,
+            *blocks.notes,
+            *_chance(blocks.problem, rows),
+        ),
         sources=blocks.sources.settled(begun).to_json(),
     )
 

@@ -31,6 +31,7 @@ from verifai_jax.evaluation.backends import resolved
 from verifai_jax.evaluation.evaluator import Evaluator
 from verifai_jax.features import Domain, FeatureSpace
 from verifai_jax.problem.problem import Problem, ProblemError
+from verifai_jax.problem.silent_mistakes import formula_notes
 from verifai_jax.statistics.paired_rates import PairedRates, paired_rates
 
 BLOCK = 1024
@@ -310,7 +311,7 @@ def _held(space: FeatureSpace) -> dict[str, str]:
 
 def _notes(baseline: Problem, candidates: Mapping[str, Problem]) -> tuple[str, ...]:
     own = {name: str(formula) for name, formula in baseline.formulas.items()}
-    notes = []
+    notes = [*formula_notes(baseline)]
     held = _held(baseline.space)
     for name, problem in candidates.items():
         for feature, value in _held(problem.space).items():

@@ -29,6 +29,7 @@ from verifai_jax.evaluation.evaluator import Evaluator
 from verifai_jax.evaluation.verdicts import Verdicts
 from verifai_jax.falsification.validation import check_search
 from verifai_jax.problem.problem import Problem, ProblemError
+from verifai_jax.problem.silent_mistakes import formula_notes
 from verifai_jax.search import Search
 from verifai_jax.search.proposals import Proposals
 from verifai_jax.search.uniform import Uniform
@@ -132,7 +133,7 @@ def transfer(
         stopped=stopped,
         seconds=time.perf_counter() - started,
         seed=seed,
-        notes=(*notes, *pairs.notes),
+        notes=(*formula_notes(problems[0]), *notes, *pairs.notes),
         sources={n: p.sources().to_json() for n, p in zip("ab", problems, strict=True)},
     )
 

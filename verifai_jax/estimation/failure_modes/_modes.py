@@ -49,6 +49,7 @@ from verifai_jax.falsification.run import Run
 from verifai_jax.features import FeatureSpace
 from verifai_jax.problem.dependence import depends_on_key, without_derivative
 from verifai_jax.problem.problem import Problem
+from verifai_jax.problem.silent_mistakes import formula_notes
 from verifai_jax.statistics.binomial import clopper_pearson
 
 DIVIDING, MAX_DIVIDING = 0.25, 6500
@@ -147,6 +148,7 @@ def modes(
         divided = _divide(limit_state, held, rng, answer, _failures_of(source), problem.black_box)
     bound = answer.prior.upper_bound(confidence)
     listed, rest, run, unexplained, notes = (), 0.0, None, (0.0, 1.0), list(answer.notes)
+    notes[:0] = formula_notes(problem)
     if limit_state.own_chance:
         notes.insert(
             0,

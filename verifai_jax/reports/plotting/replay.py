@@ -16,7 +16,8 @@ from verifai_jax.core.messages.text import format_seconds, shorten
 from verifai_jax.core.values.trace import Status, Trace
 from verifai_jax.core.values.waveform import HELD, is_waveform
 from verifai_jax.evaluation.replay import Replay
-from verifai_jax.mtl import Expression, Formula, explain, nnf, robustness_signal
+from verifai_jax.mtl import Expression, Formula, explain, robustness_signal
+from verifai_jax.mtl.blame import broken_at
 from verifai_jax.mtl.bounds import predicates_of, signal_bounds
 from verifai_jax.mtl.evaluate import End
 from verifai_jax.mtl.expression import constant_value
@@ -80,7 +81,7 @@ def plot_replay(
     name = replay.worst
     clock = np.asarray(trace.clock())
     decisive = decisive_instant(formulas[name], trace, replay.problem.end)
-    to_blame, held = _predicates_to_blame(replay), _held(replay)
+    broken, held = _broken(replay), _held(replay)
     figure = new_figure(figsize=(8, 1.2 + 1.45 * len(shown)))
     panels = figure.subplots(len(shown), 1, sharex=True, squeeze=False).ravel()
     for axes, signal in zip(panels, shown, strict=True):
@@ -98,12 +99,11 @@ def plot_replay(
         said = "" if decisive is None or decisive[0] != signal else _mark(axes, trace, *decisive)
         for predicate, limits in _bounds(replay, signal, shown).items():
             margin = np.asarray(robustness_signal(predicate, trace, end=replay.problem.end))
-            fails = margin < 0
-            blamed = predicate in to_blame
             _draw_limits(axes, trace, values, limits)
-            if blamed:
-                _shade(axes, clock, fails)
-            color = (FAILING if blamed else BOUND) if fails.any() else SAFE
+            color = BOUND if (margin < 0).any() else SAFE
+            if predicate in broken:
+                color = FAILING
+                _shade(axes, clock, broken[predicate])
             named[str(predicate)] = (color, float(margin.min()))
         _name_bounds(axes, named, said)
         if decisive is not None:
@@ -235,17 +235,17 @@ def _bounds(replay: Replay, signal: str, shown: Sequence[str]) -> dict[Formula, 
     return bounds
 
 
-def _predicates_to_blame(replay: Replay) -> set[Formula]:
-    """Return the predicates of violated formulas that should have held.
-
-    Not those of an implication's condition, nor of formulas that are kept without them.
-    """
-    blamed = set()
+def _broken(replay: Replay) -> dict[Formula, Bool[np.ndarray, " t"]]:
+    """Return the instants at which predicates break a formula, of all formulas together."""
+    found: dict[Formula, Bool[np.ndarray, " t"]] = {}
     for name, formula in replay.problem.formulas.items():
         rho = replay.rho[name]
         if rho < 0 or (rho == 0 and replay.violated):
-            blamed |= set(predicates_of(nnf(formula)))
-    return blamed
+            for part, at in broken_at(formula, replay.trace, replay.problem.end).items():
+                # A trace that ended early stays as it is.
+                at = np.pad(at, (0, replay.trace.length - len(at)))
+                found[part] = found.get(part, at) | at
+    return found
 
 
 def _draw_limits(
@@ -271,16 +271,17 @@ def _draw_limits(
 
 def _shade(axes: Axes, clock: Float[np.ndarray, " t"], fails: Bool[np.ndarray, " t"]) -> None:
     """Shade the instants at which a predicate fails."""
+    edges = np.concatenate([clock[:1], (clock[1:] + clock[:-1]) / 2, clock[-1:]])
+    # From edge to edge, so that a single instant is seen, too.
     axes.fill_between(
-        clock,
+        np.repeat(edges, 2)[1:-1],
         0,
         1,
-        where=fails,
+        where=np.repeat(fails, 2).tolist(),
         transform=axes.get_xaxis_transform(),
         color=FAILING,
         alpha=0.13,
         linewidth=0,
-        step="mid",
     )
 
 

@@ -11,6 +11,7 @@ assert run.best["rho"] > -0.5                    # further demands on the run
 import contextlib
 import functools
 import inspect
+import warnings
 from collections.abc import Callable, Iterator, Mapping
 from contextvars import ContextVar
 from dataclasses import dataclass, field, replace
@@ -20,6 +21,7 @@ from typing import Any
 from verifai_jax.core.messages.errors import suggests_options
 from verifai_jax.core.user_code.targets import definitions, load_target
 from verifai_jax.problem.problem import Problem
+from verifai_jax.problem.silent_mistakes import formula_notes
 from verifai_jax.search import Search
 from verifai_jax.testing.checking.check import BUDGET, Check, CheckOutcome, CounterexampleFound
 
@@ -110,6 +112,8 @@ def run_check(
     now.outcomes.append(outcome)
     if outcome.failed:
         raise CounterexampleFound(outcome)
+    for note in formula_notes(problem):  # What a test that passes prints is seen by nobody.
+        warnings.warn(f"{problem.name}: {note}", stacklevel=2)
     if outcome.replayed is not None:
         print(outcome.replayed)
     print(outcome)

@@ -32,6 +32,7 @@ from verifai_jax.estimation.certification import Certificates, certify
 from verifai_jax.estimation.comparison import Comparison, compare
 from verifai_jax.features import Categorical
 from verifai_jax.problem.problem import Problem
+from verifai_jax.problem.silent_mistakes import formula_notes
 from verifai_jax.rl import PPO, Algorithm, evaluate
 from verifai_jax.search import Search
 from verifai_jax.statistics.confidence_sequences import safe_at
@@ -322,7 +323,7 @@ class Work:
 
     def _result(self, stopped: str, began: float) -> Hardening:
         """Choose a policy, certify it and the first on fresh samples, and compare both in pairs."""
-        plan, notes = self.plan, []
+        plan, notes = self.plan, [*formula_notes(self.untrained)]
         chosen = {arm: self._choice(arm) for arm in self.arms_named}
         comparison: Comparison | None = None
         if at := chosen[HARDENED]:
