@@ -85,6 +85,7 @@ def watch(root: object, trace: Callable[[], Any], twice: bool = True) -> Watched
 
 def why_differs(kept: list[str]) -> str:
     """Write why calls of a function differ that change these."""
+    kept = [name for name in kept if name != CHANCE]
     if not kept:
         return "computes with other numbers each time that it is called"
     return f"keeps {' and '.join(kept[:4])} from one call to the next"

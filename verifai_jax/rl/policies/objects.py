@@ -24,7 +24,7 @@ from jaxtyping import Array, ArrayLike, Key, PyTree
 from verifai_jax.core.compute.purity import AS_MEMORY, watch, why_differs
 from verifai_jax.core.messages.errors import require
 from verifai_jax.core.messages.text import format_seconds, one_line
-from verifai_jax.core.user_code.kept_state import CHANCE, changed, state_of
+from verifai_jax.core.user_code.kept_state import changed, holds_tracer, state_of
 from verifai_jax.core.user_code.user_errors import defined_at
 from verifai_jax.rl.policies.base import Policy
 from verifai_jax.rl.policies.errors import PolicyError
@@ -166,12 +166,17 @@ class _Function:
     def __call__(self, weights: PyTree, observation: PyTree, memory: None) -> tuple[Any, None]:
         key = str(jax.tree.map(lambda o: (jnp.shape(o), str(jnp.result_type(o))), observation))
         if key not in self.forms:
+            before = state_of(self.function)
             try:
                 pure_program(self.function, observation)
                 self.forms[key] = None
             except PolicyError:
                 raise
             except Exception as error:
+                after = state_of(self.function)
+                held = [name for name in changed(before, after) if holds_tracer(after, name)]
+                if held:
+                    raise _impure(self.function, why_differs(held)) from error
                 self.forms[key] = self._form(observation, error)
         if self.forms[key] is None:
             return jax.tree.map(jnp.asarray, without_extras(self.function(observation))), None
@@ -203,7 +208,7 @@ class _Function:
         kept = changed(before, state_of(self.function))
         same = map(np.array_equal, jax.tree.leaves(action), jax.tree.leaves(again))
         if not all(same):
-            raise _impure(self.function, why_differs([n for n in kept if n != CHANCE]))
+            raise _impure(self.function, why_differs(kept))
         log.warning(
             "the policy%s runs in Python, %s a call, because JAX cannot trace it: %s",
             defined_at(self.function),
@@ -244,10 +249,9 @@ def pure_program(function: Callable[..., Any], *arguments: PyTree) -> Any:
 
 def _impure(function: Callable[..., Any], why: str) -> PolicyError:
     return PolicyError(
-        f"the policy{defined_at(function)} {why}, and a policy is a pure function of the "
-        f"observation. {AS_MEMORY}. An object with a method reset() may be given to vj.gymnasium "
-        "itself, without vj.policy; random numbers come from the key of a function "
-        "(observation, key)"
+        f"the policy{defined_at(function)} {why}, and vj.policy takes functions of the observation "
+        "alone, or of (observation, key) with a random key. An object with a method reset() may be "
+        f"given to vj.gymnasium without vj.policy. {AS_MEMORY}"
     )
 
 
