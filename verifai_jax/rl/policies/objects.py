@@ -10,9 +10,9 @@ import json
 import logging
 import time
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
@@ -55,14 +55,14 @@ def from_object(source: object, observation: ArrayLike | None, batched: bool) ->
         and callable(getattr(source[0], "apply", None))
     ):
         module, variables = source
-        return Policy(variables, _Applied(module))
+        return Policy(variables, _Of(_linen, (module,)))
     if _is_a(source, "flax.nnx.module", "Module"):
         nnx = require("flax.nnx", extra="policies")
         # A copy, so that the user's stays in training.
         evaluated = nnx.merge(*nnx.split(source))
         evaluated.eval()
         graph, state = nnx.split(evaluated)
-        return Policy(state, _Merged(graph))
+        return Policy(state, _Of(_nnx, (graph,)))
     if not callable(source):
         raise PolicyError(
             "a policy is a file, a model or a function of the observation; got "
@@ -76,7 +76,7 @@ def from_object(source: object, observation: ArrayLike | None, batched: bool) ->
         rest = tuple(
             None if a is not None else leaf for a, leaf in zip(arrays, leaves, strict=True)
         )
-        return Policy(arrays, _Rebuilt(structure, rest))
+        return Policy(arrays, _Of(partial(_rebuilt, structure, rest)))
     if count_required(source) == 2:
         return RandomPolicy((), _Function(source, batched))
     return Policy((), _Function(source, batched))
@@ -105,47 +105,44 @@ jax.tree_util.register_dataclass(
 
 
 @dataclass(frozen=True)
-class _Applied:
-    """The function of a flax module of the linen kind."""
+class _Of:
+    """The function of a network without memory: `function(*fixed, weights, observation)`."""
 
-    module: Any
+    function: Callable[..., Any]
+    fixed: tuple[Any, ...] = ()
 
     def __call__(self, weights: PyTree, observation: PyTree, memory: None) -> tuple[Any, None]:
-        takes = inspect.signature(type(self.module).__call__).parameters
-        known = {"train": False, "training": False, "is_training": False, "deterministic": True}
+        return without_extras(self.function(*self.fixed, weights, observation)), None
+
+
+def _linen(module: Any, variables: PyTree, observation: PyTree) -> Any:
+    takes = inspect.signature(type(module).__call__).parameters
+    known = {"train": False, "training": False, "is_training": False, "deterministic": True}
+    try:
         options = {name: value for name, value in known.items() if name in takes}
-        try:
-            return without_extras(self.module.apply(weights, observation, **options)), None
-        except Exception as error:
-            if not type(error).__module__.startswith("flax"):
-                raise
-            raise PolicyError(
-                f"{type(self.module).__name__} cannot be applied to an observation, as a module "
-                f"that is in training cannot: {one_line(str(error))[:300]}"
-            ) from error
+        return module.apply(variables, observation, **options)
+    except Exception as error:
+        if not type(error).__module__.startswith("flax"):
+            raise
+        raise PolicyError(
+            f"{type(module).__name__} cannot be applied to an observation, as if it were in "
+            f"training: {one_line(str(error))[:300]}"
+        ) from error
 
 
-@dataclass(frozen=True)
-class _Merged:
-    """The function of a flax module of the nnx kind."""
-
-    graph: Any
-
-    def __call__(self, weights: PyTree, observation: PyTree, memory: None) -> tuple[Any, None]:
-        nnx = require("flax.nnx", extra="policies")
-        return without_extras(nnx.merge(self.graph, weights)(observation)), None
+def _nnx(graph: Any, state: PyTree, observation: PyTree) -> Any:
+    return require("flax.nnx", extra="policies").merge(graph, state)(observation)
 
 
-@dataclass(frozen=True, eq=False)
-class _Rebuilt:
-    """The function of a callable pytree, such as a module of equinox."""
+def _rebuilt(
+    structure: Any, rest: tuple[Any, ...], weights: Sequence[Any], observation: PyTree
+) -> Any:
+    leaves = [r if w is None else w for w, r in zip(weights, rest, strict=True)]
+    return jax.tree.unflatten(structure, leaves)(observation)
 
-    structure: Any
-    rest: tuple[Any, ...]
 
-    def __call__(self, weights: PyTree, observation: PyTree, memory: None) -> tuple[Any, None]:
-        leaves = [r if w is None else w for w, r in zip(weights, self.rest, strict=True)]
-        return without_extras(jax.tree.unflatten(self.structure, leaves)(observation)), None
+def _brax(make: Callable[..., Any], weights: PyTree, observation: PyTree) -> Any:
+    return make(weights, deterministic=True)(observation, jax.random.key(0))
 
 
 @dataclass(frozen=True, eq=False)
@@ -355,15 +352,4 @@ def read_brax(folder: Path) -> Policy:
         raise PolicyError(
             f"{folder} holds no checkpoint of Brax' PPO: {one_line(str(error))[:300]}"
         ) from error
-    return Policy(weights, _Inference(networks.make_inference_fn(made)))
-
-
-@dataclass(frozen=True, eq=False)
-class _Inference:
-    """The function of a policy of Brax: `make(weights, deterministic)` gives its inference."""
-
-    make: Callable[..., Any]
-
-    def __call__(self, weights: PyTree, observation: PyTree, memory: None) -> tuple[Any, None]:
-        action, _ = self.make(weights, deterministic=True)(observation, jax.random.key(0))
-        return action, None
+    return Policy(weights, _Of(_brax, (networks.make_inference_fn(made),)))

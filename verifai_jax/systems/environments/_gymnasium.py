@@ -329,9 +329,10 @@ class EpisodeFunction:
             self._decide = episode_signals.host_policy_function(self.policy)
         sees = policy_that_sees(self.policy) is not None
         options = {"features": features_at(features, time)} if sees else {}
+        before = None if self._first is None or self._first else state_of(self.policy)
         action = self._decided(observation, options)
         if self._first is not None and len(self._first) < REPEATED:
-            self._first.append(copy.deepcopy((observation, options, action)))
+            self._first.append((*copy.deepcopy((observation, options, action)), before))
         try:
             return fit(env.action_space, action, self.clip)
         except Misfit as misfit:
@@ -353,13 +354,12 @@ class EpisodeFunction:
 
     def _check_repeats(self) -> None:
         """Refuse a policy that acts otherwise in a second episode of the same observations."""
-        first, self._first = self._first, []
-        before = state_of(self.policy)
+        first, self._first = self._first or (), []
         self._begin_policy()
-        for observation, options, action in first or ():
+        for observation, options, action, _ in first:
             again = self._decided(observation, options)
             if not all(map(_close, jax.tree.leaves(action), jax.tree.leaves(again))):
-                kept = changed(before, state_of(self.policy))
+                kept = changed(first[0][-1], state_of(self.policy))
                 resets = callable(getattr(self.policy, "reset", None))
                 raise ValueError(
                     f"the policy of {self.name}{defined_at(self.policy)} {why_differs(kept)}: with "
