@@ -19,7 +19,7 @@ from jaxtyping import Array, Float, Key
 
 from verifai_jax.core.compute.compilation import ProgramCache, Slot
 from verifai_jax.core.compute.precision import truncate_silently
-from verifai_jax.core.compute.purity import AS_MEMORY, BY_KEY, TRACED_ONCE, watch
+from verifai_jax.core.compute.purity import TRACED_ONCE, watch
 from verifai_jax.core.display.lazy import lazy_import
 from verifai_jax.core.display.notebook import InNotebook, text_html
 from verifai_jax.core.messages.checks import check_name
@@ -350,31 +350,32 @@ class Problem(InNotebook):
         features, key = self.space.feature_form, jax.eval_shape(lambda: jax.random.key(0))
         # A new function each time: JAX remembers what it traced by the function.
         program = lambda: jax.make_jaxpr(lambda *a: self.system(*a), return_shape=True)  # noqa: E731
-        plain = not self.black_box and traced_by_default(self.system)
+        watched = None
         try:
-            if self.black_box:
-                return self.system.abstract(features)
-            watched = watch(
-                self.system,
-                lambda: program()(features, key) if plain else self.system.abstract(features),
-            )
+            if self.black_box or not traced_by_default(self.system):
+                trace = self.system.abstract(features)
+            else:
+                watched = watch(self.system, lambda: program()(features, key))
+                trace = watched.result[1]
         except Exception as error:
             raise self._wrong_system(error, features) from error
-        self.programs.get(KEPT, None, lambda: watched.kept)
-        if watched.why_impure:
+        if trace is None and self.black_box:
+            return None
+        if watched is not None and watched.why_impure:
             raise ProblemError(
-                f"the system of problem {self.name!r} {watched.why_impure}. {TRACED_ONCE}. "
-                f"{AS_MEMORY if watched.kept else BY_KEY}; or make the system a vj.blackbox, which "
-                "JAX does not trace"
+                f"the system of problem {self.name!r} {watched.remedy}; or make the system a "
+                "vj.blackbox, which JAX does not trace"
             )
-        traced, trace = watched.result if plain else (None, watched.result)
         if not isinstance(trace, Trace):
             function = getattr(self.system, "__wrapped__", self.system)
             raise ProblemError(
                 f"the system of problem {self.name!r} must return a Trace; "
                 f"it returned {type(trace).__name__}{defined_at(function)}"
             )
-        if traced is not None and (alone := why_not_batched(traced.jaxpr)) is not None:
+        if watched is None:
+            return trace
+        self.programs.get(KEPT, None, lambda: watched.kept)
+        if (alone := why_not_batched(watched.result[0].jaxpr)) is not None:
             raise ProblemError(
                 f"the system of problem {self.name!r} cannot be simulated in batches: {alone}"
             )

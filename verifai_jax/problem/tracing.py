@@ -1,4 +1,4 @@
-"""What is asked of a system when JAX has traced it.
+"""Questions about a system that JAX traces.
 
 traced_by_default(system)                           # whether JAX traces the system itself
 why_not_batched(program)                            # what jax.vmap refuses, and the remedy

@@ -1,4 +1,4 @@
-"""Whether a function that JAX traces is a function of its arguments alone.
+"""The check that a function that JAX traces is a function of its arguments alone.
 
     watched = watch(system, lambda: jax.make_jaxpr(lambda *a: system(*a))(features, key))
     watched.why_impure                                  # "it keeps attribute 'integral' of PID ..."
@@ -44,6 +44,11 @@ class Watched:
     result: Any
     kept: tuple[str, ...] = ()
     why_impure: str | None = None
+
+    @property
+    def remedy(self) -> str:
+        """Why it is impure, and what to do about it."""
+        return f"{self.why_impure}. {TRACED_ONCE}. {AS_MEMORY if self.kept else BY_KEY}"
 
 
 def watch(root: object, trace: Callable[[], Any], twice: bool = True) -> Watched:

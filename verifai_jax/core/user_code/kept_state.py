@@ -1,4 +1,4 @@
-"""What code of the user keeps between its calls: attributes, variables of closures, globals.
+"""The state that a user's code keeps between its calls: attributes, variables, globals.
 
     before = state_of(controller)
     controller(observation)

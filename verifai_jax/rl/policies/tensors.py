@@ -9,7 +9,7 @@ import logging
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from itertools import pairwise, permutations
+from itertools import pairwise
 
 import jax.numpy as jnp
 import numpy as np
@@ -89,11 +89,11 @@ class Tensors(Mapping[str, np.ndarray]):
             log.warning("%s also holds %s, which no action depends on", self.what, listed(left))
 
 
-def listed(names: Iterable[str], most: int = 8) -> str:
+def listed(names: Iterable[str], count: int = 8) -> str:
     """Write names, the first of many."""
-    first = list(names)
-    more = f" and {len(first) - most} more" if len(first) > most else ""
-    return ", ".join(first[:most]) + more
+    every = list(names)
+    more = f" and {len(every) - count} more" if len(every) > count else ""
+    return ", ".join(every[:count]) + more
 
 
 def is_aside(name: str) -> bool:
@@ -131,16 +131,17 @@ def normaliser_of(tensors: Tensors, size: int) -> Normaliser | None:
     common, kinds = next(iter(found.items()))
     parent, _, leaf = common.rpartition(".")
     number = {k: np.ravel(np.asarray(tensors.arrays[n], float)) for k, n in kinds.items()}
-    scale, clip, trainer = None, None, ""
-    if leaf == "_*":
-        scale = (number["std"] if "std" in number else np.sqrt(number["var"])) + 0.01
-        trainer = "rsl_rl"
-    elif leaf == "running_*" and f"{parent}.current_count" in tensors and "variance" in number:
-        scale, clip, trainer = np.sqrt(number["variance"]) + 1e-8, 5.0, "skrl"
-    elif leaf == "running_*" and f"{parent}.num_batches_tracked" in tensors and "var" in number:
-        scale, trainer = np.sqrt(number["var"] + 1e-5), "a BatchNorm of PyTorch"
-    elif leaf == "running_*" and f"{parent}.count" in tensors and "var" in number:
-        scale, clip, trainer = np.sqrt(number["var"] + 1e-5), 5.0, "rl_games"
+    variance = number.get("var", number.get("variance", np.zeros(())))
+    deviation = number.get("std", np.sqrt(np.maximum(variance, 0)))
+    trainers = {
+        "": (deviation + 0.01, None, "rsl_rl"),
+        "current_count": (deviation + 1e-8, 5.0, "skrl"),
+        "num_batches_tracked": (np.sqrt(variance + 1e-5), None, "a BatchNorm of PyTorch"),
+        "count": (np.sqrt(variance + 1e-5), 5.0, "rl_games"),
+    }
+    signs = [n for n in trainers if n and leaf == "running_*" and f"{parent}.{n}" in tensors]
+    signs += [""] if leaf == "_*" else []
+    scale, clip, trainer = trainers[signs[0]] if signs else (None, None, "")
     if scale is None or len(found) > 1:
         form = "several normalisers" if len(found) > 1 else "a normaliser of an unknown form"
         raise PolicyError(f"{tensors.what} holds {form}, {names}: {OTHERWISE}")
@@ -150,10 +151,10 @@ def normaliser_of(tensors: Tensors, size: int) -> Normaliser | None:
             f"{tensors.what} holds {names} for {mean.size} numbers, and the network takes {size}: "
             f"{OTHERWISE}"
         )
-    if not (np.all(np.isfinite(mean)) and np.all(np.isfinite(scale)) and np.all(scale > 0)):
+    if not (np.all(np.isfinite([mean, scale])) and np.all(scale > 0)):
         raise PolicyError(f"{names} of {tensors.what} are no mean and scale: {OTHERWISE}")
     tensors.used.update(kinds.values())
-    bound = "" if clip is None else f", clipped to {clip:g}"
+    bound = "" if clip is None else f", clipped to {clip:zg}"
     log.warning(
         "%s: observations are normalised by %s%s, as by %s", tensors.what, names, bound, trainer
     )
@@ -172,18 +173,17 @@ def layer_names(tensors: Tensors) -> list[str]:
         raise PolicyError(
             f"{tensors.what} has no tensor that ends in .weight, but {listed(sorted(tensors))}"
         )
-    groups: dict[str, list[str]] = {}
-    for name in actor:
-        groups.setdefault(re.sub(r"\d+", "#", name), []).append(name)
-    # In one sequence of layers one number counts.
-    places = [zip(*(re.findall(r"\d+", n) for n in g), strict=True) for g in groups.values()]
-    counted = [sum(len(set(numbers)) > 1 for numbers in place) for place in places]
-    orders = [actor] if len(groups) == 1 else []
-    if 1 < len(groups) <= 5:
-        chains = ([n for part in parts for n in part] for parts in permutations(groups.values()))
-        orders = [names for names in chains if _fit(tensors, names)]
-    if len(orders) == 1 and max(counted) <= 1 and sum("#" in name for name in groups) <= 1:
-        return orders[0]
+    # One sequence, in whose names one number counts, and at most one layer without a number.
+    counted = [name for name in actor if re.search(r"\d", name)]
+    others = [name for name in actor if name not in counted]
+    numbers = [tuple(re.findall(r"\d+", name)) for name in counted]
+    varying = sum(len(set(column)) > 1 for column in zip(*numbers, strict=False))
+    if len({re.sub(r"\d+", "#", name) for name in counted}) <= 1 and varying <= 1:
+        if len(actor) == 1 or not others:
+            return actor
+        orders = [each for each in (counted + others, others + counted) if _fit(tensors, each)]
+        if len(others) == 1 and len(orders) == 1:
+            return orders[0]
     raise PolicyError(
         f"the names of {tensors.what} do not determine the order of its layers ({listed(actor)}): "
         "give the layers of the policy in order with layers="
