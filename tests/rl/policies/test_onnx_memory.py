@@ -88,7 +88,5 @@ def test_a_graph_of_trees_is_refused_by_its_kind(tmp_path):
         opset_imports=[helper.make_opsetid("ai.onnx.ml", 3)],
     )
     onnx.save(model, tmp_path / "m.onnx")
-    with pytest.raises(
-        PolicyError, match=r"only operators of ai\.onnx\.ml, such as"
-    ):
+    with pytest.raises(PolicyError, match=r"only operators of ai\.onnx\.ml, such as"):
         policy(tmp_path / "m.onnx")

@@ -8,8 +8,9 @@ those of one call for all simulations.
 """
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from itertools import zip_longest
 from typing import Any, TypeAlias
 
 import jax
@@ -109,40 +110,36 @@ def difference(one: Program, other: Program) -> tuple[bool, str | None]:
 
     Compares operations, constants among their operands, and plain parameters.
     """
+    for a, b in zip_longest(_steps(one), _steps(other), fillvalue=(None, None)):
+        if a[1] != b[1]:
+            step = a[0] or b[0]
+            return True, source_line(getattr(getattr(step, "source_info", None), "traceback", None))
+    return False, None
+
+
+def _steps(program: Program) -> Iterator[tuple[JaxprEqn | None, object]]:
+    """Yield the operations of a program and of those within, with what they do and results."""
     # From JAX 0.12 on both are one class; before, a program inside an operation has no constants.
-    constants, others = (getattr(each, "consts", ()) for each in (one, other))
-    for a, b in zip(constants, others, strict=False):
-        if not _same_value(a, b):
-            return True, _line_of_constant(one, a)
-    if len(constants) != len(others):
-        return True, None
-    return _difference(*(getattr(each, "jaxpr", each) for each in (one, other)))
+    inside = getattr(program, "jaxpr", program)
+    held = dict(zip(inside.constvars, getattr(program, "consts", ()), strict=False))
+
+    def values(operands: Sequence[Any]) -> list[object]:
+        return [_value(v.val if isinstance(v, Literal) else held.get(v)) for v in operands]
+
+    for step in inside.eqns:
+        plain = {name: value for name, value in step.params.items() if _is_plain(value)}
+        yield step, (step.primitive.name, values(step.invars), plain)
+        for inner in programs_read(step.params):
+            yield from _steps(inner)
+    yield None, values(inside.outvars)
 
 
-def _difference(one: Jaxpr, other: Jaxpr) -> tuple[bool, str | None]:
-    for a, b in zip(one.eqns, other.eqns, strict=False):
-        if a.primitive is not b.primitive or not _same_operands(a, b):
-            return True, _line(a)
-        inner = list(zip(programs_read(a.params), programs_read(b.params), strict=False))
-        for first, second in inner:
-            differs, line = difference(first, second)
-            if differs:
-                return True, line or _line(a)
-        plain = [name for name, value in a.params.items() if _is_plain(value)]
-        if any(a.params[name] != b.params.get(name) for name in plain):
-            return True, _line(a)
-    return len(one.eqns) != len(other.eqns), None
-
-
-def _same_operands(one: JaxprEqn, other: JaxprEqn) -> bool:
-    if len(one.invars) != len(other.invars):
-        return False
-    for a, b in zip(one.invars, other.invars, strict=True):
-        if isinstance(a, Literal) != isinstance(b, Literal):
-            return False
-        if isinstance(a, Literal) and isinstance(b, Literal) and not _same_value(a.val, b.val):
-            return False
-    return True
+def _value(value: object) -> object:
+    try:
+        array = np.asarray(value)
+        return None if value is None else (array.dtype.str, array.shape, array.tobytes())
+    except TypeError:  # Random keys and the like.
+        return type(value).__name__
 
 
 def programs_read(parameters: dict[str, Any]) -> Iterator[Program]:
@@ -158,25 +155,3 @@ def _is_plain(value: object) -> bool:
         return all(map(_is_plain, value))
     # Names of functions may hold addresses.
     return isinstance(value, bool | int | float) and value == value
-
-
-def _same_value(one: object, other: object) -> bool:
-    try:
-        a, b = np.asarray(one), np.asarray(other)
-        return a.dtype == b.dtype and np.array_equal(a, b, equal_nan=a.dtype.kind in "fc")
-    except TypeError:  # Random keys and the like.
-        return True
-
-
-def _line_of_constant(program: Program, constant: object) -> str | None:
-    """Return the line of the first operation on a constant."""
-    index = next(i for i, value in enumerate(program.consts) if value is constant)
-    variable = program.jaxpr.constvars[index]
-    for step in program.jaxpr.eqns:
-        if any(value is variable for value in step.invars):
-            return _line(step)
-    return None
-
-
-def _line(step: JaxprEqn) -> str | None:
-    return source_line(getattr(step.source_info, "traceback", None))

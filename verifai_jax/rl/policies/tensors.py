@@ -107,7 +107,7 @@ def normalisers(tensors: Tensors) -> dict[str, dict[str, str]]:
     They are by kind, and by the name that they have in common.
     """
     found: dict[str, dict[str, str]] = {}
-    for name in tensors:
+    for name in (name for name in tensors if name not in tensors.used):
         parent, _, leaf = name.rpartition(".")
         parts = re.fullmatch(r"(.*?)(mean|variance|var|std)(.*)", leaf)
         # In the name of its tensors running_mean_std is a normaliser, and no deviation.
@@ -136,7 +136,6 @@ def normaliser_of(tensors: Tensors, size: int) -> Normaliser | None:
     trainers = {
         "": (deviation + 0.01, None, "rsl_rl"),
         "current_count": (deviation + 1e-8, 5.0, "skrl"),
-        "num_batches_tracked": (np.sqrt(variance + 1e-5), None, "a BatchNorm of PyTorch"),
         "count": (np.sqrt(variance + 1e-5), 5.0, "rl_games"),
     }
     signs = [n for n in trainers if n and leaf == "running_*" and f"{parent}.{n}" in tensors]
