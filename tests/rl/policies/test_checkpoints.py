@@ -33,7 +33,7 @@ def actor(prefix="actor", sizes=(4, 8, 2), step=2):
 def forward(tensors, names, x):
     for name in names:
         x = tensors[f"{name}.weight"] @ x + tensors[f"{name}.bias"]
-        x = x if name == names[-1] else np.where(x > 0, x, np.expm1(x))
+        x = x if name == names[-1] else np.where(x > 0, x, np.expm1(np.minimum(x, 0)))
     return x
 
 

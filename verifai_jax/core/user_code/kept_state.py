@@ -7,6 +7,7 @@
 Only functions and objects of the user's own files are looked into, and what holds them.
 """
 
+import contextlib
 import functools
 import hashlib
 import itertools
@@ -29,6 +30,7 @@ MAX_DEPTH = 12
 State = dict[str, list[object]]
 """Values that can be compared, by what holds them."""
 CHANCE = "the random numbers of Python or NumPy"
+_CONTAINERS = (list, tuple, deque, set, frozenset, Mapping)
 _is_users_file = functools.cache(is_user_file)
 
 
@@ -55,8 +57,10 @@ def state_of(root: object) -> State:
             held.append(text)
         elif id(value) not in known and depth < MAX_DEPTH:
             known[id(value)] = value
-            held.append(len(value) if hasattr(value, "__len__") else 0)
-            left += [(inner, label, depth + 1) for inner, label in _parts(value, name)]
+            # An object that cannot be looked into keeps nothing that is known.
+            with contextlib.suppress(Exception):
+                held.append(len(value) if isinstance(value, _CONTAINERS) else 0)
+                left += [(inner, label, depth + 1) for inner, label in _parts(value, name)]
     return state
 
 
@@ -92,7 +96,7 @@ def _content(value: Any) -> object:
 def _parts(value: Any, name: str) -> Iterator[tuple[Any, str]]:
     """Yield what a value holds, each with the name of what holds it."""
     kind = value if isinstance(value, type) else type(value)
-    if isinstance(value, list | tuple | deque | set | frozenset | Mapping):
+    if isinstance(value, _CONTAINERS):
         inside = list(value.items() if isinstance(value, Mapping) else value)
         # What is appended to a long one is at its end.
         yield from ((item, name) for item in inside[:MAX_ITEMS] + inside[-1:])

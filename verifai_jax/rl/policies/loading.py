@@ -258,7 +258,7 @@ def _of_weights(
     if (activation is None) == (network is None):
         raise PolicyError(
             f"{what} contains weights but no network: give activation= for an MLP, or "
-            f"network=function(weights, observation); it has {listed(sorted(tensors))}"
+            f"network=function(weights, observation); it has {listed(tensors)}"
         )
     if network is not None:
         arrays = {n: jnp.asarray(a) for n, a in tensors.arrays.items() if n not in tensors.used}

@@ -8,6 +8,7 @@ A model's `.zip` has the settings as JSON (`data`), among them pickled spaces, a
 
 import base64
 import json
+import logging
 import re
 from collections.abc import Mapping
 from typing import Any
@@ -66,7 +67,7 @@ def read_sb3(data: bytes, what: str) -> Policy:
         extractor = options.get("features_extractor_class")
         _check_class(extractor, _EXTRACTORS, "a features extractor", what)
         loaded = _policy(weights, observed, acts, options, what)
-        weights.settle(EXPORT)
+        weights.settle(EXPORT, logging.INFO)
         return loaded
     except PolicyError:
         raise

@@ -50,7 +50,8 @@ class Tensors(Mapping[str, np.ndarray]):
         return name in self.arrays
 
     def __iter__(self) -> Iterator[str]:
-        return iter(self.arrays)
+        # A file need not keep their order.
+        return iter(sorted(self.arrays, key=natural))
 
     def __len__(self) -> int:
         return len(self.arrays)
@@ -66,8 +67,10 @@ class Tensors(Mapping[str, np.ndarray]):
                 raise unknown_name(f"tensor of {self.what}", name, self)
             self.used.update(found)
 
-    def settle(self, remedy: str) -> None:
+    def settle(self, remedy: str, level: int = logging.WARNING) -> None:
         """Refuse unread tensors that an action may depend on, and name the others in the log.
+
+        - `level`: the level of the log.
 
         **Raises:** `PolicyError` with their names and the remedy.
         """
@@ -75,9 +78,9 @@ class Tensors(Mapping[str, np.ndarray]):
         # A second name of a tensor that was read is none that is missing.
         left = [
             name
-            for name, array in self.arrays.items()
+            for name in self
             if name not in self.used
-            and not any(array.size > 1 and np.array_equal(array, one) for one in used)
+            and not any(one.size > 1 and np.array_equal(self.arrays[name], one) for one in used)
         ]
         held = {name for names in normalisers(self).values() for name in names.values()}
         needed = [name for name in left if name in held or not is_aside(name)]
@@ -86,7 +89,7 @@ class Tensors(Mapping[str, np.ndarray]):
                 f"{self.what} also holds {listed(needed)}, which nothing uses: {remedy}"
             )
         if left:
-            log.warning("%s also holds %s, which no action depends on", self.what, listed(left))
+            log.log(level, "%s also holds %s, which no action depends on", self.what, listed(left))
 
 
 def listed(names: Iterable[str], count: int = 8) -> str:
@@ -127,7 +130,7 @@ def normaliser_of(tensors: Tensors, size: int) -> Normaliser | None:
     found = normalisers(tensors)
     if not found:
         return None
-    names = listed(name for kinds in found.values() for name in kinds.values())
+    names = listed(sorted(name for kinds in found.values() for name in kinds.values()))
     common, kinds = next(iter(found.items()))
     parent, _, leaf = common.rpartition(".")
     number = {k: np.ravel(np.asarray(tensors.arrays[n], float)) for k, n in kinds.items()}
@@ -166,11 +169,10 @@ def layer_names(tensors: Tensors) -> list[str]:
     **Raises:** `PolicyError` if names and shapes do not determine the order.
     """
     every = [name.removesuffix(".weight") for name in tensors if name.endswith(".weight")]
-    actor = sorted((name for name in every if not is_aside(name)), key=natural)
-    actor = actor or sorted(every, key=natural)
+    actor = [name for name in every if not is_aside(name)] or every
     if not actor:
         raise PolicyError(
-            f"{tensors.what} has no tensor that ends in .weight, but {listed(sorted(tensors))}"
+            f"{tensors.what} has no tensor that ends in .weight, but {listed(tensors)}"
         )
     # One sequence, in whose names one number counts, and at most one layer without a number.
     counted = [name for name in actor if re.search(r"\d", name)]
