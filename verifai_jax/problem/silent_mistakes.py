@@ -2,9 +2,9 @@
 
     silent_mistakes(problem)                            # ("feature 'wind' influences no ...",)
 
-Examples are a formula that looks beyond the end of the trace, an unused feature, and a system that
-is not a function of its features and its key. Nothing compiles: the system is traced twice, which
-takes a fraction of a second. Only certain mistakes are reported.
+Examples are a formula that looks beyond the end of the trace, an unused feature, and a system whose
+calls change something. Nothing compiles: the system is traced, which takes a fraction of a second.
+Only certain mistakes are reported.
 """
 
 import math
@@ -69,7 +69,7 @@ def beyond_the_trace(problem: Problem) -> Iterator[str]:
 
 
 def mistakes_of_the_system(problem: Problem) -> Iterator[str]:
-    """Yield the mistakes that two tracings of the system show; none if it is slow to trace."""
+    """Yield the mistakes that tracing the system shows."""
     if problem.black_box or not traced_by_default(problem.system):
         return
     features = problem.space.feature_form

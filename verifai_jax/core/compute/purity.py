@@ -14,6 +14,7 @@ from itertools import zip_longest
 from typing import Any, TypeAlias
 
 import jax
+import jax.core
 import numpy as np
 from jax.extend.core import Jaxpr, JaxprEqn, Literal
 

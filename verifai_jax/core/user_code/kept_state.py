@@ -19,6 +19,7 @@ from collections.abc import Iterator, Mapping
 from typing import Any
 
 import jax
+import jax.core
 import numpy as np
 
 from verifai_jax.core.user_code.source_objects import is_user_file
@@ -88,7 +89,7 @@ def _content(value: Any) -> object:
     if isinstance(value, np.ndarray) and value.size > 100 * MAX_ITEMS:
         return id(value)
     if hasattr(type(value), "_version"):
-        return id(value), value._version  # A tensor of PyTorch.
+        return id(value), getattr(value, "_version")  # noqa: B009 - a tensor of PyTorch.
     plain = (bool, int, float, complex, str, bytes, type(None), np.ndarray, np.generic)
     return _text(value) if isinstance(value, (*plain, itertools.count)) else None
 

@@ -225,10 +225,10 @@ class Stacked:
         network, normaliser = weights
         size = observation.shape[-1]
         # It is of one observation, or of all frames.
-        single = normaliser is not None and jnp.size(normaliser.mean) == size
-        observation = normaliser(observation) if single else observation
+        if normaliser is not None and jnp.size(normaliser.mean) == size:
+            observation, normaliser = normaliser(observation), None
         frames = jnp.concatenate([frames[size:], observation], axis=-1)
-        seen = frames if normaliser is None or single else normaliser(frames)
+        seen = frames if normaliser is None else normaliser(frames)
         outputs, within = self.inner(network, seen, within)
         return outputs, (frames, within)
 

@@ -35,7 +35,7 @@ from verifai_jax.systems.environments.episode import count_required, without_ext
 log = logging.getLogger("verifai_jax.policies")
 
 
-def from_object(source: object, observation: ArrayLike | None, batched: bool) -> Policy:
+def from_object(source: Any, observation: ArrayLike | None, batched: bool) -> Policy:
     """Return the policy of a model or function.
 
     **Arguments:**

@@ -354,7 +354,7 @@ class EpisodeFunction:
 
     def _check_repeats(self) -> None:
         """Refuse a policy that acts otherwise in a second episode of the same observations."""
-        first, self._first = self._first or (), []
+        first, self._first = list(self._first or ()), []
         self._begin_policy()
         for observation, options, action, _ in first:
             again = self._decided(observation, options)
