@@ -8,10 +8,8 @@ policy(torch_module, observation=np.zeros(48))
 import io
 import json
 import logging
-import re
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
-from functools import cached_property
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -44,6 +42,12 @@ from verifai_jax.rl.policy import load_policy
 
 log = logging.getLogger("verifai_jax.policies")
 Network = Callable[[dict[str, Array], PyTree], PyTree]
+_TYPES: dict[str, Any] = {
+    **{f"{kind}{8 * size}": f"{kind.lower()}{size}" for kind in "FIU" for size in (1, 2, 4, 8)},
+    **{"BOOL": bool, "BF16": ml_dtypes.bfloat16},
+    **{"F8_E4M3": ml_dtypes.float8_e4m3fn, "F8_E5M2": ml_dtypes.float8_e5m2},
+}
+"""Types of numbers by their names in files of safetensors."""
 FORMATS = (".zip", ".onnx", ".safetensors", ".pt", ".pth", ".npz")
 
 
@@ -203,44 +207,29 @@ def _safetensors(data: bytes, path: Path) -> dict[str, np.ndarray]:
     package = require("safetensors", extra="policies")
     try:
         return {
-            name: widened(np.frombuffer(part["data"], _dtype(part["dtype"])).reshape(part["shape"]))
+            name: widened(np.frombuffer(part["data"], _TYPES[part["dtype"]]).reshape(part["shape"]))
             for name, part in package.deserialize(data)
         }
     except Exception as error:
         raise PolicyError(f"{path} holds no tensors: {one_line(str(error))}") from error
 
 
-def _dtype(name: str) -> np.dtype[Any]:
-    """Return the type of numbers that a file of safetensors calls `F32`, `BF16`, `U8` and so on."""
-    kind, bits, form = re.fullmatch(r"(BOOL|BF|F|I|U)(\d*)((?:_\w+)?)", name).groups()  # pyright: ignore
-    names = {"BOOL": "bool", "BF": "bfloat", "F": "float", "I": "int", "U": "uint"}
-    # Those of 8 bits have no infinity where their name has it not.
-    whole = f"{names[kind]}{bits}{form.lower()}" + ("fn" if form == "_E4M3" else "")
-    return np.dtype(getattr(ml_dtypes, whole, whole))
-
-
-@dataclass(frozen=True)
 class _Given:
     """The function of a user's own network and its weights.
 
     - `what`: the file of the weights, for messages.
     """
 
-    network: Network
-    what: str
-
-    @cached_property
-    def unused(self) -> list[str]:
-        """Names of the tensors that the network did not use at its first call."""
-        return []
+    def __init__(self, network: Network, what: str) -> None:
+        self.network, self.what, self.checked = network, what, False
 
     def __call__(self, weights: PyTree, observation: PyTree, memory: None) -> tuple[Any, None]:
-        if "unused" not in self.__dict__:
-            program = pure_program(self.network, weights, observation)
-            names = zip(sorted(weights), used_inputs(program), strict=False)
-            self.unused.extend(name for name, used in names if not used)
-            if self.unused:
-                log.warning("network= uses no %s of %s", listed(self.unused), self.what)
+        if not self.checked:
+            used = used_inputs(pure_program(self.network, weights, observation))
+            names = [n for n, is_used in zip(sorted(weights), used, strict=False) if not is_used]
+            if names:
+                log.warning("network= uses no %s of %s", listed(names), self.what)
+            self.checked = True
         return self.network(weights, observation), None
 
 
@@ -261,7 +250,7 @@ def _of_weights(
             f"network=function(weights, observation); it has {listed(tensors)}"
         )
     if network is not None:
-        arrays = {n: jnp.asarray(a) for n, a in tensors.arrays.items() if n not in tensors.used}
+        arrays = {n: jnp.asarray(a) for n, a in tensors.items() if n not in tensors.used}
         return Policy(arrays, _Given(network, what))
     assert activation is not None
     try:

@@ -7,8 +7,7 @@ tensors.settle("give ...")                          # refuses what nothing has r
 
 import logging
 import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Mapping, Sequence
 from itertools import pairwise
 
 import jax.numpy as jnp
@@ -30,31 +29,25 @@ targets and optimisers, and the spread of actions."""
 OTHERWISE = "say how observations are normalised by normalise=(mean, scale), (0, 1) for not at all"
 
 
-@dataclass(eq=False)
-class Tensors(Mapping[str, np.ndarray]):
-    """The tensors of a file, which remember which of them were read.
+class Tensors(dict[str, np.ndarray]):
+    """The tensors of a file in the order of their names, which remember what `[name]` has read.
 
     - `what`: the file, for errors.
     """
 
-    arrays: Mapping[str, np.ndarray]
-    what: str
-    used: set[str] = field(default_factory=set)
+    def __init__(self, arrays: Mapping[str, np.ndarray], what: str) -> None:
+        # A file need not keep their order.
+        super().__init__({name: arrays[name] for name in sorted(arrays, key=natural)})
+        self.what = what
+        self.used: set[str] = set()
 
     def __getitem__(self, name: str) -> np.ndarray:
-        array = self.arrays[name]
         self.used.add(name)
-        return array
+        return self.peek(name)
 
-    def __contains__(self, name: object) -> bool:
-        return name in self.arrays
-
-    def __iter__(self) -> Iterator[str]:
-        # A file need not keep their order.
-        return iter(sorted(self.arrays, key=natural))
-
-    def __len__(self) -> int:
-        return len(self.arrays)
+    def peek(self, name: str) -> np.ndarray:
+        """Return a tensor that does not count as read by that."""
+        return super().__getitem__(name)
 
     def ignore(self, names: Iterable[str]) -> None:
         """Count tensors as read; a name stands for all that begin with it.
@@ -74,16 +67,16 @@ class Tensors(Mapping[str, np.ndarray]):
 
         **Raises:** `PolicyError` with their names and the remedy.
         """
-        used = [self.arrays[name] for name in self.used]
+        used = [self.peek(name) for name in self.used]
         # A second name of a tensor that was read is none that is missing.
         left = [
             name
-            for name in self
+            for name, array in self.items()
             if name not in self.used
-            and not any(one.size > 1 and np.array_equal(self.arrays[name], one) for one in used)
+            and not any(array.size > 1 and np.array_equal(array, one) for one in used)
         ]
         held = {name for names in normalisers(self).values() for name in names.values()}
-        needed = [name for name in left if name in held or not is_aside(name)]
+        needed = [name for name in left if name in held or not ASIDE.search(name)]
         if needed:
             raise PolicyError(
                 f"{self.what} also holds {listed(needed)}, which nothing uses: {remedy}"
@@ -99,11 +92,6 @@ def listed(names: Iterable[str], count: int = 8) -> str:
     return ", ".join(every[:count]) + more
 
 
-def is_aside(name: str) -> bool:
-    """Return whether a name says that a deterministic action does not depend on its tensor."""
-    return ASIDE.search(name) is not None
-
-
 def normalisers(tensors: Tensors) -> dict[str, dict[str, str]]:
     """Return the names of means with their variances or deviations, none of a critic or a layer.
 
@@ -115,7 +103,7 @@ def normalisers(tensors: Tensors) -> dict[str, dict[str, str]]:
         parts = re.fullmatch(r"(.*?)(mean|variance|var|std)(.*)", leaf)
         # In the name of its tensors running_mean_std is a normaliser, and no deviation.
         plain = parent.replace("mean_std", "")
-        if parts is not None and f"{parent}.weight" not in tensors and not is_aside(plain):
+        if parts is not None and f"{parent}.weight" not in tensors and not ASIDE.search(plain):
             common = f"{parent}.{parts[1]}*{parts[3]}"
             found.setdefault(common, {})[parts[2]] = name
     return {name: kinds for name, kinds in found.items() if "mean" in kinds and len(kinds) > 1}
@@ -133,7 +121,7 @@ def normaliser_of(tensors: Tensors, size: int) -> Normaliser | None:
     names = listed(sorted(name for kinds in found.values() for name in kinds.values()))
     common, kinds = next(iter(found.items()))
     parent, _, leaf = common.rpartition(".")
-    number = {k: np.ravel(np.asarray(tensors.arrays[n], float)) for k, n in kinds.items()}
+    number = {k: np.ravel(np.asarray(tensors.peek(n), float)) for k, n in kinds.items()}
     variance = number.get("var", number.get("variance", np.zeros(())))
     deviation = number.get("std", np.sqrt(np.maximum(variance, 0)))
     trainers = {
@@ -169,7 +157,7 @@ def layer_names(tensors: Tensors) -> list[str]:
     **Raises:** `PolicyError` if names and shapes do not determine the order.
     """
     every = [name.removesuffix(".weight") for name in tensors if name.endswith(".weight")]
-    actor = [name for name in every if not is_aside(name)] or every
+    actor = [name for name in every if not ASIDE.search(name)] or every
     if not actor:
         raise PolicyError(
             f"{tensors.what} has no tensor that ends in .weight, but {listed(tensors)}"
@@ -192,12 +180,12 @@ def layer_names(tensors: Tensors) -> list[str]:
 
 
 def _fit(tensors: Tensors, names: Sequence[str]) -> bool:
-    shapes = [tensors.arrays[f"{name}.weight"].shape for name in names]
+    shapes = [tensors.peek(f"{name}.weight").shape for name in names]
     return all(map((2).__eq__, map(len, shapes))) and all(a[0] == b[1] for a, b in pairwise(shapes))
 
 
 def linear_layers(
-    weights: Mapping[str, np.ndarray], names: Sequence[str], what: str
+    weights: Tensors, names: Sequence[str], what: str
 ) -> tuple[tuple[Array, Array], ...]:
     """Return the PyTorch layers with these names as `([in, out], [out])`, in this order.
 
@@ -213,7 +201,9 @@ def linear_layers(
         weight = np.asarray(weights[f"{name}.weight"], np.float32)
         if weight.ndim != 2 or before not in (None, weight.shape[1]):
             raise PolicyError(f"{name}.weight of {what} has shape {list(weight.shape)}")
-        bias = np.asarray(weights.get(f"{name}.bias", np.zeros(len(weight))), np.float32)
+        has_bias = f"{name}.bias" in weights
+        bias = weights[f"{name}.bias"] if has_bias else np.zeros(len(weight))
+        bias = np.asarray(bias, np.float32)
         if bias.shape != (len(weight),):
             raise PolicyError(f"{name}.bias of {what} has shape {list(bias.shape)}")
         if not (np.all(np.isfinite(weight)) and np.all(np.isfinite(bias))):

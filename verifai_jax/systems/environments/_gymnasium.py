@@ -60,13 +60,6 @@ REPEATED = 50
 """Decisions of the first episode that are taken again, to see whether the policy remembers."""
 
 
-def _close(one: object, other: object) -> bool:
-    a, b = np.asarray(one), np.asarray(other)
-    if a.dtype.kind not in "fiub" or b.dtype.kind not in "fiub":
-        return bool(np.array_equal(a, b))
-    return a.shape == b.shape and np.allclose(a, b, rtol=1e-5, atol=1e-7, equal_nan=True)
-
-
 @dataclasses.dataclass(eq=False)
 class EpisodeFunction:
     """A function `(features, seed) -> Trace` of one episode of an environment.
@@ -358,7 +351,7 @@ class EpisodeFunction:
         self._begin_policy()
         for observation, options, action, _ in first:
             again = self._decided(observation, options)
-            if not all(map(_close, jax.tree.leaves(action), jax.tree.leaves(again))):
+            if not all(map(np.array_equal, jax.tree.leaves(action), jax.tree.leaves(again))):
                 kept = changed(first[0][-1], state_of(self.policy))
                 resets = callable(getattr(self.policy, "reset", None))
                 raise ValueError(
