@@ -16,6 +16,7 @@ import sys
 import types
 from collections import deque
 from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import jax
@@ -42,7 +43,17 @@ def changed(before: State, after: State) -> list[str]:
 
 def holds_tracer(state: State, name: str) -> bool:
     """Return whether something holds a value that JAX has traced."""
-    return jax.core.Tracer in state[name]
+    return any(isinstance(each, _Traced) for each in state[name])
+
+
+@dataclass(frozen=True, eq=False)
+class _Traced:
+    """A value that JAX has traced, equal to itself alone."""
+
+    value: object
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Traced) and other.value is self.value
 
 
 def state_of(root: object) -> State:
@@ -78,7 +89,7 @@ def _text(value: object) -> str:
 def _content(value: Any) -> object:
     """Return what a value that holds no other can be compared by; None for one that may."""
     if isinstance(value, jax.core.Tracer):
-        return jax.core.Tracer
+        return _Traced(value)
     if isinstance(value, jax.Array | types.ModuleType):
         return id(value)
     if isinstance(value, np.random.Generator):
