@@ -20,7 +20,8 @@ from verifai_jax.evaluation.evaluator import Evaluator
 from verifai_jax.falsification.table import ErrorTable
 from verifai_jax.problem.dependence import has_gradient
 from verifai_jax.problem.problem import Problem
-from verifai_jax.problem.silent_mistakes import is_quick, silent_mistakes, traced_by_default
+from verifai_jax.problem.silent_mistakes import is_quick, silent_mistakes
+from verifai_jax.problem.tracing import traced_by_default
 from verifai_jax.search import Search
 
 ENOUGH = 32

@@ -18,8 +18,8 @@ import numpy as np
 from jaxtyping import Array, Float, Key
 
 from verifai_jax.core.compute.compilation import ProgramCache, Slot
-from verifai_jax.core.compute.fingerprint import alone_only, describe_step
 from verifai_jax.core.compute.precision import truncate_silently
+from verifai_jax.core.compute.purity import TRACED_ONCE, watch
 from verifai_jax.core.display.lazy import lazy_import
 from verifai_jax.core.display.notebook import InNotebook, text_html
 from verifai_jax.core.messages.checks import check_name
@@ -43,6 +43,7 @@ from verifai_jax.mtl.semantics import Semantics
 from verifai_jax.problem.behaviour import Behaviour
 from verifai_jax.problem.guide import Guide, Term
 from verifai_jax.problem.rulebook import Rulebook
+from verifai_jax.problem.tracing import traced_by_default, why_not_batched
 from verifai_jax.systems.base import System, as_system
 
 
@@ -298,10 +299,23 @@ class Problem(InNotebook):
         if trace is None:
             self._check_known()
             return
-        for formula in self.formulas.values():
-            jax.eval_shape(lambda t, f=formula: robustness(f, t, end=self.end), trace)
-        if (guide := self.guide) is not None:
-            jax.eval_shape(lambda t, f: guide.value(t.hold(), f, self.end), trace, features)
+
+        def judged(trace: Trace, features: Any) -> Any:
+            values = [robustness(f, trace, end=self.end) for f in self.formulas.values()]
+            guide, where = self.guide, self.space.where
+            steered = None if guide is None else guide.value(trace.hold(), features, self.end)
+            return values, steered, None if where is None else where(features)
+
+        judges = (tuple(self.formulas.values()), self.guide, self.space.where)
+        watched = watch(
+            judges, lambda: jax.make_jaxpr(lambda *a: judged(*a))(trace, features), twice=False
+        )
+        if watched.why_impure:
+            raise ProblemError(
+                f"what judges the simulations of problem {self.name!r} {watched.why_impure}. "
+                f"{TRACED_ONCE}: a formula, a guide and a constraint are functions of their "
+                "arguments alone"
+            )
 
     def _check_known(self) -> None:
         """Check the formulas against what is known of the signals of a black box."""
@@ -333,43 +347,39 @@ class Problem(InNotebook):
 
     @truncate_silently()
     def _form(self) -> Trace | None:
-        features = self.space.feature_form
+        features, key = self.space.feature_form, jax.eval_shape(lambda: jax.random.key(0))
+        # A new function each time: JAX remembers what it traced by the function.
+        program = lambda: jax.make_jaxpr(lambda *a: self.system(*a), return_shape=True)  # noqa: E731
+        watched = None
         try:
-            trace = self.system.abstract(features)
+            if self.black_box or not traced_by_default(self.system):
+                trace = self.system.abstract(features)
+            else:
+                watched = watch(self.system, lambda: program()(features, key))
+                trace = watched.result[1]
         except Exception as error:
             raise self._wrong_system(error, features) from error
         if trace is None and self.black_box:
             return None
+        if watched is not None and watched.why_impure:
+            raise ProblemError(
+                f"the system of problem {self.name!r} {watched.remedy}; or make the system a "
+                "vj.blackbox, which JAX does not trace"
+            )
         if not isinstance(trace, Trace):
             function = getattr(self.system, "__wrapped__", self.system)
             raise ProblemError(
                 f"the system of problem {self.name!r} must return a Trace; "
                 f"it returned {type(trace).__name__}{defined_at(function)}"
             )
-        own = type(getattr(self.system, "function", self.system))
-        if not self.black_box and getattr(own, "abstract", System.abstract) is System.abstract:
-            self._check_batches(features)
-        return trace
-
-    def _check_batches(self, features: Mapping[str, Any]) -> None:
-        """Refuse a system with a step that JAX takes for one simulation at a time only."""
-        key = jax.eval_shape(lambda: jax.random.key(0))
-        # Traced already, for its form.
-        program = jax.make_jaxpr(self.system)(features, key).jaxpr
-        for step, error in alone_only(program):
-            does = step.primitive.name
-            said = str(error).strip().partition("\n")[0].rstrip(".")
-            if does == "pure_callback":
-                said, cure = "it has no vmap_method", "give it vmap_method='sequential'"
-            elif does == "io_callback" and step.params.get("ordered"):
-                cure = "write ordered=False"
-            else:
-                cure = "give the operation a rule for jax.vmap"
+        if watched is None:
+            return trace
+        self.programs.get(KEPT, None, lambda: watched.kept)
+        if (alone := why_not_batched(watched.result[0].jaxpr)) is not None:
             raise ProblemError(
-                f"the system of problem {self.name!r} cannot be simulated in batches: "
-                f"{describe_step(step)} is for one simulation at a time ({said}); {cure}, or make "
-                "the system a vj.blackbox, which JAX does not trace"
-            ) from error
+                f"the system of problem {self.name!r} cannot be simulated in batches: {alone}"
+            )
+        return trace
 
     def _wrong_system(self, error: Exception, features: Mapping[str, Any]) -> ProblemError:
         native = "native" in self.system.backends and self.system.backend != "native"
@@ -392,6 +402,8 @@ class Problem(InNotebook):
         return "\n".join(lines)
 
 
+KEPT: Slot[None, tuple[str, ...]] = Slot("kept")
+"""What each call of a problem's system changes, in words."""
 FORM: Slot[None, Trace | None] = Slot("form")
 """The form of the traces of a problem's system."""
 BACKENDS: Slot[str, Problem] = Slot("backends")

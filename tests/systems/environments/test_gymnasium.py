@@ -311,3 +311,41 @@ def test_an_action_of_the_wrong_shape():
 def test_what_makes_no_environment():
     with pytest.raises(TypeError, match=r"dict must make a Gymnasium environment; it made \{\}"):
         gymnasium(dict, balancing, steps=5)({}, 0)
+
+
+class Integrates:
+    def __init__(self):
+        self.total = 0.0
+
+    def __call__(self, observation):
+        self.total += float(observation[2]) + 0.3
+        return int(np.sin(9 * self.total) > 0)
+
+
+class Begins(Integrates):
+    def reset(self):
+        self.total = 0.0
+
+
+class Forgets(Integrates):
+    def reset(self):
+        pass
+
+
+def test_a_policy_begins_each_episode_anew_or_is_refused():
+    def episode(policy):
+        return gymnasium("CartPole-v1", policy, steps=20, signals=NAMES)
+
+    begins = episode(Begins())
+    first, again = (begins({}, 3)["theta"] for _ in range(2))
+    np.testing.assert_array_equal(first, again)
+    for policy, words in {
+        Integrates(): "keeps attribute 'total' of Integrates from one call to the next",
+        Forgets(): "keeps attribute 'total' of Forgets from one call to the next",
+        lambda observation: int(np.random.rand() < 0.5): "other numbers each time",  # noqa: NPY002
+    }.items():
+        refused = episode(policy)
+        for _ in range(2):
+            with pytest.raises(ValueError, match=words) as error:
+                refused({}, 3)
+        assert ("Its reset() is called" in str(error.value)) == isinstance(policy, Forgets)

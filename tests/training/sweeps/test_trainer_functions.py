@@ -4,6 +4,7 @@ import os
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import jax.numpy as jnp
 import numpy as np
@@ -13,6 +14,7 @@ from numpy_training import study, sweep, train, train_anew
 
 import verifai_jax as vj
 from verifai_jax.training.sweeps import StudyError
+from verifai_jax.training.sweeps.function_runs import FunctionRuns
 
 HERE = Path(__file__).parent
 
@@ -42,6 +44,14 @@ def test_what_is_wrong_is_said_before_anything_trains():
         trainer.check(study(train).space)
     study(train).check()
     assert "trains: train, 8 steps" in str(study(train))
+
+
+def test_a_policy_of_another_form_than_the_examples():
+    trained = vj.policy(HERE.parents[1] / "rl" / "policies" / "files" / "mlp.onnx")
+    for size, words in ((2, None), (3, "actions of shape [2], and example= of the trainer, with")):
+        trainer = vj.Trainer(train, steps=8, example=lambda o, size=size: jnp.zeros(size))
+        why = FunctionRuns._why_not_of_the_form(SimpleNamespace(_trainer=trainer), trained)
+        assert why is None if words is None else words in why
 
 
 @pytest.mark.slow

@@ -107,6 +107,11 @@ def certify(
     if the first simulations of all policies raise.
     """
     started = time.perf_counter()
+    if not callable(problem_of) or isinstance(problem_of, Problem) or callable(policies):
+        raise ValueError(
+            "certify is called with a function from a policy to its problem, and a list of "
+            f"policies; got {type(problem_of).__name__} and {type(policies).__name__}"
+        )
     policies = list(policies)
     budget = _check(policies, p, confidence, samples, seed, budget, attack_simulations, tie)
     lanes = LANES if samples >= LANES else max(8, power_of_two(samples))

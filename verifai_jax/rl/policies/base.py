@@ -222,8 +222,12 @@ class Stacked:
     def __call__(self, weights: PyTree, observation: Array, memory: PyTree) -> tuple[Any, PyTree]:
         """Compute with the frames that the memory holds and this observation."""
         frames, within = memory
-        frames = jnp.concatenate([frames[observation.shape[-1] :], observation], axis=-1)
         network, normaliser = weights
+        size = observation.shape[-1]
+        # It is of one observation, or of all frames.
+        if normaliser is not None and jnp.size(normaliser.mean) == size:
+            observation, normaliser = normaliser(observation), None
+        frames = jnp.concatenate([frames[size:], observation], axis=-1)
         seen = frames if normaliser is None else normaliser(frames)
         outputs, within = self.inner(network, seen, within)
         return outputs, (frames, within)
@@ -235,7 +239,15 @@ def stack_frames(policy: Policy, count: int, size: int) -> Policy:
     Before the first observation there are zeros, as in the frame stack of Stable-Baselines3.
 
     - `size`: number of entries in one observation.
+
+    **Raises:** `PolicyError` for a normalisation of another number of entries.
     """
+    scaled = None if policy.normaliser is None else policy.normaliser.mean
+    if scaled is not None and np.size(scaled) not in (1, size, count * size):
+        raise PolicyError(
+            f"the normalisation is of {np.size(scaled)} numbers, and the policy sees {count} "
+            f"observations of {size}: it must be of {size} or {count * size}"
+        )
     return Policy(
         weights=(policy.weights, policy.normaliser),
         compute=Stacked(policy.compute, count),

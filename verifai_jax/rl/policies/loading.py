@@ -7,29 +7,47 @@ policy(torch_module, observation=np.zeros(48))
 
 import io
 import json
+import logging
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import jax.numpy as jnp
+import ml_dtypes
 import numpy as np
 from jaxtyping import Array, ArrayLike, PyTree
 
+from verifai_jax.core.compute.fingerprint import used_inputs
 from verifai_jax.core.messages.checks import check_count
 from verifai_jax.core.messages.errors import require, suggests_options
 from verifai_jax.core.messages.text import one_line
 from verifai_jax.rl.policies.base import Actions, Normaliser, Policy, bounds, stack_frames
 from verifai_jax.rl.policies.errors import MAX_BYTES, PolicyError
-from verifai_jax.rl.policies.networks import Mlp, activation_name, linear_layers, natural
-from verifai_jax.rl.policies.objects import from_object, read_brax
+from verifai_jax.rl.policies.networks import Mlp, activation_name
+from verifai_jax.rl.policies.objects import from_object, pure_program, read_brax
 from verifai_jax.rl.policies.onnx_graph import read_graph, read_onnx
 from verifai_jax.rl.policies.sb3 import read_normaliser, read_sb3
-from verifai_jax.rl.policies.torch_archive import open_archive, read_member, read_state
+from verifai_jax.rl.policies.tensors import (
+    Tensors,
+    layer_names,
+    linear_layers,
+    listed,
+    normaliser_of,
+    normalisers,
+)
+from verifai_jax.rl.policies.torch_archive import open_archive, read_member, read_state, widened
 from verifai_jax.rl.policy import Policy as OwnPolicy
 from verifai_jax.rl.policy import load_policy
 
+log = logging.getLogger("verifai_jax.policies")
 Network = Callable[[dict[str, Array], PyTree], PyTree]
+_TYPES: dict[str, Any] = {
+    **{f"{kind}{8 * size}": f"{kind.lower()}{size}" for kind in "FIU" for size in (1, 2, 4, 8)},
+    **{"BOOL": bool, "BF16": ml_dtypes.bfloat16},
+    **{"F8_E4M3": ml_dtypes.float8_e4m3fn, "F8_E5M2": ml_dtypes.float8_e5m2},
+}
+"""Types of numbers by their names in files of safetensors."""
 FORMATS = (".zip", ".onnx", ".safetensors", ".pt", ".pth", ".npz")
 
 
@@ -47,6 +65,7 @@ def policy(
     layers: Sequence[str] | None = None,
     output: str | None = None,
     memory: Mapping[str, str] | None = None,
+    ignore: Sequence[str] = (),
     stack: int = 1,
     batched: bool = False,
 ) -> Policy | OwnPolicy:
@@ -58,7 +77,8 @@ def policy(
         squashing and bounds;
       - `.onnx`: a graph; outputs that are fed back to inputs become the memory of a recurrent one;
       - `.safetensors`, or `.pt` and `.pth` of `torch.save(module.state_dict())`: weights of an MLP
-        with `activation=`, or of your own `network=`;
+        with `activation=`, or of your own `network=`; the normaliser that rsl_rl, rl_games and skrl
+        store beside them is applied;
       - `.npz` of `rl.save_policy`;
       - a folder: a PPO checkpoint of Brax or MuJoCo Playground;
       - a model of Stable-Baselines3; a PyTorch module with `observation=`; a module of equinox or
@@ -74,9 +94,11 @@ def policy(
     - `low`, `high`: bounds of the action.
     - `activation`: the activation of an MLP, after every layer except the last.
     - `network(weights, observation) -> outputs`: the network for other weights, given by name.
-    - `layers`: names of the layers of an MLP, in order; by default sorted by name.
+    - `layers`: names of the layers of an MLP, in order; by default all that are no critic's.
     - `output`: the output that is the action, for an ONNX graph with several.
-    - `memory`: recurrent values of an ONNX graph, `{input: output}`; by default found by shape.
+    - `memory`: recurrent values of an ONNX graph, `{input: output}`; by default found by their
+      names, and by the ports of LSTM, GRU and RNN.
+    - `ignore`: names of tensors of a checkpoint, or their beginnings, that an action does not need.
     - `stack`: number of observations that the policy receives at once, the newest last.
     - `batched`: whether a Python function takes a batch of observations.
     **Returns:** a `Policy`, which any system accepts as its policy or controller (`policy.act`), or
@@ -88,7 +110,8 @@ def policy(
     if isinstance(source, Policy | OwnPolicy):
         loaded = source
     elif isinstance(source, str | Path):
-        loaded = _of_file(Path(source), activation, network, layers, output=output, memory=memory)
+        mlp, graph = (activation, network, layers, ignore), (output, memory)
+        loaded = _of_file(Path(source), mlp, graph, normalise is not None)
     else:
         loaded = from_object(source, observation, batched)
     stated = action is not None or low is not None or high is not None
@@ -115,12 +138,9 @@ def policy(
 
 def _of_file(
     path: Path,
-    activation: str | None,
-    network: Network | None,
-    layers: Sequence[str] | None,
-    *,
-    output: str | None,
-    memory: Mapping[str, str] | None,
+    mlp: tuple[str | None, Network | None, Sequence[str] | None, Sequence[str]],
+    graph: tuple[str | None, Mapping[str, str] | None],
+    normalised: bool,
 ) -> Policy | OwnPolicy:
     if path.is_dir():
         return read_brax(path.resolve())
@@ -137,22 +157,23 @@ def _of_file(
     data = path.read_bytes()
     stored = _stored_graph(data, path)
     weights_alone = kind in (".safetensors", ".pt", ".pth") and stored is None
-    if not weights_alone and (activation or network or layers):
+    if not weights_alone and any(mlp):
         raise PolicyError(
-            f"{path} defines its network: leave out activation=, network= and layers="
+            f"{path} defines its network: leave out activation=, network=, layers= and ignore="
         )
     if stored is not None:
-        graph, weights, first = read_graph(*stored, str(path))
-        return Policy(weights, graph, first)
+        function, weights, first = read_graph(*stored, str(path))
+        return Policy(weights, function, first)
     if kind == ".npz":
         return load_policy(path)
     if kind == ".zip":
         return read_sb3(data, str(path))
     if kind == ".onnx":
-        graph, weights, first = read_onnx(path, data, str(path), output=output, memory=memory)
-        return Policy(weights, graph, first)
+        output, memory = graph
+        function, weights, first = read_onnx(path, data, str(path), output=output, memory=memory)
+        return Policy(weights, function, first)
     arrays = _safetensors(data, path) if kind == ".safetensors" else read_state(data, str(path))
-    return _of_weights(arrays, activation, network, layers, str(path))
+    return _of_weights(Tensors(arrays, str(path)), *mlp, normalised)
 
 
 def _stored_graph(data: bytes, path: Path) -> tuple[Any, dict[str, np.ndarray]] | None:
@@ -183,47 +204,71 @@ def _stored_graph(data: bytes, path: Path) -> tuple[Any, dict[str, np.ndarray]] 
 
 
 def _safetensors(data: bytes, path: Path) -> dict[str, np.ndarray]:
-    package = require("safetensors.numpy", extra="policies")
+    package = require("safetensors", extra="policies")
     try:
-        return package.load(data)
+        return {
+            name: widened(np.frombuffer(part["data"], _TYPES[part["dtype"]]).reshape(part["shape"]))
+            for name, part in package.deserialize(data)
+        }
     except Exception as error:
         raise PolicyError(f"{path} holds no tensors: {one_line(str(error))}") from error
 
 
 class _Given:
-    """The function of a user's own network and its weights."""
+    """The function of a user's own network and its weights.
 
-    def __init__(self, network: Network) -> None:
-        self.network = network
+    - `what`: the file of the weights, for messages.
+    """
+
+    def __init__(self, network: Network, what: str) -> None:
+        self.network, self.what, self.checked = network, what, False
 
     def __call__(self, weights: PyTree, observation: PyTree, memory: None) -> tuple[Any, None]:
+        if not self.checked:
+            used = used_inputs(pure_program(self.network, weights, observation))
+            names = [n for n, is_used in zip(sorted(weights), used, strict=False) if not is_used]
+            if names:
+                log.warning("network= uses no %s of %s", listed(names), self.what)
+            self.checked = True
         return self.network(weights, observation), None
 
 
 def _of_weights(
-    arrays: Mapping[str, np.ndarray],
+    tensors: Tensors,
     activation: str | None,
     network: Network | None,
     layers: Sequence[str] | None,
-    what: str,
+    ignore: Sequence[str],
+    normalised: bool,
 ) -> Policy:
-    """Return the policy of weights with a given network."""
+    """Return the policy of weights with a given network; every tensor is used, or named."""
+    what = tensors.what
+    tensors.ignore([ignore] if isinstance(ignore, str) else ignore)
     if (activation is None) == (network is None):
         raise PolicyError(
             f"{what} contains weights but no network: give activation= for an MLP, or "
-            f"network=function(weights, observation); it has {', '.join(sorted(arrays)[:8])}"
+            f"network=function(weights, observation); it has {listed(tensors)}"
         )
     if network is not None:
-        return Policy({name: jnp.asarray(array) for name, array in arrays.items()}, _Given(network))
+        arrays = {n: jnp.asarray(a) for n, a in tensors.items() if n not in tensors.used}
+        return Policy(arrays, _Given(network, what))
     assert activation is not None
-    found = [n.removesuffix(".weight") for n, a in arrays.items() if n.endswith(".weight")]
-    names = sorted(found, key=natural) if layers is None else list(layers)
-    if not names:
-        raise PolicyError(f"{what} has no tensor that ends in .weight")
     try:
-        return Policy(linear_layers(arrays, names, what), Mlp(activation_name(activation)))
+        names = layer_names(tensors) if layers is None else list(layers)
+        weights = linear_layers(tensors, names, what)
     except PolicyError as error:
-        raise PolicyError(f"{error}; give the layers of the policy in order with layers=") from None
+        hint = "give the layers of the policy in order with layers="
+        raise PolicyError(f"{str(error).removesuffix(f': {hint}')}: {hint}") from None
+    normaliser = None
+    if normalised:
+        tensors.used.update(n for kinds in normalisers(tensors).values() for n in kinds.values())
+    else:
+        normaliser = normaliser_of(tensors, weights[0][0].shape[0])
+    tensors.settle(
+        "name them in layers= if they are layers of the policy, give network=function(weights, "
+        "observation) for a network of another form, or ignore= with their names"
+    )
+    return Policy(weights, Mlp(activation_name(activation)), normaliser=normaliser)
 
 
 def _normaliser(given: str | Path | tuple[ArrayLike, ArrayLike] | Normaliser) -> Normaliser:

@@ -1,9 +1,7 @@
 """Networks of the usual forms, as pure functions of their weights."""
 
-import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -102,33 +100,3 @@ def _nature(convolutions: Layers, image: Float[Array, "c h w"]) -> Float[Array, 
         x = jax.lax.conv(x, kernel, (stride, stride), "VALID") + bias[:, None, None]
         x = jax.nn.relu(x)
     return jnp.reshape(x, -1)
-
-
-def linear_layers(
-    weights: Mapping[str, np.ndarray], names: Sequence[str], what: str
-) -> tuple[Any, ...]:
-    """Return the PyTorch layers with these names as `([in, out], [out])`, in this order.
-
-    **Raises:** `PolicyError` for a layer that is missing or does not fit its predecessor.
-    """
-    layers, before = [], None
-    for name in names:
-        try:
-            weight = np.asarray(weights[f"{name}.weight"], np.float32)
-        except KeyError:
-            raise PolicyError(f"{what} has no tensor {name}.weight") from None
-        if weight.ndim != 2 or before not in (None, weight.shape[1]):
-            raise PolicyError(f"{name}.weight of {what} has shape {list(weight.shape)}")
-        bias = np.asarray(weights.get(f"{name}.bias", np.zeros(len(weight))), np.float32)
-        if bias.shape != (len(weight),):
-            raise PolicyError(f"{name}.bias of {what} has shape {list(bias.shape)}")
-        if not (np.all(np.isfinite(weight)) and np.all(np.isfinite(bias))):
-            raise PolicyError(f"the layer {name} of {what} holds numbers that are not finite")
-        layers.append((jnp.asarray(weight.T), jnp.asarray(bias)))
-        before = weight.shape[0]
-    return tuple(layers)
-
-
-def natural(name: str) -> list[Any]:
-    """Return a key that sorts `layer.10` after `layer.9`."""
-    return [int(part) if part.isdigit() else part for part in re.split(r"(\d+)", name)]

@@ -4,14 +4,15 @@ policy = from_object(model, observation=np.zeros(8))
 """
 
 import contextlib
+import inspect
 import io
 import json
 import logging
 import time
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
@@ -20,8 +21,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Key, PyTree
 
+from verifai_jax.core.compute.purity import AS_MEMORY, watch, why_differs
 from verifai_jax.core.messages.errors import require
 from verifai_jax.core.messages.text import format_seconds, one_line
+from verifai_jax.core.user_code.kept_state import changed, holds_tracer, state_of
 from verifai_jax.core.user_code.user_errors import defined_at
 from verifai_jax.rl.policies.base import Policy
 from verifai_jax.rl.policies.errors import PolicyError
@@ -32,7 +35,7 @@ from verifai_jax.systems.environments.episode import count_required, without_ext
 log = logging.getLogger("verifai_jax.policies")
 
 
-def from_object(source: object, observation: ArrayLike | None, batched: bool) -> Policy:
+def from_object(source: Any, observation: ArrayLike | None, batched: bool) -> Policy:
     """Return the policy of a model or function.
 
     **Arguments:**
@@ -52,22 +55,28 @@ def from_object(source: object, observation: ArrayLike | None, batched: bool) ->
         and callable(getattr(source[0], "apply", None))
     ):
         module, variables = source
-        return Policy(variables, _Applied(module))
+        return Policy(variables, _Of(_linen, (module,)))
     if _is_a(source, "flax.nnx.module", "Module"):
-        graph, state = require("flax.nnx", extra="policies").split(source)
-        return Policy(state, _Merged(graph))
+        nnx = require("flax.nnx", extra="policies")
+        # A copy, so that the user's stays in training.
+        evaluated = nnx.merge(*nnx.split(source))
+        evaluated.eval()
+        graph, state = nnx.split(evaluated)
+        return Policy(state, _Of(_nnx, (graph,)))
     if not callable(source):
         raise PolicyError(
             "a policy is a file, a model or a function of the observation; got "
             f"{type(source).__name__}. For a flax module give (module, variables)"
         )
+    if _is_a(source, "equinox._module._module", "Module"):
+        source = require("equinox", extra="policies").nn.inference_mode(source)
     leaves, structure = jax.tree.flatten(source)
     if leaves and leaves != [source]:
         arrays = [leaf if isinstance(leaf, jax.Array | np.ndarray) else None for leaf in leaves]
         rest = tuple(
             None if a is not None else leaf for a, leaf in zip(arrays, leaves, strict=True)
         )
-        return Policy(arrays, _Rebuilt(structure, rest))
+        return Policy(arrays, _Of(partial(_rebuilt, structure, rest)))
     if count_required(source) == 2:
         return RandomPolicy((), _Function(source, batched))
     return Policy((), _Function(source, batched))
@@ -96,36 +105,44 @@ jax.tree_util.register_dataclass(
 
 
 @dataclass(frozen=True)
-class _Applied:
-    """The function of a flax module of the linen kind."""
+class _Of:
+    """The function of a network without memory: `function(*fixed, weights, observation)`."""
 
-    module: Any
-
-    def __call__(self, weights: PyTree, observation: PyTree, memory: None) -> tuple[Any, None]:
-        return without_extras(self.module.apply(weights, observation)), None
-
-
-@dataclass(frozen=True)
-class _Merged:
-    """The function of a flax module of the nnx kind."""
-
-    graph: Any
+    function: Callable[..., Any]
+    fixed: tuple[Any, ...] = ()
 
     def __call__(self, weights: PyTree, observation: PyTree, memory: None) -> tuple[Any, None]:
-        nnx = require("flax.nnx", extra="policies")
-        return without_extras(nnx.merge(self.graph, weights)(observation)), None
+        return without_extras(self.function(*self.fixed, weights, observation)), None
 
 
-@dataclass(frozen=True, eq=False)
-class _Rebuilt:
-    """The function of a callable pytree, such as a module of equinox."""
+def _linen(module: Any, variables: PyTree, observation: PyTree) -> Any:
+    takes = inspect.signature(type(module).__call__).parameters
+    known = {"train": False, "training": False, "is_training": False, "deterministic": True}
+    try:
+        options = {name: value for name, value in known.items() if name in takes}
+        return module.apply(variables, observation, **options)
+    except Exception as error:
+        if not type(error).__module__.startswith("flax"):
+            raise
+        raise PolicyError(
+            f"{type(module).__name__} cannot be applied to an observation, as if it were in "
+            f"training: {one_line(str(error))[:300]}"
+        ) from error
 
-    structure: Any
-    rest: tuple[Any, ...]
 
-    def __call__(self, weights: PyTree, observation: PyTree, memory: None) -> tuple[Any, None]:
-        leaves = [r if w is None else w for w, r in zip(weights, self.rest, strict=True)]
-        return without_extras(jax.tree.unflatten(self.structure, leaves)(observation)), None
+def _nnx(graph: Any, state: PyTree, observation: PyTree) -> Any:
+    return require("flax.nnx", extra="policies").merge(graph, state)(observation)
+
+
+def _rebuilt(
+    structure: Any, rest: tuple[Any, ...], weights: Sequence[Any], observation: PyTree
+) -> Any:
+    leaves = [r if w is None else w for w, r in zip(weights, rest, strict=True)]
+    return jax.tree.unflatten(structure, leaves)(observation)
+
+
+def _brax(make: Callable[..., Any], weights: PyTree, observation: PyTree) -> Any:
+    return make(weights, deterministic=True)(observation, jax.random.key(0))
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,18 +157,26 @@ class _Function:
 
     @cached_property
     def forms(self) -> dict[Any, Any]:
-        """Shapes of observations that the host computes, with the form of the action."""
+        """Shapes of observations with the form of the action on the host; None if JAX traces it."""
         return {}
 
     def __call__(self, weights: PyTree, observation: PyTree, memory: None) -> tuple[Any, None]:
-        shapes = jax.tree.map(lambda o: (jnp.shape(o), str(jnp.result_type(o))), observation)
-        key = str(shapes)
+        key = str(jax.tree.map(lambda o: (jnp.shape(o), str(jnp.result_type(o))), observation))
         if key not in self.forms:
+            before = state_of(self.function)
             try:
-                traced = without_extras(self.function(observation))
-                return jax.tree.map(jnp.asarray, traced), None
+                pure_program(self.function, observation)
+                self.forms[key] = None
+            except PolicyError:
+                raise
             except Exception as error:
+                after = state_of(self.function)
+                held = [name for name in changed(before, after) if holds_tracer(after, name)]
+                if held:
+                    raise _impure(self.function, why_differs(held)) from error
                 self.forms[key] = self._form(observation, error)
+        if self.forms[key] is None:
+            return jax.tree.map(jnp.asarray, without_extras(self.function(observation))), None
         action = jax.pure_callback(
             self._on_host,
             self.forms[key],
@@ -162,17 +187,25 @@ class _Function:
 
     def _on_host(self, observation: PyTree) -> Any:
         seen = jax.tree.map(np.asarray, observation)
-        return jax.tree.map(_plain, without_extras(self.function(seen)))
+        return jax.tree.map(_plain, returned(self.function, self.function(seen)))
 
     def _form(self, observation: PyTree, error: Exception) -> Any:
         """Return the form of the action on the host, and log the time of a call.
 
-        **Raises:** the errors of the function.
+        **Raises:** `PolicyError` if it remembers earlier calls; the errors of the function.
         """
         zeros = jax.tree.map(lambda o: np.zeros(jnp.shape(o), jnp.result_type(o)), observation)
-        begun = time.perf_counter()
+        before, begun = state_of(self.function), time.perf_counter()
         action = self._on_host(zeros)
         took = time.perf_counter() - begun
+        with contextlib.suppress(ArithmeticError, LookupError, ValueError):
+            # Between two calls that are the same, one with another observation.
+            self._on_host(jax.tree.map(lambda o: (o + 0.1).astype(o.dtype), zeros))
+        again = self._on_host(zeros)
+        kept = changed(before, state_of(self.function))
+        same = map(np.array_equal, jax.tree.leaves(action), jax.tree.leaves(again))
+        if not all(same):
+            raise _impure(self.function, why_differs(kept))
         log.warning(
             "the policy%s runs in Python, %s a call, because JAX cannot trace it: %s",
             defined_at(self.function),
@@ -180,6 +213,43 @@ class _Function:
             one_line(str(error))[:200],
         )
         return jax.tree.map(lambda a: jax.ShapeDtypeStruct(a.shape, a.dtype), action)
+
+
+def returned(function: Callable[..., Any], made: Any) -> Any:
+    """Return the action that a function has returned, without extras.
+
+    **Raises:** `PolicyError` for None.
+    """
+    if made is None:
+        raise PolicyError(
+            f"the policy{defined_at(function)} returned None: it may lack a return statement"
+        )
+    return without_extras(made)
+
+
+def pure_program(function: Callable[..., Any], *arguments: PyTree) -> Any:
+    """Return the program of a policy, traced by JAX.
+
+    **Raises:** `PolicyError` for one that returns None, and for one that is no function of its
+    arguments alone; the errors of tracing.
+    """
+    forms = jax.tree.map(
+        lambda a: jax.ShapeDtypeStruct(jnp.shape(a), jnp.result_type(a)), arguments
+    )
+    # A new function each time: JAX remembers what it traced by the function.
+    trace = lambda: jax.make_jaxpr(lambda *a: returned(function, function(*a)))(*forms)  # noqa: E731
+    watched = watch(function, trace)
+    if watched.why_impure is not None:
+        raise _impure(function, watched.why_impure)
+    return watched.result
+
+
+def _impure(function: Callable[..., Any], why: str) -> PolicyError:
+    return PolicyError(
+        f"the policy{defined_at(function)} {why}, and vj.policy takes functions of the observation "
+        "alone, or of (observation, key) with a random key. An object with a method reset() may be "
+        f"given to vj.gymnasium without vj.policy. {AS_MEMORY}"
+    )
 
 
 def _plain(value: Any) -> np.ndarray:
@@ -282,15 +352,4 @@ def read_brax(folder: Path) -> Policy:
         raise PolicyError(
             f"{folder} holds no checkpoint of Brax' PPO: {one_line(str(error))[:300]}"
         ) from error
-    return Policy(weights, _Inference(networks.make_inference_fn(made)))
-
-
-@dataclass(frozen=True, eq=False)
-class _Inference:
-    """The function of a policy of Brax: `make(weights, deterministic)` gives its inference."""
-
-    make: Callable[..., Any]
-
-    def __call__(self, weights: PyTree, observation: PyTree, memory: None) -> tuple[Any, None]:
-        action, _ = self.make(weights, deterministic=True)(observation, jax.random.key(0))
-        return action, None
+    return Policy(weights, _Of(_brax, (networks.make_inference_fn(made),)))

@@ -22,6 +22,7 @@ from jaxtyping import Array, PyTree
 from verifai_jax.core.messages.errors import check_names, require
 from verifai_jax.core.messages.text import one_line
 from verifai_jax.rl.policies.errors import MAX_BYTES, MAX_NUMBERS, PolicyError
+from verifai_jax.rl.policies.onnx_memory import memory_of
 from verifai_jax.rl.policies.onnx_node import Node
 from verifai_jax.rl.policies.onnx_operators import OPERATORS, output_size
 
@@ -180,7 +181,7 @@ def read_onnx(
     - `path`: path of the file, next to which tensors may be stored; None for bytes.
     - `what`: its name in errors.
     - `output`: name of the output to use, if there are several.
-    - `memory`: the recurrent values `{input: output}`; found by their shapes if None.
+    - `memory`: the recurrent values `{input: output}`; found by ports and names if None.
     **Returns:** the graph, its weights, and its initial memory: zeros, or None.
     **Raises:** `PolicyError` for a damaged model, or one with unsupported operators.
     """
@@ -195,6 +196,12 @@ def read_onnx(
         raise PolicyError(
             f"{what} is not an ONNX model, or is damaged: {one_line(str(error))}"
         ) from error
+    others = sorted({o.domain for o in model.opset_import} - {"", "ai.onnx"})
+    if graph.output and others and not opset:
+        raise PolicyError(
+            f"{what} uses only operators of {', '.join(others)}, such as those of trees, which are "
+            "not supported: give the policy as a Python function, such as one of its ONNX runtime"
+        )
     if not graph.output or not opset:
         raise PolicyError(f"{what} is not an ONNX model: it has no outputs, or names no operators")
     arrays = {t.name: _tensor(t, path, what) for t in graph.initializer}
@@ -205,7 +212,8 @@ def read_onnx(
         if math.prod(_shape(each)) > MAX_NUMBERS:
             raise PolicyError(f"{what} takes an input {each.name!r} of shape {list(_shape(each))}")
     made = [o.name for o in graph.output]
-    feeds = dict(_memory(fed, graph.output, memory))
+    shapes = ({i.name: _shape(i) for i in fed}, {o.name: _shape(o) for o in graph.output})
+    feeds = memory_of(nodes, *shapes, memory, output, what)
     left = [i for i in fed if i.name not in feeds]
     remembered = [i for i in fed if i.name in feeds]
     if not left:
@@ -375,25 +383,6 @@ def _external(tensor: Any, path: Path | None) -> np.ndarray:
 def _shape(value: Any) -> tuple[int, ...]:
     """Return the shape of an input or output, with 1 for an unspecified size."""
     return tuple(int(d.dim_value) or 1 for d in value.type.tensor_type.shape.dim)
-
-
-def _memory(
-    fed: Sequence[Any], made: Sequence[Any], stated: Mapping[str, str] | None
-) -> list[tuple[str, str]]:
-    """Return pairs of a memory input and the output with its next value."""
-    if stated is not None:
-        check_names("input of the network", stated, [i.name for i in fed])
-        check_names("output of the network", stated.values(), [o.name for o in made])
-        return list(stated.items())
-    # The first input is the observation. Another one is memory if an output after the first has its
-    # shape: exporters write states in their order, after the outputs.
-    pairs, left = [], list(made[1:])
-    for one in fed[1:]:
-        match = next((o for o in left if _shape(o) == _shape(one)), None)
-        if match is not None:
-            left.remove(match)
-            pairs.append((one.name, match.name))
-    return pairs
 
 
 def _output(left: list[str], chosen: str | None, made: list[str], what: str) -> str:

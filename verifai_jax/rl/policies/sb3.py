@@ -8,6 +8,8 @@ A model's `.zip` has the settings as JSON (`data`), among them pickled spaces, a
 
 import base64
 import json
+import logging
+import re
 from collections.abc import Mapping
 from typing import Any
 
@@ -16,11 +18,11 @@ import numpy as np
 
 from verifai_jax.rl.policies.base import Actions, Normaliser, Policy
 from verifai_jax.rl.policies.errors import PolicyError
-from verifai_jax.rl.policies.networks import Mlp, activation_name, linear_layers, natural
+from verifai_jax.rl.policies.networks import Mlp, activation_name
 from verifai_jax.rl.policies.pickled import Name, Record, array_of, read_pickle
+from verifai_jax.rl.policies.tensors import Tensors, linear_layers, natural
 from verifai_jax.rl.policies.torch_archive import open_archive, read_member, read_state
 
-Weights = Mapping[str, np.ndarray]
 _KINDS = (
     # What is there, the hidden layers, the last layer (None: the last of the hidden ones), the
     # features.
@@ -31,6 +33,9 @@ _KINDS = (
     ("q_net.q_net.0.weight", "q_net.q_net.", None, "q_net."),
 )
 """PPO and A2C; SAC, with and without hidden layers; TD3 and DDPG; DQN."""
+_POLICIES = re.compile(r"(ActorCritic|MaskableActorCritic|SAC|TD3|TQC|DQN|)(Mlp|Cnn|)Policy")
+_EXTRACTORS = re.compile("FlattenExtractor|NatureCNN")
+EXPORT = "export it as ONNX, and load that"
 
 
 def read_sb3(data: bytes, what: str) -> Policy:
@@ -55,8 +60,15 @@ def read_sb3(data: bytes, what: str) -> Policy:
         if not isinstance(options, Mapping):
             raise PolicyError(f"policy_kwargs of {what} is damaged")
         options = {str(name): value for name, value in options.items()}
-        weights = read_state(read_member(archive, "policy.pth", what), f"policy.pth of {what}")
-        return _policy(weights, observed, acts, options, what)
+        name = f"policy.pth of {what}"
+        weights = Tensors(read_state(read_member(archive, "policy.pth", what), name), name)
+        kind = _unpickled(settings.get("policy_class"), f"policy_class of {what}")
+        _check_class(kind, _POLICIES, "a policy", what)
+        extractor = options.get("features_extractor_class")
+        _check_class(extractor, _EXTRACTORS, "a features extractor", what)
+        loaded = _policy(weights, observed, acts, options, what)
+        weights.settle(EXPORT, logging.INFO)
+        return loaded
     except PolicyError:
         raise
     except Exception as error:
@@ -70,6 +82,8 @@ def read_normaliser(data: bytes, what: str) -> Normaliser:
     """
     record = read_pickle(data, what)
     state = record.state if isinstance(record, Record) else None
+    if isinstance(state, Mapping) and state.get("norm_obs") is False:
+        return Normaliser(jnp.zeros(()), jnp.ones(()))
     if not isinstance(state, Mapping) or "obs_rms" not in state:
         raise PolicyError(f"{what} is not a file of VecNormalize.save: it has no obs_rms")
     statistics = state["obs_rms"]
@@ -84,6 +98,14 @@ def read_normaliser(data: bytes, what: str) -> Normaliser:
     if not np.all(np.isfinite(mean)) or not np.all(scale > 0):
         raise PolicyError(f"{what} has a mean or variance that cannot be a scale")
     return Normaliser(jnp.asarray(mean, np.float32), jnp.asarray(scale, np.float32), clip)
+
+
+def _check_class(given: object, known: re.Pattern[str], role: str, what: str) -> None:
+    """Refuse a class whose computation is not that of the library's own."""
+    name = given.name if isinstance(given, Name) else ""
+    if name and not known.fullmatch(name):
+        remembers = ", which remembers" if name.startswith("Recurrent") else ""
+        raise PolicyError(f"{what} has {role} of the class {name}{remembers}: {EXPORT}")
 
 
 def _number(value: object, name: str, what: str) -> float:
@@ -117,7 +139,7 @@ def _space(entry: Any, role: str, what: str) -> tuple[str, dict[str, Any]]:
 
 
 def _policy(
-    weights: Weights,
+    weights: Tensors,
     observed: tuple[str, dict[str, Any]],
     acts: tuple[str, dict[str, Any]],
     options: Mapping[str, Any],
@@ -128,11 +150,11 @@ def _policy(
         some = ", ".join(sorted(weights)[:3])
         raise PolicyError(
             f"{what} holds a network of another form than PPO, A2C, SAC, TD3, DDPG and DQN have "
-            f"({some} ...): export it as ONNX, and load that"
+            f"({some} ...): {EXPORT}"
         )
     found, hidden, last, features = known[0]
     if "actor.mu.0.weight" in weights and found == "actor.latent_pi.0.weight":
-        raise PolicyError(f"{what} is a SAC with use_sde=True: export it as ONNX, and load that")
+        raise PolicyError(f"{what} is a SAC with use_sde=True: {EXPORT}")
     names = _numbered(weights, hidden) + ([last] if last else [])
     if any(name.startswith("mlp_extractor.shared_net.") for name in weights):
         names = _numbered(weights, "mlp_extractor.shared_net.") + names
@@ -144,14 +166,14 @@ def _policy(
     return Policy(arrays, network, actions=_actions(acts, squashed, what))
 
 
-def _numbered(weights: Weights, prefix: str) -> list[str]:
+def _numbered(weights: Tensors, prefix: str) -> list[str]:
     """Return the names of the layers of a sequence, in order."""
     names = {n.rpartition(".")[0] for n in weights if n.startswith(prefix)}
     return sorted(names, key=natural)
 
 
 def _network(
-    weights: Weights,
+    weights: Tensors,
     names: list[str],
     features: str,
     observed: tuple[str, dict[str, Any]],
@@ -172,8 +194,7 @@ def _network(
     image = len(space.get("_shape") or ()) == 3 and options.get("normalize_images", True) is True
     if kind != "Box" or not image or not all(f"{n}.weight" in weights for n in convolutions):
         raise PolicyError(
-            f"{what} reads observations of {kind} with an unsupported features extractor: export "
-            "it as ONNX, and load that"
+            f"{what} reads observations of {kind} with an unsupported features extractor: {EXPORT}"
         )
     kernels = tuple(
         tuple(jnp.asarray(weights[f"{name}.{part}"], np.float32) for part in ("weight", "bias"))

@@ -16,7 +16,7 @@ import ml_dtypes
 import numpy as np
 
 from verifai_jax.rl.policies.errors import MAX_BYTES, PolicyError
-from verifai_jax.rl.policies.pickled import Name, Persistent, Record, read_pickle
+from verifai_jax.rl.policies.pickled import Name, Persistent, Record, array_of, read_pickle
 
 _STORAGES: dict[str, Any] = {
     "FloatStorage": np.float32,
@@ -87,8 +87,13 @@ def read_state(data: bytes, what: str) -> dict[str, np.ndarray]:
 
 
 def _collect(value: Any, name: str, found: dict[str, np.ndarray], read: Any, depth: int) -> None:
-    items = value.items if isinstance(value, Record) and value.items else value
-    if isinstance(items, Mapping) and depth < 8:
+    items = dict(enumerate(value)) if isinstance(value, list | tuple) else value
+    if isinstance(value, Record):
+        items = value.items or value.state  # An object, such as one of running means.
+    array = array_of(value)
+    if array is not None and array.dtype.kind in "fiub":
+        found[name] = array
+    elif isinstance(items, Mapping) and depth < 8:
         for key, inner in items.items():
             joined = f"{name}.{key}" if name else str(key)
             _collect(inner, joined, found, read, depth + 1)
@@ -121,5 +126,10 @@ def _tensor(value: Any, read: Any, name: str) -> np.ndarray | None:
         raise
     except Exception as error:
         raise PolicyError(f"the tensor {name!r} is damaged: {error}") from error
-    whole = np.array(view)
-    return whole.astype(np.float32) if dtype in (np.float16, ml_dtypes.bfloat16) else whole
+    return widened(np.array(view))
+
+
+def widened(array: np.ndarray) -> np.ndarray:
+    """Return numbers of fewer than 32 bits, which are not integers, as float32."""
+    real = array.dtype.kind not in "iub" and array.dtype.itemsize < 4
+    return array.astype(np.float32) if real else array

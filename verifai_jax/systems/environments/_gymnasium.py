@@ -18,9 +18,11 @@ import jax
 import numpy as np
 from jaxtyping import UInt8
 
+from verifai_jax.core.compute.purity import why_differs
 from verifai_jax.core.messages.checks import check_count
 from verifai_jax.core.messages.errors import require, suggests_options, unknown_name
-from verifai_jax.core.user_code.user_errors import check_called_with
+from verifai_jax.core.user_code.kept_state import changed, state_of
+from verifai_jax.core.user_code.user_errors import check_called_with, defined_at
 from verifai_jax.core.values.gaps import with_gaps
 from verifai_jax.core.values.trace import Status, Trace
 from verifai_jax.core.values.waveform import is_waveform, set_durations
@@ -54,6 +56,10 @@ Env: TypeAlias = Any
 """A `gymnasium.Env`; Gymnasium is an optional package, so its types cannot be imported here."""
 
 
+REPEATED = 50
+"""Decisions of the first episode that are taken again, to see whether the policy remembers."""
+
+
 @dataclasses.dataclass(eq=False)
 class EpisodeFunction:
     """A function `(features, seed) -> Trace` of one episode of an environment.
@@ -83,6 +89,8 @@ class EpisodeFunction:
         self._drawn: dict[int, Any] | None = None
         self._wanted: Collection[int] = ()
         self._memory: Any = None
+        # What the policy saw and did at first, until it has done the same again.
+        self._first: list[tuple[Any, ...]] | None = []
 
     def __getstate__(self) -> dict[str, Any]:
         return {**self.__dict__, "_env": None, "_decide": None}
@@ -135,9 +143,7 @@ class EpisodeFunction:
         if self.configure is not None:
             self.configure(env, features)
         observation = self._start(env, features, seed)
-        if callable(getattr(self.policy, "reset", None)):
-            self.policy.reset()
-        self._memory = first_memory(self.policy, None)
+        self._begin_policy()
         changes = any(is_waveform(features[name]) for name in self.features)
         reward, over, rows, overshoots = 0.0, False, [], 0
         for link in (self.observation_delay, self.action_delay, *self.links):
@@ -166,6 +172,7 @@ class EpisodeFunction:
             observation, reward, terminated, truncated, _ = env.step(action)
             self._check_observation(env, observation, "step must return an", ValueError)
             over = bool(terminated or truncated)
+        self._check_repeats()
         signals = {name: np.stack([row[name] for row in rows]) for name in rows[0]}
         finite = all(bool(np.all(np.isfinite(signal))) for signal in signals.values())
         index = np.minimum(np.arange(self.steps + 1), len(rows) - 1)
@@ -315,10 +322,10 @@ class EpisodeFunction:
             self._decide = episode_signals.host_policy_function(self.policy)
         sees = policy_that_sees(self.policy) is not None
         options = {"features": features_at(features, time)} if sees else {}
-        if self._memory is None:
-            action = self._decide(observation, **options)
-        else:
-            action, self._memory = self._decide(observation, self._memory, **options)
+        before = None if self._first is None or self._first else state_of(self.policy)
+        action = self._decided(observation, options)
+        if self._first is not None and len(self._first) < REPEATED:
+            self._first.append((*copy.deepcopy((observation, options, action)), before))
         try:
             return fit(env.action_space, action, self.clip)
         except Misfit as misfit:
@@ -326,6 +333,35 @@ class EpisodeFunction:
             what = f"one of the {space.n} actions" if kind == "Discrete" else "an action"
             of = f"{self.name}'s {describe(space)}" if kind in ("Dict", "Tuple") else self.name
             raise ValueError(f"policy must return {what} of {of}; {misfit}") from None
+
+    def _begin_policy(self) -> None:
+        if callable(getattr(self.policy, "reset", None)):
+            self.policy.reset()
+        self._memory = first_memory(self.policy, None)
+
+    def _decided(self, observation: object, options: Mapping[str, Any]) -> Any:
+        if self._memory is None:
+            return self._decide(observation, **options)
+        action, self._memory = self._decide(observation, self._memory, **options)
+        return action
+
+    def _check_repeats(self) -> None:
+        """Refuse a policy that acts otherwise in a second episode of the same observations."""
+        first, self._first = list(self._first or ()), []
+        self._begin_policy()
+        for observation, options, action, _ in first:
+            again = self._decided(observation, options)
+            if not all(map(np.array_equal, jax.tree.leaves(action), jax.tree.leaves(again))):
+                kept = changed(first[0][-1], state_of(self.policy))
+                resets = callable(getattr(self.policy, "reset", None))
+                raise ValueError(
+                    f"the policy of {self.name}{defined_at(self.policy)} {why_differs(kept)}: with "
+                    "the observations of an episode again it acts otherwise. "
+                    f"{'Its reset()' if resets else 'Give it a method reset(), which'} is called "
+                    "before each episode and must restore all that it remembers, and seed what "
+                    "it draws"
+                )
+        self._first = None
 
     def _sample(
         self,

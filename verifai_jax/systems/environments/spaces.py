@@ -150,6 +150,8 @@ def _discrete(space: Space, kind: str, value: object) -> Any:
         if not space.contains(value):
             raise _misfit(space, value)
         return value
+    # The argmax of a batch of one stands for the choice.
+    value = np.reshape(value, ()) if kind == "Discrete" and np.shape(value) == (1,) else value  # pyright: ignore
     numbers = _numbers(space, value)
     low = np.asarray(getattr(space, "start", 0))
     choices = {"Discrete": "n", "MultiDiscrete": "nvec"}

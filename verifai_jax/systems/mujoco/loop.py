@@ -15,6 +15,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
+from verifai_jax.core.compute.purity import watch
 from verifai_jax.core.messages.errors import check_names
 from verifai_jax.core.user_code.user_errors import explain_user_error
 from verifai_jax.systems.base import Seed
@@ -391,9 +392,12 @@ class Loop:
                 ended = jnp.asarray(self.terminate(state, watched))
                 if ended.shape != () or ended.dtype != jnp.bool_:
                     raise ValueError(f"terminate must return one truth value; got {outline(ended)}")
-            return signals
+            return signals, control
 
-        jax.eval_shape(everything, features, key)
+        # A new function each time: JAX remembers what it traced by the function.
+        seen = watch(self, lambda: jax.make_jaxpr(lambda *a: everything(*a))(features, key))
+        if seen.why_impure is not None:
+            raise ValueError(f"controller, or another function of the model, {seen.remedy}")
         if any(b.location.array == "ctrl" for b in self.bindings.applied) and self.controller:
             raise ValueError("a feature is bound to a ctrl that the controller already sets")
         for name in features:

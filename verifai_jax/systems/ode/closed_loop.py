@@ -364,9 +364,22 @@ class _Rollout:
                     raise ValueError(f"controller must return {role}; got {outline(decided)}{note}")
                 control = decided[0]
                 check_like(decided[1], memory, "controller", role, note, same_precision=False)
-        derivative = jax.eval_shape(
-            lambda control: loop.dynamics(time, state, control, self.features), control
-        )
+            if control is None:
+                raise ValueError(
+                    "controller must return the control; it returned None, as without a return "
+                    f"statement{defined_at(loop.controller)}"
+                )
+        try:
+            derivative = jax.eval_shape(
+                lambda control: loop.dynamics(time, state, control, self.features), control
+            )
+        except TypeError as error:
+            if control is None and "NoneType" in str(error):
+                raise ValueError(
+                    "dynamics computes with a control, which is None without controller=: "
+                    f"{error}{defined_at(loop.dynamics)}"
+                ) from error
+            raise
         role, note = "the state's derivative, in the form of the state", defined_at(loop.dynamics)
         check_like(derivative, state, "dynamics", role, note, same_precision=False)
         role = "a state, in the form of the state"

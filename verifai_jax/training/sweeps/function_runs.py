@@ -163,13 +163,37 @@ class FunctionRuns(TrainingRuns):
         plain = {name: np.nan_to_num(array) for name, array in held.items()}
         graph, weights, start = read_graph(json.loads(bytes(arrays["graph"])), plain, what)
         policy = Policy(jax.device_get(weights), graph, jax.device_get(start))
+        if (why := self._why_not_of_the_form(policy)) is not None:
+            self.errors.setdefault(number, why)
         curve = Curve(arrays["steps"], arrays["mean_return"])
         seconds = float(arrays["seconds"])
         self._checkpoints[number, rung] = RunCheckpoint(policy, finite, curve, seconds)
 
+    def _why_not_of_the_form(self, policy: Policy) -> str | None:
+        """Say that actions have another shape than those of the example, which fits the problem."""
+        example = self._trainer.untrained_policy("")
+        seen = policy.compute.example(policy.weights)  # pyright: ignore[reportFunctionMemberAccess]
+        try:
+            made, wanted = (
+                jax.eval_shape(partial(_first_action, each), seen) for each in (policy, example)
+            )
+        except Exception:  # The example may be of other observations.
+            return None
+        if made.shape == wanted.shape:
+            return None
+        return (
+            f"the trained policy returns actions of shape {list(made.shape)}, and example= of the "
+            f"trainer, with which the problem was checked, of shape {list(wanted.shape)}"
+        )
+
 
 ARRAY = "array/"
 """Prefix of the names of a policy's arrays among the stored arrays of a training."""
+
+
+def _first_action(policy: Any, observation: Any) -> Any:
+    memory = getattr(policy, "initial_memory", None)
+    return policy.act(observation) if memory is None else policy.act(observation, memory)[0]
 
 
 def train_once(
