@@ -102,12 +102,10 @@ def fmea(
         cache.claim(work, faulty.sources())
         rows = Rows(faulty, known, cache, seed, executor)
         healthy = not rows("healthy", rows.nominal.u[None])[0][0]
-        found = [rows.try_out((name,), samples, budget, budget) for name in known]
+        found = [rows.try_out((name,), samples, budget) for name in known]
         if pairs:
             safe = [effect.name for effect, _ in found if not effect.fails]
-            both = [
-                rows.try_out(pair, samples, 0, budget) for pair in itertools.combinations(safe, 2)
-            ]
+            both = [rows.try_out(pair, samples, budget) for pair in itertools.combinations(safe, 2)]
             found += [each for each in both if each[0].fails]
         run, verdicts, last = _run_of(rows, [points for _, points in found], folder, target), {}, 0
         if run is not None:

@@ -73,13 +73,8 @@ class Rows:
         known = self.cache.remember(f"{what}/{zlib.crc32(points.tobytes())}", simulated)
         return known["violated"], known["proper"], known["rho"]
 
-    def try_out(
-        self, names: tuple[str, ...], samples: int, budget: int, lowering: int
-    ) -> tuple[Effect, Points]:
+    def try_out(self, names: tuple[str, ...], samples: int, budget: int) -> tuple[Effect, Points]:
         """Sample a fault or a pair, search for more failures if few, and lower their severity.
-
-        **Arguments:**
-        - `budget`, `lowering`: simulations at most of the two searches.
 
         **Returns:** the effect without the parts of its counterexample, and failing points, the
         least severe first.
@@ -89,12 +84,10 @@ class Rows:
             points[:, self.groups[name]] = self.rng.random((samples, len(self.groups[name])))
         violated, proper, _ = self(f"samples/{'+'.join(names)}", points)
         failing = points[violated]
-        if len(failing) < FEW and budget:
+        if len(failing) < FEW and budget and len(names) == 1:
             # A few failures by chance may all be refuted; the worst of a search seldom are.
             failing = np.concatenate([failing, self._searched(names, budget)])
-        edge = False
-        if len(failing):
-            failing, edge = self._lowered(names, failing, lowering)
+        failing, edge = self._lowered(names, failing, budget) if len(failing) else (failing, False)
         failures, undecided = int(violated.sum()), int((~proper).sum())
         return Effect(names, len(failing) > 0, failures, samples, undecided, edge=edge), failing
 
@@ -146,13 +139,7 @@ class Rows:
             return points[np.argsort(self._away(points, index), kind="stable")]
 
         failing = ordered(failing)
-        longest = failing[:FOLLOWED].copy()
-        for name in names:
-            if "duration" in faults[name].domains and faults[name].grade != "duration":
-                # With the longest duration they may fail at less.
-                longest[:, self.coordinate(name, "duration")] = 1.0
-        starts = np.unique(np.concatenate([failing[:FOLLOWED], longest]), axis=0)
-        lowest = ordered(self._on_lines(names, index, starts))
+        lowest = ordered(self._on_lines(names, index, failing[:FOLLOWED]))
         edge = False
         if len(lowest) and not draws:
             lowest, edge = self._below(names, index, lowest, budget)
