@@ -23,7 +23,7 @@ from jaxtyping import Array, PyTree
 from verifai_jax.core.messages.errors import check_names, require
 from verifai_jax.core.messages.text import one_line
 from verifai_jax.rl.policies.errors import MAX_BYTES, MAX_NUMBERS, PolicyError
-from verifai_jax.rl.policies.onnx_layers import nothing
+from verifai_jax.rl.policies.onnx_layers import extreme
 from verifai_jax.rl.policies.onnx_node import TYPES, Node, cast, fitting, known
 from verifai_jax.rl.policies.onnx_operators import GROWING, OPERATORS, output_size
 
@@ -121,7 +121,9 @@ class Graph:
         if outputs.dtype in (jnp.float16, jnp.bfloat16):
             outputs = cast(outputs, float)
         if SPILLED in values:
-            outputs = jnp.where(values[SPILLED], nothing(outputs), outputs)
+            real = jnp.issubdtype(outputs.dtype, jnp.floating)
+            none = jnp.nan if real else extreme(outputs, "min")
+            outputs = jnp.where(values[SPILLED], none, outputs)
         for _ in range(added):
             outputs = outputs[0] if outputs.ndim > 1 and outputs.shape[0] == 1 else outputs
         after = tuple(values[name] for _, name in self.memory) or None

@@ -74,13 +74,6 @@ def extreme(x: Value, of: str) -> Any:
     return -jnp.inf if of == "max" else jnp.inf
 
 
-def nothing(x: Value) -> Any:
-    """Return what stands for a number that is not known: NaN, or the whole number farthest out."""
-    if jnp.issubdtype(x.dtype, jnp.floating):
-        return jnp.nan
-    return extreme(x, "min" if jnp.issubdtype(x.dtype, jnp.unsignedinteger) else "max")
-
-
 def conv(node: Node, x: Value, kernel: Value, bias: Value | None = None) -> Value:
     """Return a convolution."""
     strides, dilations, around = _window(node, x, kernel.shape[2:])
