@@ -86,7 +86,7 @@ def _pow(node: Node, a: Value, b: Value) -> Value:
     if not whole(b):
         odd = not known(b) or np.any(b != np.round(b))
         node.refuse(odd, "has a whole number to the power of a real one, which is not supported")
-        b = np.asarray(b, np.int32)
+        b = cast(b, np.int32)
     xp = module(a, b)
     inverse = xp.where(abs(a) == 1, a ** xp.asarray(b % 2, a.dtype), 0)
     return like(xp.where(b < 0, inverse, xp.power(a, xp.maximum(b, 0))), a)
@@ -121,7 +121,8 @@ def _clip(node: Node, x: Value, low: Value | None = None, high: Value | None = N
     high = node.get("max", None) if high is None else high
     xp = module(x)
     if jnp.issubdtype(x.dtype, jnp.floating):
-        ends = jnp.finfo(x.dtype)  # Without an end infinity becomes the greatest number.
+        # Without an end infinity becomes the greatest number.
+        ends: Any = jnp.finfo(x.dtype)
         low, high = (ends.min if low is None else low), (ends.max if high is None else high)
     x = x if low is None else xp.maximum(x, xp.asarray(low, x.dtype))
     return x if high is None else xp.minimum(x, xp.asarray(high, x.dtype))
