@@ -99,8 +99,8 @@ def fitting(what: object, value: Value) -> Value:
     kind = jax.dtypes.canonicalize_dtype(value.dtype) if known(value) else None
     if kind in (np.int32, np.uint32) and np.any(changed := value != value.astype(kind)):
         raise PolicyError(
-            f"{what} has whole numbers beyond {kind}, such as {value[changed].ravel()[0]}: export the "
-            "model with smaller ones, or start Python with JAX_ENABLE_X64=1"
+            f"{what} has whole numbers beyond {kind}, such as {value[changed].ravel()[0]}: export "
+            "the model with smaller ones, or start Python with JAX_ENABLE_X64=1"
         )
     return value
 
