@@ -17,6 +17,8 @@ from verifai_jax.core.messages.checks import check_count, check_name, is_number
 from verifai_jax.features import Categorical, Domain, Struct
 from verifai_jax.systems.delays import line_of
 
+SLACK = 1e-3
+"""Tolerance for rounded instants, in periods: onset 0.3 includes the instant 30 * 0.01 s."""
 Number: TypeAlias = float | Domain
 Vector: TypeAlias = Float[Array | np.ndarray, " n"]
 
@@ -49,6 +51,16 @@ class Moment(NamedTuple):
     acts: bool
     other: Vector | None
     uniform: Callable[[int], Vector]
+
+    @property
+    def instants(self) -> Any:
+        """Number of instants since the first one that is not before the onset."""
+        return self.xp.floor(self.since / self.period + slack(self.time, self.period))
+
+
+def slack(time: Any, period: float) -> Any:
+    """Return the tolerance for a rounded instant, in periods: late times are rounded more."""
+    return SLACK + 2 * np.finfo(np.float32).eps * abs(time) / period
 
 
 class FaultFeatures(Struct):

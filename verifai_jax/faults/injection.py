@@ -15,15 +15,12 @@ from jaxtyping import Array, Bool, Float, Key, PyTree
 
 from verifai_jax.core.compute.keys import mixed_bits
 from verifai_jax.core.messages.errors import check_names
-from verifai_jax.faults.fault import AtMost, Fault, FaultFeatures, Moment
+from verifai_jax.faults.fault import AtMost, Fault, FaultFeatures, Moment, slack
 from verifai_jax.faults.kinds import WrongChannel
 from verifai_jax.features import FeatureSpace
 from verifai_jax.problem.problem import Problem
 from verifai_jax.systems.any_lane import changed_if_needed
 from verifai_jax.systems.channels import Channels, Entries, Instant, Link, Passing, Side
-
-SLACK = 1e-3
-"""Tolerance for rounded instants, in periods: onset 0.3 includes the instant 30 * 0.01 s."""
 
 
 @dataclass(frozen=True)
@@ -123,7 +120,8 @@ class Injected(Link):
         lead = since / now.period
         # A fault that never ends has ended in no sample, and its end moves nothing.
         trail = (since - number["duration"]) / now.period if "duration" in number else -2.0
-        live = possible & (lead >= -SLACK) & (trail < -SLACK)
+        early = -slack(time, now.period)
+        live = possible & (lead >= early) & (trail < early)
         on = live & self._severe(number)
         at = Moment(
             xp, number, live, xp.maximum(since, 0.0), time, now.period, now.step == 0,

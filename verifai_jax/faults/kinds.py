@@ -10,7 +10,7 @@ from jax.lax import erf_inv
 from jaxtyping import PyTree
 
 from verifai_jax.core.compute.derivatives import with_derivative_of
-from verifai_jax.faults.fault import Fault, Moment, Number, Vector, number
+from verifai_jax.faults.fault import SLACK, Fault, Moment, Number, Vector, number
 from verifai_jax.systems.delays import entry, moved_up
 
 
@@ -38,15 +38,17 @@ class Freeze(Fault, holds=True):
 
 
 class HeldAction(Fault, severity="hold", holds=True):
-    """The channel changes only every `hold` seconds and keeps its value in between."""
+    """The channel changes only every `hold` seconds, in whole periods, from the onset on.
+
+    It keeps its value in between.
+    """
 
     channel: str = field(default="action", kw_only=False)
     hold: Number = number(0)
 
     def corrupt(self, good: Vector, memory: PyTree, at: Moment) -> tuple[Vector, PyTree]:
-        steps = at.xp.maximum(1, at.xp.round(at.number["hold"] / at.period))
-        passed = at.xp.round(at.since / at.period)
-        fresh = ~at.live | (passed % steps == 0) | at.first
+        steps = at.xp.maximum(1, _nearest(at.number["hold"] / at.period, at.xp))
+        fresh = ~at.live | (at.instants % steps == 0) | at.first
         held = at.xp.where(fresh, good, memory)
         return held, held
 
@@ -185,6 +187,11 @@ class WrongChannel(Fault):
         return at.other, memory
 
 
+def _nearest(periods: Any, xp: Any) -> Any:
+    """Return the nearest whole number of periods; halves, which are seldom exact, upwards."""
+    return xp.floor(periods + (0.5 + SLACK))
+
+
 def _late(good: Vector, line: Any, seconds: Any, at: Moment) -> tuple[Vector, Any]:
     """Return the value from some seconds ago, in whole periods, and the updated delay line."""
     xp, line = at.xp, moved_up(line, good, at.xp)
@@ -193,7 +200,7 @@ def _late(good: Vector, line: Any, seconds: Any, at: Moment) -> tuple[Vector, An
         line = jax.tree.map(lambda values: xp.where(at.first, good, values), line)
     latest = len(line) - 1
     periods = xp.clip(seconds / at.period, 0, latest)
-    whole = entry(line, xp.round(periods).astype(np.int32), xp)
+    whole = entry(line, xp.minimum(_nearest(periods, xp), latest).astype(np.int32), xp)
     if xp is np or good.dtype.kind != "f" or not latest:
         return whole, line
     left = xp.clip(xp.floor(periods).astype(np.int32), 0, latest - 1)

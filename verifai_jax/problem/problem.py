@@ -147,7 +147,7 @@ class Problem(InNotebook):
         values = {
             "name": name,
             "space": space,
-            "system": as_system(system),
+            "system": as_system(system).with_domains(space.domains),
             "spec": spec,
             "nominal": nominal,
             "description": printable(str(description)),

@@ -21,6 +21,7 @@ from verifai_jax.core.display.notebook import ForUsers
 from verifai_jax.core.user_code.forks import returning_once
 from verifai_jax.core.user_code.user_errors import format_user_error
 from verifai_jax.core.values.trace import Status, Trace
+from verifai_jax.features.domain import Domain
 from verifai_jax.systems.channels import Link, Passing
 
 KnownSignals: TypeAlias = tuple[str, ...] | Mapping[str, int] | None
@@ -87,7 +88,7 @@ class System(ForUsers):
         "fold", "forward_up_to", "held_signals", "known_signals", "lanes", "likely", "links",
         "may_draw", "passing", "refined", "renewed", "reverse_hint", "simulate_batch",
         "simulate_each", "switches", "traced_factor", "unroll", "why_error", "why_not",
-        "with_backend", "with_links", "workers",
+        "with_backend", "with_domains", "with_links", "workers",
     ))  # fmt: skip
     black_box: bool = False
     # About 1 MB of a trace with 200 samples and two signals.
@@ -117,6 +118,10 @@ class System(ForUsers):
         - `features`: `jax.ShapeDtypeStruct`s.
         **Raises:** `ValueError` that names what does not fit.
         """
+
+    def with_domains(self, domains: Mapping[str, Domain]) -> "System":
+        """Return the system for features of these domains; for one that needs their choices."""
+        return self
 
     def abstract(self, features: Features) -> Trace | None:
         """Return the shapes of the trace, its signals as `jax.ShapeDtypeStruct`s.
@@ -274,7 +279,7 @@ class System(ForUsers):
 
 _VALUES = (
     *("black_box", "lanes", "effort", "forward_up_to", "reverse_hint", "dt", "exact_step"),
-    *("traced_factor", "backends", "backend", "likely"),
+    *("traced_factor", "backends", "backend", "likely", "notes"),
 )
 
 
@@ -310,6 +315,11 @@ class FunctionSystem(System):
     def check(self, features: Features) -> None:
         if self._offers("check"):
             self._method("check")(features)
+
+    def with_domains(self, domains: Mapping[str, Domain]) -> System:
+        if self._offers("with_domains"):
+            return as_system(self._method("with_domains")(domains))
+        return self
 
     def abstract(self, features: Features) -> Trace | None:
         if self._offers("abstract"):

@@ -65,8 +65,9 @@ def fmea(
       mission_time)`, independently of other faults. Without a rate, probabilities are conditional
       on the fault.
     - `samples`: number of samples of each fault and of each pair, from the prior.
-    - `budget`: number of simulations of the search that runs if no or few samples fail, and half
-      the budget of the estimate that runs if few samples fail; 0 switches off both.
+    - `budget`: number of simulations of the search that runs if no or few samples fail, of the
+      search for failures below the lowest severity, and half the budget of the estimate that runs
+      if few samples fail; 0 switches off all three.
     - `pairs`: whether to try pairs of the faults that cause no failure alone.
     - `confidence`: the confidence of each interval.
     - `seed`: the seed of everything that is drawn at random.
@@ -104,7 +105,7 @@ def fmea(
         found = [rows.try_out((name,), samples, budget) for name in known]
         if pairs:
             safe = [effect.name for effect, _ in found if not effect.fails]
-            both = [rows.try_out(pair, samples, 0) for pair in itertools.combinations(safe, 2)]
+            both = [rows.try_out(pair, samples, budget) for pair in itertools.combinations(safe, 2)]
             found += [each for each in both if each[0].fails]
         run, verdicts, last = _run_of(rows, [points for _, points in found], folder, target), {}, 0
         if run is not None:

@@ -13,6 +13,7 @@ from verifai_jax.evaluation.replay import replay as simulate_again
 from verifai_jax.falsification.run import Run
 from verifai_jax.falsification.run_folder import replay_command
 from verifai_jax.faults.failure_table.result import Effect
+from verifai_jax.faults.failure_table.rows import ABOVE
 from verifai_jax.faults.fault import Fault
 from verifai_jax.mtl import robustness_signal
 
@@ -46,8 +47,10 @@ def with_counterexample(
         command = f"table.{command}"
     shown_by, shown = _first_difference(again.trace, without.trace)
     grades = [f"{name}.{fault.grade}" for name, fault in own.items()]
+    # Only the first few points lie at the edge; others fail, and something less severe does, too.
+    edge = effect.edge and row - min(verdicts) < len(ABOVE)
     return replace(
-        effect, row=row, severity={number: float(columns[number]) for number in grades},
+        effect, row=row, edge=edge, severity={number: float(columns[number]) for number in grades},
         verdict=verdicts[row], broken=again.worst,
         delay=_violation(again, onset) - max(onset, 0.0), shown_by=shown_by,
         shown_after=shown - max(onset, 0.0), command=command,

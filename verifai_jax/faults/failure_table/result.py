@@ -24,6 +24,8 @@ class Effect:
     - `failures`, `simulations`: counts of the samples of the prior that `probability` rests on.
     - `undecided`: number of these samples without a verdict.
     - `severity`: the lowest severity that fails, by the name of the number; empty without failures.
+    - `edge`: whether a search over all numbers of the faults found nothing that fails at a severity
+      lower by a thousandth of its range; otherwise less may fail, too.
     - `row`: the row of the counterexample in the run of the table; None if there is none.
     - `verdict`: the verdict of `vj.confirm` on that counterexample.
     - `broken`: the name of the broken formula.
@@ -42,6 +44,7 @@ class Effect:
     simulations: int
     undecided: int = 0
     severity: Mapping[str, float] = field(default_factory=dict)
+    edge: bool = False
     row: int | None = None
     verdict: str = ""
     broken: str = ""
@@ -61,8 +64,9 @@ class Effect:
 
     @property
     def severity_text(self) -> str:
-        """The lowest severities that fail, as text."""
-        return ", ".join(f"{name} {value:z.4g}" for name, value in self.severity.items())
+        """The lowest severities that fail, as text; with `at most` where less may fail, too."""
+        text = ", ".join(f"{name} {value:z.4g}" for name, value in self.severity.items())
+        return text if self.edge or not text else f"at most {text}"
 
     @property
     def confirmed(self) -> bool:

@@ -9,8 +9,9 @@ fixed shapes. Source: the ONNX specification, `docs/IR.md` and `docs/Operators.m
 import hashlib
 import json
 import math
+import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -22,13 +23,18 @@ from jaxtyping import Array, PyTree
 from verifai_jax.core.messages.errors import check_names, require
 from verifai_jax.core.messages.text import one_line
 from verifai_jax.rl.policies.errors import MAX_BYTES, MAX_NUMBERS, PolicyError
+from verifai_jax.rl.policies.onnx_layers import extreme
 from verifai_jax.rl.policies.onnx_memory import memory_of
-from verifai_jax.rl.policies.onnx_node import Node
-from verifai_jax.rl.policies.onnx_operators import OPERATORS, output_size
+from verifai_jax.rl.policies.onnx_node import TYPES, Node, cast, fitting, known
+from verifai_jax.rl.policies.onnx_operators import GROWING, OPERATORS, output_size
 
 Values = dict[str, Any]
 OPSET = 18
 """The operator set of the graphs that `writing` makes; runtimes since 2023 read it."""
+SPILLED = ""
+"""What has the name of no value: whether whole numbers have left their range."""
+OPSETS = 7, 26
+"""The first and the last operator set that is read."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,6 +48,7 @@ class Graph:
     - `inputs`: names of the observations, with their shapes.
     - `memory`: pairs of an input and the output that is its next value.
     - `output`: name of the output.
+    - `types`: numbers of the types of inputs; without one it is real.
     """
 
     nodes: tuple[Node, ...]
@@ -49,6 +56,7 @@ class Graph:
     inputs: Mapping[str, tuple[int, ...]]
     memory: tuple[tuple[str, str], ...]
     output: str
+    types: Mapping[str, int] = field(default_factory=dict)
 
     @cached_property
     def digest(self) -> str:
@@ -95,9 +103,8 @@ class Graph:
         for name, shape in self.inputs.items():
             rank = len(shape)
             given = observation[name] if isinstance(observation, Mapping) else observation
-            given = jnp.asarray(given)
-            if not jnp.issubdtype(given.dtype, jnp.floating):
-                given = given.astype(float)
+            given = jnp.asarray(fitting(f"the observation {name!r}", given))
+            given = cast(given, TYPES[self.types.get(name, 1)])
             added = rank - given.ndim
             if added < 0:
                 raise PolicyError(
@@ -108,7 +115,16 @@ class Graph:
         for (name, _), value in zip(self.memory, memory or (), strict=True):
             values[name] = value
         run(self.nodes, values)
-        outputs = jnp.asarray(values[self.output])
+        absent = [n for n in (self.output, *dict(self.memory).values()) if n not in values]
+        if absent:
+            raise PolicyError(f"{absent[0]!r} is an output that is not supported")
+        outputs = jnp.asarray(fitting(f"the output {self.output!r}", values[self.output]))
+        if outputs.dtype in (jnp.float16, jnp.bfloat16):
+            outputs = cast(outputs, float)
+        if SPILLED in values:
+            real = jnp.issubdtype(outputs.dtype, jnp.floating)
+            none = jnp.nan if real else extreme(outputs, "min")
+            outputs = jnp.where(values[SPILLED], none, outputs)
         for _ in range(added):
             outputs = outputs[0] if outputs.ndim > 1 and outputs.shape[0] == 1 else outputs
         after = tuple(values[name] for _, name in self.memory) or None
@@ -132,6 +148,7 @@ def run(nodes: Sequence[Node], values: Values) -> None:
                 outputs = _branch(node, inputs[0], values)
             else:
                 outputs = OPERATORS[node.operator](node, *inputs)
+                _note_spilled(node, inputs, outputs, values)
         except PolicyError:
             raise
         except Exception as error:
@@ -143,6 +160,21 @@ def run(nodes: Sequence[Node], values: Values) -> None:
         total += sum(int(np.size(made)) for made in outputs)
         _check_size(node, total)
         values.update(zip(node.outputs, outputs, strict=False))
+
+
+def _note_spilled(node: Node, inputs: Sequence[Any], outputs: Any, values: Values) -> None:
+    """Note among the values whether whole numbers of 64 bits leave the 32 that JAX has for them."""
+    if isinstance(outputs, tuple) or known(outputs):
+        return
+    for value in inputs if node.operator not in ("Slice", "Reshape", "Expand") else ():
+        fitting(node, value)
+    if not node.wide or node.operator not in GROWING or outputs.dtype.itemsize == 8:
+        return
+    reals = [i if i is None or known(i) else jnp.asarray(i, float) for i in inputs]
+    about = OPERATORS[GROWING[node.operator]](node, *reals)
+    ends = np.iinfo(outputs.dtype)
+    beyond = ~jnp.all((about >= float(ends.min)) & (about < float(ends.max)))
+    values[SPILLED] = values.get(SPILLED, False) | beyond
 
 
 def _check_size(node: Node, count: int) -> None:
@@ -164,6 +196,7 @@ def _branch(node: Node, condition: Any, values: Values) -> tuple[Any, ...]:
     inner, outputs = node.attributes["then_branch" if np.all(condition) else "else_branch"]
     within = dict(values)
     run(inner, within)
+    values.update({SPILLED: within[SPILLED]} if SPILLED in within else {})
     return tuple(within[name] for name in outputs)
 
 
@@ -206,7 +239,24 @@ def read_onnx(
         raise PolicyError(f"{what} is not an ONNX model: it has no outputs, or names no operators")
     arrays = {t.name: _tensor(t, path, what) for t in graph.initializer}
     fed = [i for i in graph.input if i.name not in arrays]
+    first, last = OPSETS
+    if not first <= opset <= last:
+        raise PolicyError(
+            f"{what} has operator set {opset}; {first} to {last} are supported: export it with "
+            f"opset_version={OPSET}"
+        )
+    infer, wrong = package.shape_inference.infer_shapes, ""
+    try:
+        graph = infer(model, check_type=True).graph
+    except Exception as error:
+        # Sizes may be declared wrongly, which does no harm.
+        if re.search("(unsupported|inconsistent) type|input size", str(error)):
+            wrong = one_line(str(error))
     nodes = _nodes(graph, opset, {*arrays, *(i.name for i in fed)}, path, what)
+    types = {i.name: i.type.tensor_type.elem_type for i in fed}
+    wrong = wrong or next((f"type {t} of {n!r}" for n, t in types.items() if t not in TYPES), "")
+    if wrong:
+        raise PolicyError(f"{what} has types that ONNX or this reader does not allow: {wrong}")
     weights, constants = _sorted_out(arrays)
     for each in fed:
         if math.prod(_shape(each)) > MAX_NUMBERS:
@@ -220,21 +270,16 @@ def read_onnx(
         raise PolicyError(f"{what} has no input for an observation")
     inputs = {i.name: _shape(i) for i in left}
     chosen = _output([n for n in made if n not in feeds.values()], output, made, what)
-    whole = package.TensorProto.INT32
-    start = (
-        tuple(
-            jnp.zeros(_shape(i), np.int32 if i.type.tensor_type.elem_type == whole else None)
-            for i in remembered
-        )
-        or None
-    )
+    start = tuple(cast(jnp.zeros(_shape(i)), TYPES[types[i.name]]) for i in remembered) or None
     ordered = tuple((i.name, feeds[i.name]) for i in remembered)
-    return Graph(nodes, constants, inputs, ordered, chosen), weights, start
+    types = {name: types[name] for name in inputs if TYPES[types[name]] is not float}
+    return Graph(nodes, constants, inputs, ordered, chosen, types), weights, start
 
 
 def _sorted_out(arrays: Mapping[str, np.ndarray]) -> tuple[dict[str, Array], dict[str, np.ndarray]]:
     """Return the weights among arrays, which are real numbers, and the others."""
-    weights = {n: jnp.asarray(a) for n, a in arrays.items() if a.dtype.kind == "f" and a.size}
+    real = {n: a for n, a in arrays.items() if a.dtype.kind not in "iub" and a.size}
+    weights = {n: jnp.asarray(a) for n, a in real.items()}
     return weights, {n: a for n, a in arrays.items() if n not in weights}
 
 
@@ -293,26 +338,51 @@ def check_nodes(nodes: Sequence[Node], known: set[str], outputs: Sequence[str], 
 
 
 def _nodes(
-    graph: Any, opset: int, known: set[str], path: Path | None, what: str
+    graph: Any,
+    opset: int,
+    known: set[str],
+    path: Path | None,
+    what: str,
+    types: Mapping[str, int] | None = None,
 ) -> tuple[Node, ...]:
     """Return the nodes of a graph, checked."""
-    found, inner = [], set(known)
+    found, inner, types = [], set(known), {**(types or {})}
+    for each in (*graph.input, *graph.value_info, *graph.output):
+        types[each.name] = each.type.tensor_type.elem_type
+    types |= {each.name: each.data_type for each in graph.initializer}
     for node in graph.node:
         if node.domain not in ("", "ai.onnx"):
             raise PolicyError(
                 f"{what} uses {node.op_type} of {node.domain}, which is not ONNX's own"
             )
-        attributes = {a.name: _attribute(a, opset, inner, path, what) for a in node.attribute}
+        attributes = {
+            a.name: _attribute(a, opset, inner, path, what, types) for a in node.attribute
+        }
         name = node.name or (node.output[0] if node.output else "")
-        found.append(
-            Node(node.op_type, name, tuple(node.input), tuple(node.output), attributes, opset)
-        )
+        wide = any(types.get(output) in (7, 13) for output in node.output[:1])
+        inputs, outputs = tuple(node.input), tuple(node.output)
+        found.append(Node(node.op_type, name, inputs, outputs, attributes, opset, wide))
         inner.update(node.output)
     check_nodes(found, known, [o.name for o in graph.output], what)
+    package = require("onnx", extra="policies")
+    for node in found:
+        try:
+            page = package.defs.get_schema(node.operator, node.opset, "").attributes
+        except package.defs.SchemaError:
+            raise PolicyError(f"{node} of {what} is not in operator set {opset}") from None
+        more = [name for name in node.attributes if name not in page]
+        node.refuse(more, f"of {what} has {more}, no attributes in operator set {opset}")
     return tuple(found)
 
 
-def _attribute(attribute: Any, opset: int, known: set[str], path: Path | None, what: str) -> Any:
+def _attribute(
+    attribute: Any,
+    opset: int,
+    known: set[str],
+    path: Path | None,
+    what: str,
+    types: Mapping[str, int],
+) -> Any:
     package = require("onnx", extra="policies")
     kinds = package.AttributeProto
     if attribute.type == kinds.TENSOR:
@@ -320,7 +390,7 @@ def _attribute(attribute: Any, opset: int, known: set[str], path: Path | None, w
     if attribute.type == kinds.GRAPH:
         inner = attribute.g
         arrays = {t.name: _tensor(t, path, what) for t in inner.initializer}
-        nodes = _nodes(inner, opset, known | {*arrays}, path, what)
+        nodes = _nodes(inner, opset, known | {*arrays}, path, what, types)
         constants = tuple(
             Node("Constant", name, (), (name,), {"value": array}, opset)
             for name, array in arrays.items()
@@ -331,6 +401,8 @@ def _attribute(attribute: Any, opset: int, known: set[str], path: Path | None, w
         return value.decode("utf-8", "replace")
     if isinstance(value, float | int):
         return value
+    if not isinstance(value, list | tuple):
+        raise PolicyError(f"the attribute {attribute.name!r} in {what} is not supported")
     return tuple(v.decode("utf-8", "replace") if isinstance(v, bytes) else v for v in value)
 
 
@@ -349,7 +421,8 @@ def _tensor(tensor: Any, path: Path | None, what: str) -> np.ndarray:
             f"the tensor {tensor.name!r} of {what}: {one_line(str(error))}"
         ) from error
     if array.dtype.kind not in "iub":
-        array = np.asarray(array, np.float32)
+        if array.dtype not in (np.float16, jnp.bfloat16):
+            array = np.asarray(array, np.float32)
         if np.any(np.isnan(array)):
             raise PolicyError(f"the tensor {tensor.name!r} of {what} holds NaN")
     return array

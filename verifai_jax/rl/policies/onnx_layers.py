@@ -8,9 +8,10 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array
 
-from verifai_jax.rl.policies.onnx_node import Node, Value
+from verifai_jax.rl.policies.onnx_node import Node, Value, cast, like
 
 IN_TRAINING = "is in training mode: export the model after model.eval()"
 
@@ -18,28 +19,30 @@ IN_TRAINING = "is in training mode: export the model after model.eval()"
 def layer_normalization(node: Node, x: Value, scale: Value, bias: Value | None = None) -> Value:
     """Return entries divided by their deviation over the last axes, or their RMS about zero."""
     axes = tuple(range(node.get("axis", -1) % x.ndim, x.ndim))
+    given, x = x, cast(x, float)
     if node.operator == "LayerNormalization":
         x = x - jnp.mean(x, axis=axes, keepdims=True)
     variance = jnp.mean(x**2, axis=axes, keepdims=True)
     scaled = x / jnp.sqrt(variance + node.get("epsilon", 1e-5)) * scale
-    return scaled if bias is None else scaled + bias
+    return like(scaled if bias is None else scaled + bias, given)
 
 
 def _across(x: Value, vector: Value) -> Value:
     """Reshape one number per channel so that it broadcasts over a batch."""
-    return jnp.reshape(vector, (1, -1) + (1,) * (x.ndim - 2))
+    return jnp.reshape(vector, ((1, -1) + (1,) * (x.ndim - 2))[: x.ndim])
 
 
 def channel_normalization(node: Node, x: Value, scale: Value, b: Value, *moments: Value) -> Value:
     """Return channels normalised by their stored deviation, or by the deviation of each image."""
     node.refuse(node.get("training_mode", 0), IN_TRAINING)
+    node.refuse(not node.get("spatial", 1), "has spatial=0, which is not supported")
     if moments:
         mean, variance = (_across(x, v) for v in moments)
     else:
         axes = tuple(range(2, x.ndim))
         mean, variance = (f(x, axis=axes, keepdims=True) for f in (jnp.mean, jnp.var))
     scaled = (x - mean) / jnp.sqrt(variance + node.get("epsilon", 1e-5))
-    return scaled * _across(x, scale) + _across(x, b)
+    return like(scaled * _across(x, scale) + _across(x, b), x)
 
 
 def _window(node: Node, x: Value, kernel: tuple[int, ...]) -> tuple[Any, Any, Any]:
@@ -51,12 +54,24 @@ def _window(node: Node, x: Value, kernel: tuple[int, ...]) -> tuple[Any, Any, An
     if not automatic.startswith("SAME"):
         pads = node.get("pads", (0,) * 2 * rank)
         return strides, dilations, list(zip(pads[:rank], pads[rank:], strict=True))
+    odd = node.operator != "Conv" and set(dilations) != {1}
+    node.refuse(odd, f"has auto_pad={automatic} with dilations, on which runtimes disagree")
     around = []
     for size, k, s, d in zip(x.shape[2:], kernel, strides, dilations, strict=True):
         total = max(0, (-(-size // s) - 1) * s + (k - 1) * d + 1 - size)
         upper = (total // 2, total - total // 2)
         around.append(upper if automatic == "SAME_UPPER" else upper[::-1])
     return strides, dilations, around
+
+
+def extreme(x: Value, of: str) -> Any:
+    """Return the value of a type with which a maximum (`max`) or minimum (`min`) begins."""
+    if x.dtype == bool:
+        return of == "min"
+    if jnp.issubdtype(x.dtype, jnp.integer):
+        ends = np.iinfo(x.dtype)
+        return np.asarray(ends.min if of == "max" else ends.max, x.dtype)
+    return -jnp.inf if of == "max" else jnp.inf
 
 
 def conv(node: Node, x: Value, kernel: Value, bias: Value | None = None) -> Value:
@@ -95,7 +110,7 @@ def pool(node: Node, x: Value) -> Value:
         return jax.lax.reduce_window(values, start, function, *sizes, window_dilation=dilated)
 
     if node.operator == "MaxPool":
-        return windows(x, -jnp.inf, jax.lax.max, around)
+        return windows(x, extreme(x, "max"), jax.lax.max, around)
     # Padding counts where the node says so; what lies beyond it never does.
     counted = float(node.get("count_include_pad", 0))
     ones = jnp.pad(jnp.ones_like(x), [(0, 0), (0, 0), *around], constant_values=counted)
@@ -128,6 +143,7 @@ def recurrent(
     unknown = sorted({*names} - {*_FUNCTIONS})
     node.refuse(unknown != [], f"has the activation {unknown[:1]}, which is not supported")
     start = (h, c) if node.operator == "LSTM" else (h,)
+    times = jnp.arange(len(x))
     ends, series = [], []
     for i in range(count):
         biases = jnp.zeros(2 * gates * hidden) if b is None else b[i]
@@ -138,13 +154,18 @@ def recurrent(
         )
         f = [_FUNCTIONS[name] for name in names[i * len(usual) : (i + 1) * len(usual)]]
 
-        def one(carry: Any, at: Array, i: int = i, f: Any = f, bias: Array = bias) -> Any:
-            after = step(node, f, at, carry, r[i], bias, hidden)
-            return after, after[0]
+        def one(carry: Any, at: Any, i: int = i, f: Any = f, bias: Array = bias) -> Any:
+            after = step(node, f, at[0], carry, r[i], bias, hidden)
+            if lengths is None:
+                return after, after[0]
+            # After its end a sequence keeps its state and its output is zero.
+            within = (at[1] < jnp.asarray(lengths))[:, None]
+            after = tuple(jnp.where(within, a, c) for a, c in zip(after, carry, strict=True))
+            return after, jnp.where(within, after[0], 0)
 
-        inputs = x @ w[i].T + input_bias
-        if inputs.shape[0] == 1:
-            end, output = one(first, inputs[0])
+        inputs = x @ w[i].T + input_bias, times
+        if len(x) == 1:
+            end, output = one(first, (inputs[0][0], 0))
             outputs = output[None]
         else:
             backwards = node.get("direction", "forward") == "reverse" or i == 1

@@ -13,16 +13,27 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from verifai_jax.rl.policies.errors import PolicyError
 from verifai_jax.rl.policies.onnx_layers import (
     IN_TRAINING,
     channel_normalization,
     conv,
+    extreme,
     layer_normalization,
     pool,
     recurrent,
 )
-from verifai_jax.rl.policies.onnx_node import Node, Value, known, module, static, static_axes
+from verifai_jax.rl.policies.onnx_node import (
+    TYPES,
+    Node,
+    Value,
+    cast,
+    known,
+    like,
+    module,
+    static,
+    static_axes,
+    whole,
+)
 
 
 def _same(name: str) -> Callable[..., Any]:
@@ -44,23 +55,51 @@ def _by_index(name: str) -> Callable[..., Any]:
     """Return an operator that takes entries of an axis by their indices."""
 
     def operator(node: Node, x: Value, index: Value) -> Value:
-        axis = node.get("axis", 0)
-        index = module(index).where(index < 0, index + x.shape[axis], index)
+        axis = node.get("axis", 0) % x.ndim
+        size = x.shape[axis]
+        beyond = known(index) and np.any((index < -size) | (index >= size))
+        node.refuse(beyond, f"has an index beyond the {size} entries of axis {axis}")
+        index = module(index).where(index < 0, index + size, index)
+        if name == "take_along_axis":
+            x = x[tuple(slice(None if i == axis else n) for i, n in enumerate(index.shape))]
         return getattr(module(x, index), name)(x, index, axis=axis)
 
     return operator
 
 
 def _divide(node: Node, a: Value, b: Value) -> Value:
-    if np.issubdtype(a.dtype, np.integer):
-        return module(a, b).trunc(a / b).astype(a.dtype)  # Towards zero, as in C.
-    return a / b
+    if not whole(a):
+        return a / b
+    down = a // b
+    return down + ((down * b != a) & ((a < 0) != (b < 0)))  # Towards zero, as in C.
+
+
+def _mod(node: Node, a: Value, b: Value) -> Value:
+    as_in_c = node.get("fmod", 0)
+    node.refuse(not (as_in_c or whole(a)), "has fmod=0, which is for whole numbers")
+    return getattr(module(a, b), "fmod" if as_in_c else "mod")(a, b)
+
+
+def _pow(node: Node, a: Value, b: Value) -> Value:
+    if not whole(a):
+        return like(module(a, b).power(a, b), a)
+    if not whole(b):
+        odd = not known(b) or np.any(b != np.round(b))
+        node.refuse(odd, "has a whole number to the power of a real one, which is not supported")
+        b = cast(b, np.int32)
+    xp = module(a, b)
+    inverse = xp.where(abs(a) == 1, a ** xp.asarray(b % 2, a.dtype), 0)
+    return like(xp.where(b < 0, inverse, xp.power(a, xp.maximum(b, 0))), a)
 
 
 def _gemm(node: Node, a: Value, b: Value, c: Value | None = None) -> Value:
     a = a.T if node.get("transA", 0) else a
     b = b.T if node.get("transB", 0) else b
     alpha, beta = node.get("alpha", 1.0), node.get("beta", 1.0)
+    if whole(a):
+        odd = alpha != int(alpha) or beta != int(beta)
+        node.refuse(odd, f"has alpha={alpha:g} and beta={beta:g} for whole numbers")
+        alpha, beta = int(alpha), int(beta)
     product = jnp.matmul(a, b)
     product = product if alpha == 1 else alpha * product
     return product if c is None else product + (c if beta == 1 else beta * c)
@@ -81,23 +120,18 @@ def _clip(node: Node, x: Value, low: Value | None = None, high: Value | None = N
     low = node.get("min", None) if low is None else low
     high = node.get("max", None) if high is None else high
     xp = module(x)
+    if jnp.issubdtype(x.dtype, jnp.floating):
+        # Without an end infinity becomes the greatest number.
+        ends: Any = jnp.finfo(x.dtype)
+        low, high = (ends.min if low is None else low), (ends.max if high is None else high)
     x = x if low is None else xp.maximum(x, xp.asarray(low, x.dtype))
     return x if high is None else xp.minimum(x, xp.asarray(high, x.dtype))
 
 
 def _cast(node: Node, x: Value) -> Any:
-    kinds = {1: float, 10: float, 11: float, 16: float, 6: np.int32, 7: np.int64, 9: np.bool_}
-    kinds |= {2: np.uint8, 3: np.int8, 5: np.int16, 12: np.uint32, 13: np.uint64}
-    kind = kinds.get(node.attributes["to"])
-    if kind is None:
-        raise PolicyError(f"{node} makes numbers of a type that is not supported")
-    if known(x):
-        return np.asarray(x).astype(np.float32 if kind is float else kind)
-    if kind is float and jnp.issubdtype(x.dtype, jnp.floating):
-        return x  # The working precision is the caller's.
-    return x.astype(
-        jnp.result_type(float) if kind is float else jax.dtypes.canonicalize_dtype(kind)
-    )
+    to = node.attributes["to"]
+    node.refuse(to not in TYPES, f"makes numbers of type {to}, which is not supported")
+    return cast(x, TYPES[to])
 
 
 def _constant(node: Node) -> Any:
@@ -118,7 +152,8 @@ def _dropout(node: Node, x: Value, ratio: Value | None = None, training: object 
 
 def _flatten(node: Node, x: Value) -> Value:
     axis = node.get("axis", 1)
-    return x.reshape(math.prod(x.shape[: axis + x.ndim if axis < 0 else axis]), -1)
+    axis = axis + x.ndim if axis < 0 else axis
+    return x.reshape(math.prod(x.shape[:axis]), math.prod(x.shape[axis:]))
 
 
 def _reshape(node: Node, x: Value, shape: Value | None = None) -> Value:
@@ -157,9 +192,12 @@ def _slice(node: Node, x: Value, *given: Value) -> Value:
     steps = [1] * len(starts) if steps is None else steps
     where = [slice(None)] * x.ndim
     for axis, start, end, step in zip(axes, starts, ends, steps, strict=True):
+        size, back = x.shape[axis], step < 0
+        start, end = (at + size if at < 0 else at for at in (start, end))
+        start = min(max(start, 0), size - back)
+        end = min(max(end, -back), size - back)
         # An end before the first entry means "to the first one" when it goes backwards.
-        stop = None if step < 0 and end < -x.shape[axis] else end
-        where[axis] = slice(start, stop, step)
+        where[axis] = slice(start, None if end < 0 else end, step)
     return x[tuple(where)]
 
 
@@ -172,27 +210,39 @@ def _pad(
 ) -> Value:
     widths = node.attributes["pads"] if pads is None else static(node, pads)
     chosen = range(x.ndim) if axes is None else static(node, axes)
-    around = [(0, 0)] * x.ndim
+    around, left = [(0, 0)] * x.ndim, [slice(None)] * x.ndim
     for i, axis in enumerate(chosen):
-        around[axis] = (widths[i], widths[len(chosen) + i])
+        low, high = widths[i], widths[len(chosen) + i]
+        around[axis] = max(low, 0), max(high, 0)
+        left[axis] = slice(max(-low, 0), min(high, 0) or None)
     mode = node.get("mode", "constant")
+    node.refuse(mode not in ("constant", "reflect", "edge", "wrap"), f"has mode={mode!r}")
+    x = x[tuple(left)]
     if mode == "constant":
-        filled = node.get("value", 0.0) if value is None else value
-        return jnp.pad(x, around, constant_values=filled)
-    return jnp.pad(x, around, mode={"reflect": "reflect", "edge": "edge", "wrap": "wrap"}[mode])
+        filled = node.get("value", 0.0) if value is None else jnp.asarray(value).reshape(())
+        return jnp.pad(x, around, constant_values=jnp.asarray(filled, x.dtype))
+    return jnp.pad(x, around, mode=mode)
 
 
 def _reduce(name: str) -> Callable[..., Any]:
     def operator(node: Node, x: Value, axes: Value | None = None) -> Value:
         found = static_axes(node, axes)
         if found is None and node.get("noop_with_empty_axes", 0):
-            return x
-        xp, keep = module(x), bool(node.get("keepdims", 1))
+            found = ()
+        xp, form = module(x), {"axis": found, "keepdims": bool(node.get("keepdims", 1))}
+        if name in ("max", "min"):
+            # Of no values the maximum is the lowest value of the type.
+            none = {"initial": extreme(x, name)} if x.size == 0 else {}
+            return getattr(xp, name)(x, **form, **none)
+        if name == "mean" and whole(x):
+            total = xp.sum(x, **form, dtype=x.dtype)
+            return _divide(node, total, xp.asarray(x.size // max(total.size, 1), x.dtype))
+        node.refuse(name == "l2" and whole(x), "has whole numbers, which are not supported")
         if name in ("l1", "l2"):
-            powers = xp.abs(x) if name == "l1" else x * x
-            total = xp.sum(powers, axis=found, keepdims=keep)
+            x = xp.abs(x) if name == "l1" else x * x
+            total = xp.sum(x, **form, dtype=x.dtype)
             return total if name == "l1" else xp.sqrt(total)
-        return getattr(xp, name)(x, axis=found, keepdims=keep)
+        return getattr(xp, name)(x, **form, dtype=x.dtype)
 
     return operator
 
@@ -208,7 +258,7 @@ def _arg(name: str) -> Callable[..., Any]:
 
 
 _OF_NUMPY = {
-    "Add": "add", "Sub": "subtract", "Mul": "multiply", "Pow": "power", "Sqrt": "sqrt",
+    "Add": "add", "Sub": "subtract", "Mul": "multiply", "Sqrt": "sqrt",
     "Exp": "exp", "Log": "log", "Abs": "abs", "Neg": "negative", "Floor": "floor", "Ceil": "ceil",
     "Round": "round", "Sign": "sign", "Sin": "sin", "Cos": "cos", "Tan": "tan", "Atan": "arctan",
     "Tanh": "tanh", "Equal": "equal", "Greater": "greater", "Less": "less",
@@ -232,6 +282,12 @@ _ACTIVATIONS: dict[str, Callable[[Value], Value]] = {
     "Reciprocal": lambda x: 1 / x,
 }
 """Operators without attributes, as functions of one array."""
+GROWING = {
+    **{name: name for name in ("Add", "Sub", "Mul", "Div", "Pow", "Neg", "Abs", "Sum", "MatMul")},
+    **{name: name for name in ("Gemm", "ReduceSum", "ReduceProd", "ReduceL1")},
+    "ReduceMean": "ReduceSum", "Cast": "Identity", "CastLike": "Identity",
+}  # fmt: skip
+"""Operators whose results may be larger than their inputs, with those that say how large."""
 _ELEMENTWISE = {*_OF_NUMPY, "Min", "Max", "Sum", "Mean", "Div", "Mod", "PRelu", "Where"} - {
     "MatMul"
 }
@@ -280,8 +336,7 @@ OPERATORS: dict[str, Callable[..., Any]] = {
     **{operator: _alone(function) for operator, function in _ACTIVATIONS.items()},
     "Min": _folded("minimum"), "Max": _folded("maximum"), "Sum": _folded("add"),
     "Mean": lambda node, *inputs: sum(inputs) / len(inputs),
-    "Div": _divide, "Gemm": _gemm,
-    "Mod": lambda node, a, b: getattr(module(a, b), "fmod" if node.get("fmod", 0) else "mod")(a, b),
+    "Div": _divide, "Gemm": _gemm, "Mod": _mod, "Pow": _pow,
     "Relu": lambda node, x: module(x).maximum(x, module(x).asarray(0, x.dtype)),
     "Elu": lambda node, x: jax.nn.elu(x, node.get("alpha", 1.0)),
     "Celu": lambda node, x: jax.nn.celu(x, node.get("alpha", 1.0)),
@@ -295,9 +350,9 @@ OPERATORS: dict[str, Callable[..., Any]] = {
     ),
     "Gelu": lambda node, x: jax.nn.gelu(x, node.get("approximate", "none") == "tanh"),
     "Softmax": _softmax(jax.nn.softmax), "LogSoftmax": _softmax(jax.nn.log_softmax),
-    "Clip": _clip, "Cast": _cast, "CastLike": lambda node, x, like: x.astype(like.dtype),
+    "Clip": _clip, "Cast": _cast, "CastLike": lambda node, x, other: cast(x, other.dtype),
     "Constant": _constant, "ConstantOfShape": _constant_of_shape,
-    "Identity": lambda node, x: x, "Dropout": _dropout,
+    "Identity": lambda node, x, *_: x, "Dropout": _dropout,
     "Reshape": _reshape, "Flatten": _flatten, "Squeeze": _squeeze,
     "Transpose": lambda node, x: x.transpose(node.get("perm", tuple(range(x.ndim))[::-1])),
     "Unsqueeze": lambda node, x, axes=None: module(x).expand_dims(

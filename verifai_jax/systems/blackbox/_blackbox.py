@@ -22,6 +22,7 @@ from verifai_jax.core.messages.errors import suggests_options
 from verifai_jax.core.user_code.forks import returning_once
 from verifai_jax.core.values.gaps import with_gaps
 from verifai_jax.core.values.trace import Status, Trace, check_code
+from verifai_jax.features.domain import Domain
 from verifai_jax.systems.base import (
     Features,
     FunctionSystem,
@@ -86,6 +87,17 @@ class _RowByRow(System):
     def check(self, features: Features) -> None:
         """Refuse features that do not fit, if the simulator has a `check` of its own."""
         as_system(self.simulation.function).check(features)
+
+    def with_domains(self, domains: Mapping[str, Domain]) -> System:
+        made = _bare(as_system(self.simulation.function).with_domains(domains))
+        if made is self.simulation.function:
+            return self
+        return self._with(replace(self.simulation, function=made))
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """The notes of the simulator."""
+        return as_system(self.simulation.function).notes
 
     @property
     def exact_step(self) -> bool:

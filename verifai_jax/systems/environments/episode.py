@@ -24,6 +24,7 @@ from verifai_jax.core.values.waveform import is_waveform
 from verifai_jax.systems.base import Carry, Features, Seed
 from verifai_jax.systems.channels import NOTHING_PASSED, Channels
 from verifai_jax.systems.checkpointing import checkpointed_scan
+from verifai_jax.systems.clock import count_periods
 from verifai_jax.systems.pytree_checks import (
     as_precise_as,
     check_like,
@@ -330,11 +331,7 @@ def step_count(
     if steps is not None and duration is not None:
         raise ValueError(f"give either duration or steps; got (duration={duration}, steps={steps})")
     if duration is not None:
-        steps = round(duration / dt) if math.isfinite(duration) else 0
-        if steps < 1 or abs(steps * dt - duration) > 1e-6 * dt * max(steps, 1):
-            raise ValueError(
-                f"duration must be a positive multiple of dt; got (duration={duration}, dt={dt:zg})"
-            )
+        steps = count_periods(duration, dt, "duration")
     chosen = otherwise if steps is None else steps
     if chosen is None:
         raise ValueError("give steps or duration; got neither")

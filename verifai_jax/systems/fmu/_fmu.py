@@ -13,19 +13,25 @@ import shutil
 import tempfile
 import zipfile
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
+import jax
+import jax.numpy as jnp
 import numpy as np
+from jaxtyping import PyTree
 
-from verifai_jax.core.messages.checks import check_positive
+from verifai_jax.core.messages.checks import check_positive, is_number
 from verifai_jax.core.messages.errors import missing_name, suggests_options
 from verifai_jax.core.values.trace import Trace
 from verifai_jax.core.values.waveform import is_waveform
+from verifai_jax.features import Categorical, Domain
 from verifai_jax.systems.base import Features, System
 from verifai_jax.systems.blackbox._blackbox import blackbox
-from verifai_jax.systems.fmu.description import Description, read_description
+from verifai_jax.systems.clock import count_periods
+from verifai_jax.systems.fmu.description import Description, Variable, read_description
 from verifai_jax.systems.fmu.exchange import ExchangeInstance
 from verifai_jax.systems.fmu.library import FMUError, Instance
 
@@ -49,6 +55,8 @@ class FMUSimulation:
     controller: Controller | None
     reuse: bool
     description: Description = field(repr=False)
+    domains: Mapping[str, Domain] = field(default_factory=dict)
+    """The domains of those features that are choices, or have two ends."""
     exact_step = True
     """The steps belong to the FMU and its controller."""
 
@@ -62,9 +70,10 @@ class FMUSimulation:
         return dict.fromkeys(self.outputs, 1)
 
     def check(self, features: Features) -> None:
-        """Check that there is a variable for every feature.
+        """Check that there is a variable for every feature, which can have its values.
 
-        **Raises:** `ValueError` with the first feature without one, and the existing variables.
+        **Raises:** `ValueError` with the first feature for which there is none, and the existing
+        variables; the errors of `Variable.number`.
         """
         for name in features:
             variable = self._variable(name)
@@ -74,9 +83,55 @@ class FMUSimulation:
                     f"the FMU {self.file.name}", "parameter, start value or input",
                     self.bind.get(name, name), settable,
                 )  # fmt: skip
+            if variable:
+                self._check_values(name, self.description.variable(variable), features[name])
         for name in self.bind:
             if name not in features:
                 raise missing_name("the feature space", "feature", name, list(features))
+
+    def _check_values(self, name: str, variable: Variable, form: PyTree) -> None:
+        """Check that a variable can have the values of a feature of this form."""
+        what = f"feature {name!r} sets {variable.name} of the FMU {self.file.name}"
+        moving = is_waveform(form)
+        (leaf, *more), shape = jax.tree.leaves(form), (1,) if moving else ()
+        if more or np.shape(leaf)[moving:] != ():
+            raise ValueError(f"{what}, which is one number; the feature has {shape or 'several'}")
+        domain = self.domains.get(name)
+        real = jnp.issubdtype(leaf.dtype, jnp.floating) and not isinstance(domain, Categorical)
+        if real and not variable.real:
+            raise ValueError(
+                f"{what}, which is of type {variable.type}, by real values: give whole ones, by "
+                "vj.DiscreteBox or vj.Categorical"
+            )
+        for value in _extremes(domain, listed=bool(variable.items)):
+            try:
+                variable.number(value)
+            except ValueError as error:
+                raise type(error)(f"{what}: {error}") from None
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Sentences on features with values beyond the ranges that the FMU declares."""
+        found = []
+        for name, domain in self.domains.items():
+            variable = self.description.variables[self._variable(name) or ""]
+            values = [variable.number(value) for value in _extremes(domain)]
+            if min(values) < variable.low or max(values) > variable.high:
+                found.append(
+                    f"feature {name!r} has values from {min(values):zg} to {max(values):zg}; the "
+                    f"FMU declares {variable.name} from {variable.low:zg} to {variable.high:zg}"
+                )
+        return tuple(found)
+
+    def with_domains(self, domains: Mapping[str, Domain]) -> "FMUSimulation":
+        """Return the same simulation for features of these domains."""
+        known = dict(self.domains)
+        for name, domain in domains.items():
+            while isinstance(inner := getattr(domain, "domain", None), Domain):
+                domain = inner  # Of a Signal, or of one that is held at a value.
+            if self._variable(name) and _extremes(domain):
+                known[name] = domain
+        return self if known == self.domains else replace(self, domains=known)
 
     def __call__(self, features: Features) -> Trace:
         constant, moving = {}, {}
@@ -86,9 +141,9 @@ class FMUSimulation:
                 continue
             if is_waveform(value):
                 course = value if value.duration or value.times else value.over(self.duration)
-                moving[variable] = course
+                moving[variable] = partial(self._value, name, course)
             else:
-                constant[variable] = float(value)
+                constant[variable] = self._value(name, lambda _, value=value: value, 0.0)
         instance, only_once = self._instance(), self.description.only_once
         try:
             trace = self._simulated(instance, constant, moving, features)
@@ -107,17 +162,20 @@ class FMUSimulation:
     def _simulated(
         self,
         instance: Instance,
-        constant: dict[str, float],
+        constant: dict[str, object],
         moving: dict[str, Any],
         features: Features,
     ) -> Trace:
-        steps = round(self.duration / self.dt)
+        steps = count_periods(self.duration, self.dt, "duration")
         names = tuple(self.outputs.values())
 
-        def at(time: float) -> dict[str, float]:
-            return {name: float(course(time)) for name, course in moving.items()}
+        def at(time: float) -> dict[str, Any]:
+            return {name: course(time) for name, course in moving.items()}
 
-        instance.begin({**constant, **at(0.0)}, steps * self.dt)
+        # The last step ends where the simulation does, which a strict FMU compares to the bit.
+        before = (steps - 1) * self.dt
+        end = self.duration if self.description.varies_step else before + self.dt
+        instance.begin({**constant, **at(0.0)}, end)
         rows = [instance.get(names)]
         for step in range(steps):
             time = step * self.dt
@@ -127,13 +185,21 @@ class FMUSimulation:
                 inputs.update(self.controller(time, seen, features))
             if inputs:
                 instance.set(inputs)
-            if not instance.step(time, self.dt):
+            last = step == steps - 1 and self.description.varies_step
+            if not instance.step(time, end - time if last else self.dt):
                 break
             rows.append(instance.get(names))
         valid = len(rows)
         table = np.array(rows + rows[-1:] * (steps + 1 - valid))
         signals = {name: table[:, i] for i, name in enumerate(self.outputs)}
         return Trace(signals, dt=self.dt, valid=None if valid > steps else np.int32(valid))
+
+    def _value(self, feature: str, course: Callable[[float], Any], time: float) -> Any:
+        """Return a feature at a time; of a choice that is no number the choice itself."""
+        value, domain = course(time), self.domains.get(feature)
+        if isinstance(value, str) or not isinstance(domain, Categorical) or domain.numeric:
+            return value
+        return domain.choices[int(value)]
 
     def _variable(self, feature: str) -> str | None:
         """Return the variable that a feature sets; None for one that only the controller sees."""
@@ -158,6 +224,16 @@ class FMUSimulation:
     def _key(self) -> tuple[Path, bool, str]:
         # The token is another one for a model that was exported again under the same name.
         return self.file, self.description.exchange, self.description.token
+
+
+def _extremes(domain: Domain | None, listed: bool = False) -> tuple[Any, ...]:
+    """Return the choices of a domain, or its ends; with `listed` all whole numbers between them."""
+    if isinstance(domain, Categorical):
+        return domain.choices
+    low, high = getattr(domain, "low", None), getattr(domain, "high", None)
+    if not (is_number(low) and is_number(high)):
+        return ()
+    return tuple(range(int(low), int(high) + 1)) if listed else (low, high)
 
 
 def _unpacked(file: Path) -> Path:
@@ -186,12 +262,13 @@ def fmu(
     """Make a system from a Functional Mock-up Unit: FMI 2 or 3, co-simulation or model exchange.
 
     A feature sets the variable with its name before each simulation: a parameter, a start value, or
-    an input; a `Signal` is an input over time. An FMU is an executable program: simulate only those
+    an input; a `Signal` is an input over time. The choices of a feature for an enumeration are the
+    names of its items. An FMU is an executable program: simulate only those
     that you trust.
 
     **Arguments:**
     - `file`: the FMU.
-    - `duration`: duration of a simulation in seconds.
+    - `duration`: duration of a simulation in seconds, a multiple of `dt`.
     - `dt`: seconds between two samples, which is also the communication step.
     - `bind`: a dictionary from features to variables, if their names differ.
     - `outputs`: variables that are signals of the trace: a list of names, or a dictionary from
@@ -211,8 +288,7 @@ def fmu(
     binary for this machine, for variables that do not exist, and times out of range.
     """
     duration, dt = check_positive("duration", duration), check_positive("dt", dt)
-    if dt > duration:
-        raise ValueError(f"dt must be at most the duration of {duration:zg} s; got {dt}")
+    steps = count_periods(duration, dt, "duration")
     description = read_description(file, exchange)
     if description.only_once and not reuse:
         raise ValueError(
@@ -237,7 +313,7 @@ def fmu(
     simulation = FMUSimulation(
         description.file, duration, dt, dict(bind or {}), named, controller, reuse, description
     )
-    form = {"signals": tuple(named), "dt": dt, "length": round(duration / dt) + 1}
+    form = {"signals": tuple(named), "dt": dt, "length": steps + 1}
     return blackbox(simulation, workers=workers, timeout=timeout, **form)
 
 
@@ -273,7 +349,7 @@ def fmu_ranges(
         variable = description.variable(name)
         low, high = variable.low, variable.high
         if not np.isfinite([low, high]).all():
-            if around is None or variable.start is None:
+            if around is None or variable.start is None or not variable.real:
                 raise ValueError(
                     f"{name} of the FMU {description.file.name} declares no finite range ({low:zg} "
                     f"to {high:zg}), but the start value {variable.start}; give around=0.2 for a "

@@ -10,6 +10,7 @@ import math
 import platform
 import sys
 import zipfile
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from xml.etree.ElementTree import Element
@@ -24,6 +25,8 @@ TYPES = {
     "Enumeration": "Integer",
 }  # fmt: skip
 """Types of variables of FMI 2, and by which functions their values are set and read."""
+FLOATS = ("Real", "Float64", "Float32")
+"""Types of real numbers."""
 TYPES3 = {
     **{name: name for name in ("Float64", "Float32", "Boolean", "String")},
     **{f"{sign}Int{bits}": f"{sign}Int{bits}" for sign in ("", "U") for bits in (8, 16, 32, 64)},
@@ -44,6 +47,7 @@ class Variable:
     - `start`: its start value as text; None without one.
     - `low`, `high`: declared range; infinite if it has no end.
     - `scalar`: False for an array.
+    - `items`: the values of an enumeration by the names of its items.
     """
 
     name: str
@@ -57,6 +61,36 @@ class Variable:
     high: float = math.inf
     description: str = ""
     scalar: bool = True
+    items: Mapping[str, int] = field(default_factory=dict)
+
+    def number(self, value: object) -> float:
+        """Return a value as a number: an item of an enumeration by its name, any other as it is.
+
+        **Raises:** `UnknownNameError` for a text that names no item; `ValueError` for a number that
+        a variable of whole numbers cannot have.
+        """
+        if isinstance(value, str):
+            if value not in self.items:
+                raise missing_name(f"the variable {self.name}", "item", value, self.items)
+            return self.items[value]
+        number = float(value)  # pyright: ignore[reportArgumentType]
+        if self.real:
+            return number
+        if self.type == "Boolean":
+            wanted, fits = "0 or 1", number in (0, 1)
+        elif self.items:
+            wanted = ", ".join(f"{value} ({name})" for name, value in self.items.items())
+            fits = number in self.items.values()
+        else:
+            wanted, fits = "a whole number", number.is_integer()
+        if not fits:
+            raise ValueError(f"{self.name} is of type {self.type}: {wanted}; got {number:zg}")
+        return number
+
+    @property
+    def real(self) -> bool:
+        """True if its values are real numbers."""
+        return self.type in FLOATS
 
     @property
     def settable(self) -> bool:
@@ -78,6 +112,7 @@ class Description:
     - `variables`: the variables by name.
     - `exchange`: whether to simulate it by model exchange instead of co-simulation.
     - `sizes`: numbers of continuous states and event indicators, which FMI 2 declares.
+    - `varies_step`: whether a communication step may differ from the others.
     - `keeps_states`: whether the FMU can save and restore its state.
     - `only_once`: whether a process can only have one instance of it.
     - `asks_after_steps`: whether it must be called after each step of the integrator.
@@ -91,6 +126,7 @@ class Description:
     variables: dict[str, Variable] = field(repr=False)
     exchange: bool = False
     sizes: tuple[int, int] = (0, 0)
+    varies_step: bool = False
     keeps_states: bool = False
     only_once: bool = False
     asks_after_steps: bool = True
@@ -186,6 +222,7 @@ def read_description(file: str | Path, exchange: bool | None = None) -> Descript
         path, int(version), root.get("modelName", path.stem),
         kind.get("modelIdentifier", ""), token or "", _variables(root, int(version)),
         exchange, (states, int(root.get("numberOfEventIndicators", "0"))),
+        says("canHandleVariableCommunicationStepSize") or exchange,
         says("canGetAndSetFMUstate" if two else "canGetAndSetFMUState"),
         says("canBeInstantiatedOnlyOncePerProcess"),
         not says("completedIntegratorStepNotNeeded") if two
@@ -195,9 +232,13 @@ def read_description(file: str | Path, exchange: bool | None = None) -> Descript
 
 def _variables(root: Element, version: int) -> dict[str, Variable]:
     declared: dict[str, dict[str, str]] = {}
+    items: dict[str, dict[str, int]] = {}
     for each in root.iterfind("TypeDefinitions/*"):
         inner = each if version == 3 else next(iter(each), each)
         declared[each.get("name", "")] = dict(inner.attrib)
+        items[each.get("name", "")] = {
+            item.get("name", ""): int(item.get("value", "0")) for item in inner.iterfind("Item")
+        }
     found = {}
     for element in root.iterfind("ModelVariables/*"):
         value = element if version == 3 else next(iter(element), element)
@@ -206,7 +247,7 @@ def _variables(root: Element, version: int) -> dict[str, Variable]:
         if kind is None:  # Clocks and binary data.
             continue
         name = element.get("name", "")
-        continuous = value.tag in ("Real", "Float64", "Float32")
+        continuous = value.tag in FLOATS
         start = value.get("start")
         texts = value.find("Start")
         if start is None and texts is not None:
@@ -217,6 +258,6 @@ def _variables(root: Element, version: int) -> dict[str, Variable]:
             element.get("variability", "continuous" if continuous else "discrete"),
             attributes.get("unit", ""), start, float(attributes.get("min", "-inf")),
             float(attributes.get("max", "inf")), element.get("description", ""),
-            value.find("Dimension") is None,
+            value.find("Dimension") is None, items.get(value.get("declaredType", ""), {}),
         )  # fmt: skip
     return found

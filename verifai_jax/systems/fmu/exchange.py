@@ -47,7 +47,7 @@ class ExchangeInstance(Instance):
 
     _running = _sized = False
 
-    def begin(self, values: Mapping[str, float], duration: float) -> None:
+    def begin(self, values: Mapping[str, object], duration: float) -> None:
         self._running = False
         super().begin(values, duration)
         self._running, self._ended = True, False

@@ -45,10 +45,9 @@ class _Callbacks(ctypes.Structure):
 
 
 class _Group(NamedTuple):
-    """Variables of one type: their indices, memory for their values, and calls that use it."""
+    """Variables of one type by their indices, memory for their values, and calls that use it."""
 
-    kind: str
-    indices: list[int]
+    variables: Mapping[int, Variable]
     buffer: Any
     get: Callable[[], int]
     set: Callable[[], int]
@@ -112,7 +111,7 @@ class Instance:
             with suppress(FMUError):
                 self._call(f"GetFMU{self._state}", byref(self.new_state))
 
-    def begin(self, values: Mapping[str, float], duration: float) -> None:
+    def begin(self, values: Mapping[str, object], duration: float) -> None:
         """Set start values and initialise, starting from the state of a new instance."""
         if self._begun:
             self._renew()
@@ -134,13 +133,18 @@ class Instance:
         self._clock.value, self._span.value = time, size
         return self._do_step() != DISCARD and not self._flags[1]
 
-    def set(self, values: Mapping[str, float]) -> None:
-        """Set variables by name."""
-        numbers = list(values.values())
+    def set(self, values: Mapping[str, object]) -> None:
+        """Set variables by name.
+
+        **Raises:** the errors of `Variable.number`; `ValueError` for a number beyond its type.
+        """
+        given = list(values.values())
         for group in self._grouped(tuple(values)):
-            whole = group.kind not in FLOATS
-            for i, index in enumerate(group.indices):
-                group.buffer[i] = round(numbers[index]) if whole else numbers[index]
+            for i, (index, variable) in enumerate(group.variables.items()):
+                number = variable.number(given[index])
+                group.buffer[i] = number if variable.real else int(number)
+                if not variable.real and group.buffer[i] != number:
+                    raise ValueError(f"{variable.name} is of type {variable.type}; got {number:zg}")
             group.set()
 
     def get(self, names: tuple[str, ...]) -> list[float]:
@@ -148,7 +152,7 @@ class Instance:
         found = [0.0] * len(names)
         for group in self._grouped(names):
             group.get()
-            for index, value in zip(group.indices, group.buffer, strict=True):
+            for index, value in zip(group.variables, group.buffer, strict=True):
                 found[index] = float(value)
         return found
 
@@ -193,7 +197,7 @@ class Instance:
         buffer, count = (c_type * len(variables))(), c_size_t(len(variables))
         arguments = (references, count, buffer, *(() if self._two else (count,)))
         get, set_ = (self._prepared(f"{verb}{kind}", *arguments) for verb in ("Get", "Set"))
-        return _Group(kind, [*variables], buffer, get, set_)
+        return _Group(variables, buffer, get, set_)
 
     def _call(self, name: str, *arguments: Any) -> int:
         """Call a function of the instance.
@@ -240,7 +244,3 @@ class Instance:
     def _log3(self, _: Any, status: int, category: Any, message: bytes | None) -> None:
         if status > OK and message:
             self.messages.append(message.decode(errors="replace").strip())
-
-
-FLOATS = ("Real", "Float64", "Float32")
-"""Types whose values are not rounded."""
