@@ -24,7 +24,7 @@ from verifai_jax.analysis.odd_conditions import (
 )
 from verifai_jax.analysis.operational_domain import OperationalDomain
 from verifai_jax.core.messages.errors import check_names, unknown_name
-from verifai_jax.core.store.foreign_files import read_yaml
+from verifai_jax.core.store.foreign_files import read_text, read_yaml
 from verifai_jax.core.user_code.reads import documents
 from verifai_jax.features import FeatureSpace
 
@@ -256,8 +256,9 @@ def _mapping(path: Path) -> dict[str, Any]:
     if not path.exists():
         raise FileNotFoundError(f"there is no file of an operational design domain {path}")
     documents.add(str(path.resolve()))
+    text = read_text(path)
     try:
-        whole = read_yaml(path.read_text(encoding="utf-8"))
+        whole = read_yaml(text)
     except ValueError as error:
         raise ValueError(f"{path} is not YAML: {error}") from None
     if not isinstance(whole, dict):
