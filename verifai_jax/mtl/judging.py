@@ -132,7 +132,8 @@ def judge(
 def _hashed(name: str, source: Recording) -> list[Source]:
     """Return a recording with its hash: its files, or its samples if it is in memory."""
     if isinstance(source, str | Path | Episode):
-        return hashed_files([Path(getattr(source, "path", source))], "a recording")
+        path = source.path if isinstance(source, Episode) else source
+        return hashed_files([Path(path)], "a recording")
     columns: Mapping[str, object] = (
         source.to_dict("list")
         if not isinstance(source, Trace)

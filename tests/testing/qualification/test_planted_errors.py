@@ -77,6 +77,42 @@ PLANTED = {
     "E50": ("statistics/divergence.py", "return 0.0 if limit <= p else binary_divergence(limit, p)", "return 0.0 if limit <= p else 2 * binary_divergence(limit, p)"),
 }  # fmt: skip
 """By identifier of the error: the file, what stands there, and what is planted in its place."""
+BY_ERROR = {
+    "a row of a recording is lost below its units": (
+        "mtl/recording.py",
+        "skip_rows_after_names=int(units)",
+        "skip_rows_after_names=2 * int(units)",
+    ),
+    "a truth value of a recording is read as its opposite": (
+        "mtl/recording.py",
+        "    trace = Trace(signals, dt=dt, times=times, notes=notes, units=units)",
+        "    signals = {n: ~v if v.dtype == bool else v for n, v in signals.items()}\n    trace = Trace(signals, dt=dt, times=times, notes=notes, units=units)",
+    ),
+    "a recording always holds": ("mtl/judging.py", '"holds" if ', '"holds" if True or '),
+    "a robustness on a recording is wrong": (
+        "mtl/host_values.py",
+        "                return -below[0]",
+        "                return below[0]",
+    ),
+    "a monitor takes the least value for the greatest": (
+        "mtl/c_monitor.py",
+        "(b > a) : (b < a)",
+        "(b > a) : (b > a)",
+    ),
+    "a monitor loses its memory": ("mtl/c_monitor.py", "if (index >= 0) { *kept = through; }", ""),
+    "a violation is not shown in the trace matrix": (
+        "testing/traceability/evidence.py",
+        "    if len(broken):",
+        "    if len(broken) > 10**9:",
+    ),
+    "claims that were edited are believed": (
+        "testing/traceability/evidence.py",
+        "    if sealed(data) != data:",
+        "    if False:",
+    ),
+}
+"""The same by the text of the error."""
+PLANTED |= {n: BY_ERROR[hazard.error] for n, hazard in HAZARDS.items() if hazard.error in BY_ERROR}
 
 RUN = "import sys; from verifai_jax.testing.qualification import qualify; found = qualify(sys.argv[1:]);"
 RUN += "print(found); sys.exit(10 if found.passed else 11)"

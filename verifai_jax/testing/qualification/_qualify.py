@@ -5,10 +5,14 @@ found.save("qualification")
 """
 
 import hashlib
+import inspect
+import re
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from datetime import UTC, datetime
 
+import verifai_jax
+from verifai_jax import mtl
 from verifai_jax.core.messages.errors import check_names
 from verifai_jax.core.messages.text import one_line
 from verifai_jax.core.user_code.source_objects import PACKAGE
@@ -41,7 +45,25 @@ def qualify(only: Sequence[str] | None = None) -> Qualification:
         outcomes.append(Outcome(name, what, not message, round(seconds, 2), message))
     now = datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC")
     complete = len(outcomes) == len(ORACLES)
-    return Qualification(tuple(outcomes), dict(versions()), package_hash(), now, complete)
+    unseen = tuple(not_exercised([ORACLES[each.name] for each in outcomes]))
+    return Qualification(tuple(outcomes), dict(versions()), package_hash(), now, complete, unseen)
+
+
+def not_exercised(oracles: Sequence[Callable[[], None]]) -> list[str]:
+    """Return the public functions that are not named in the text of oracles, as users call them."""
+    names = (*verifai_jax.__all__, *(f"mtl.{name}" for name in mtl.__all__))
+    called: set[str] = set()
+    for oracle in oracles:
+        text = inspect.getsource(oracle)
+        # What an oracle has defined at the top of its file counts as its own text.
+        text += "".join(v for v in vars(inspect.getmodule(oracle)).values() if isinstance(v, str))
+        called |= set(re.findall(r"\w+", text))
+    found = []
+    for name in names:
+        value = verifai_jax if "." not in name else mtl
+        if inspect.isroutine(getattr(value, name.rpartition(".")[2], None)):
+            found += [f"vj.{name}"] if name.rpartition(".")[2] not in called else []
+    return found
 
 
 def package_hash() -> str:

@@ -3,7 +3,7 @@
 print(vj.trace_matrix("specs/brake.py", tests=["tests"], runs=["runs"]))
 """
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
 from verifai_jax.core.user_code.sources import hashed_files
@@ -78,6 +78,10 @@ def trace_matrix(
             gaps.append(Gap("missing", "requirement", each.label, f"{text}the problems"))
     evidence = [*runs_in(runs or ())]
     evidence += claims_in([*(each.folder for each in evidence), *(reports or ())])
+    for case in cases:
+        if case.properties.get("vj_problem") in names and not any(map(case.is_of, tested)):
+            text = f"{case.file} has a result of {case.name}, which is not one of the tests"
+            gaps.append(Gap("suspect", "tests", case.name, text))
     rows: list[TraceRow] = []
     for problem in known:
         own = [each for each in evidence if each.problem == problem.name]
@@ -101,8 +105,9 @@ def trace_matrix(
                     gaps += [Gap("suspect", k, name, f"{name}: {text}") for k, text in each.edited]
                     if name in each.outcomes:
                         found_by.append(Result(each.kind, each.name, *each.outcomes[name]))
-            row = _row(problem, name, about, {kind: links.get(kind, ()) for kind in asked})
-            row = row._replace(results=tuple(found_by))
+            demand = ("", "") if about is None else (name, about.text)
+            ends = [links.get(kind, ()) if kind in asked else () for kind in LINKS]
+            row = TraceRow(*demand, formula, problem.name, *ends, results=tuple(found_by))
             gaps += _gaps_of(problem, name, about, row, asked)
             rows.append(row)
     for each in demanded.values():
@@ -122,13 +127,6 @@ def trace_matrix(
         files += [each.folder / RECORD] if each.kind == "runs" else [Path(each.name), each.page]
     inputs = tuple(hashed_files(files, "evidence"))
     return TraceMatrix(tuple(rows), tuple(dict.fromkeys(gaps)), asked, inputs)
-
-
-def _row(
-    problem: Problem, name: str, about: Requirement | None, links: Mapping[str, tuple[str, ...]]
-) -> TraceRow:
-    demand = ("", "") if about is None else (name, about.text)
-    return TraceRow(*demand, str(problem.formulas[name]), problem.name, **links)
 
 
 def _gaps_of(

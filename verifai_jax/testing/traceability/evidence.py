@@ -113,10 +113,11 @@ class Evidence:
         if self.model and model.digests.get(self.backend):
             if self.model != model.digests[self.backend]:
                 yield f"{name}: the model has changed since {self.name}"
-        elif changes := model_changes(self.sources, model.sources):
-            yield f"{name}: the model has changed since {self.name}: {list_changes(changes)}"
-        elif None not in (self.space, model.space) and self.space != model.space:
-            yield f"{name}: the features have changed since {self.name}"
+        else:
+            if changes := model_changes(self.sources, model.sources):
+                yield f"{name}: the model has changed since {self.name}: {list_changes(changes)}"
+            if None not in (self.space, model.space) and self.space != model.space:
+                yield f"{name}: the features have changed since {self.name}"
         if self.kind == "claims":
             if self.result == "run" and self.chain not in model.chains:
                 yield f"{name}: the run has changed since {self.name}, or was not given"

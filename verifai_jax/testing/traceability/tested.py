@@ -4,6 +4,7 @@ tests = [*tests_in(["tests"])]
 cases = read_cases(["junit.xml"])                   # pytest --junitxml=junit.xml
 """
 
+import inspect
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -41,7 +42,8 @@ class Tested(NamedTuple):
     def skipped(self) -> str:
         """The mark of pytest by which it is skipped; empty if it is not."""
         marks = [*getattr(self.function, "pytestmark", ())]
-        there = getattr(self.function, "__globals__", {}).get("pytestmark", ())
+        inner = inspect.unwrap(self.function) if self.function else None
+        there = getattr(inner, "__globals__", {}).get("pytestmark", ())
         marks += there if isinstance(there, list | tuple) else [there]
         for each in marks:
             if each.name == "skip" or (each.name == "skipif" and any(each.args[:1])):
