@@ -94,12 +94,8 @@ BY_ERROR = {
         "                return -below[0]",
         "                return below[0]",
     ),
-    "a monitor takes the least value for the greatest": (
-        "mtl/c_monitor.py",
-        "(b > a) : (b < a)",
-        "(b > a) : (b > a)",
-    ),
-    "a monitor loses its memory": ("mtl/c_monitor.py", "if (index >= 0) { *kept = through; }", ""),
+    "a monitor takes the least value for the greatest": ("mtl/streams.py", "delay, sign * f.sign, 0.0, a, b)", "delay, -sign * f.sign, 0.0, a, b)"),
+    "a monitor forgets the beginning of a window": ("mtl/streams.py", 'return self.op("accumulate", (slot,), delay, sign * f.sign, 0.0, a, b)', 'return self.op("accumulate", (slot,), delay, sign * f.sign, 0.0, b, b)'),
     "a violation is not shown in the trace matrix": (
         "testing/traceability/evidence.py",
         "    if len(broken):",
@@ -110,7 +106,7 @@ BY_ERROR = {
         "    if sealed(data) != data:",
         "    if False:",
     ),
-}
+}  # fmt: skip
 """The same by the text of the error."""
 PLANTED |= {n: BY_ERROR[hazard.error] for n, hazard in HAZARDS.items() if hazard.error in BY_ERROR}
 
