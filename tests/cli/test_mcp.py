@@ -40,7 +40,7 @@ def request(number, method, **params):
 
 
 def answers(folder, *lines):
-    return [json.loads(line) for line in server(folder).answers(iter(lines))]
+    return [json.loads(line) for line in server(folder).answers(lines)]
 
 
 def test_messages(folder):
@@ -89,7 +89,7 @@ def test_no_message_ends_the_server(folder, line):
         raise AssertionError(f"{name} is not JSON")
 
     (folder / "loop").symlink_to(folder / "loop")
-    lines = server(folder).answers(iter([line, request(2, "ping")]))
+    lines = server(folder).answers([line, request(2, "ping")])
     first, second = (json.loads(each, parse_constant=plain) for each in lines)
     assert first.get("error") or first["result"]["isError"]
     assert second == {"jsonrpc": "2.0", "id": 2, "result": {}}

@@ -109,7 +109,9 @@ def test_defaults_and_choices_and_names(tmp_path):
     assert read_one(tmp_path, given, names={"own": "id"} | {"more": "Comment"}).id == "7"
     assert read_one(tmp_path, given, names=names).id == "7"
     names = {"text": "Name", "id": "Key"}
-    with pytest.raises(ValueError, match=r"of its attributes, .*'key', .*'name', .* an object must"):
+    with pytest.raises(
+        ValueError, match=r"of its attributes, .*'key', .*'name', .* an object must"
+    ):
         read_one(tmp_path, {"id": "7"}, names=names)
 
 

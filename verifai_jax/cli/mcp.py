@@ -11,10 +11,10 @@ import re
 import shlex
 import subprocess
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, NamedTuple, TextIO
+from typing import Any, NamedTuple
 
 import click
 
@@ -123,7 +123,7 @@ class Server:
     seconds: float
     spent: int = field(default=0, init=False)
 
-    def answers(self, lines: TextIO) -> Iterator[str]:
+    def answers(self, lines: Iterable[str]) -> Iterator[str]:
         """Yield an answer to each request, as a line; no line ends the server."""
         for line in filter(str.strip, lines):
             try:

@@ -14,6 +14,7 @@ from pathlib import Path
 import pytest
 
 from verifai_jax.testing.qualification import qualify
+from verifai_jax.testing.qualification._qualify import not_exercised
 from verifai_jax.testing.qualification.oracles import ORACLES
 from verifai_jax.testing.qualification.result import HAZARDS
 
@@ -162,6 +163,18 @@ def test_an_oracle_falls_and_is_said_to(monkeypatch, tmp_path):
     assert '"package_sha256"' in (tmp_path / "qualification.json").read_text()
     with pytest.raises(ValueError, match="'nothing'"):
         qualify(["nothing"])
+
+
+def test_what_is_not_exercised_is_listed(monkeypatch):
+    every = not_exercised([*ORACLES.values()])
+    assert {"vj.mtl.judge", "vj.mtl.watch", "vj.falsify", "vj.estimate", "vj.resume"}.isdisjoint(
+        every
+    )
+    assert {"vj.sweep", "vj.mtl.export_c"} <= set(every)
+    root = sys.modules["verifai_jax"]
+    monkeypatch.setattr(root, "__all__", [*root.__all__, "divine"])
+    monkeypatch.setattr(root, "divine", lambda: None, raising=False)
+    assert "vj.divine" in not_exercised([*ORACLES.values()])
 
 
 @pytest.mark.slow

@@ -55,7 +55,7 @@ class SavedCounterexample:
     - `verdict`: the verdict of closer replays of its row; empty if there were none.
     - `changed`: the departures from nominal, `[nominal, value]` by coordinate, if it was shrunk.
     - `found`: the search, its budget, the number of simulations, the version, the `sources`: the
-      files of the model, as a run records them, and the `place` of the problem (`place_of`).
+      files of the model, as a run records them, and the `origin` of the problem (`origin_of`).
     """
 
     problem: str
@@ -76,7 +76,7 @@ class SavedCounterexample:
         """Name of its file: the problem's name, and a digest of what determines the simulation."""
         deciding = [self.problem, self.formulas, self.features, self.seed, self.row]
         # Another problem of this name has files of its own.
-        deciding += [self.found["place"]] if "place" in self.found else []
+        deciding += [self.found["origin"]] if "origin" in self.found else []
         text = json.dumps(deciding, sort_keys=True)
         stem = re.sub(r"\W+", "-", self.problem).strip("-")[:60] or "counterexample"
         return f"{stem}-{hashlib.sha256(text.encode()).hexdigest()[:10]}.json"
@@ -253,7 +253,7 @@ def save_counterexamples(
                 "version": run.version,
                 "jax": jax.__version__,
                 "sources": _sources(run, row),
-                "place": place_of(problem),
+                "origin": origin_of(problem),
             },
         )
         paths[saved.write(folder)] = None
@@ -267,7 +267,7 @@ def _sources(run: Run, row: int) -> dict[str, Any]:
     return {} if found is None else replace(found, root="", first=0).to_json()
 
 
-def place_of(problem: Problem) -> list[str]:
+def origin_of(problem: Problem) -> list[str]:
     """Return the file that makes a problem and, if others there have its name, its variable."""
     file = problem.made_in[-1].file if problem.made_in else ""
     here = Path(file).name if file else ""
@@ -281,11 +281,11 @@ def is_elsewhere(saved: SavedCounterexample, problem: Problem) -> bool:
 
     One whose file or variable is not there any more may be of this problem, which was moved.
     """
-    place = saved.found.get("place")
-    if not isinstance(place, list) or len(place) != 2 or not all(map(_is_text, place)):
+    origin = saved.found.get("origin")
+    if not isinstance(origin, list) or len(origin) != 2 or not all(map(_is_text, origin)):
         return False
     file = problem.made_in[-1].file if problem.made_in else ""
-    was, variable = Path(str(place[0])), place[1]
+    was, variable = Path(str(origin[0])), origin[1]
     if not file or not was.name:
         return False
     if Path(file).parts[-len(was.parts) :] != was.parts:

@@ -4,14 +4,16 @@ found = qualify()
 found.save("qualification")
 """
 
+import ast
 import hashlib
 import inspect
 import re
+import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from datetime import UTC, datetime
+from types import FunctionType
 
-import verifai_jax
 from verifai_jax import mtl
 from verifai_jax.core.messages.errors import check_names
 from verifai_jax.core.messages.text import one_line
@@ -45,22 +47,29 @@ def qualify(only: Sequence[str] | None = None) -> Qualification:
         outcomes.append(Outcome(name, what, not message, round(seconds, 2), message))
     now = datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC")
     complete = len(outcomes) == len(ORACLES)
-    unseen = tuple(not_exercised([ORACLES[each.name] for each in outcomes]))
+    unseen = tuple(
+        not_exercised(
+            [each for name in outcomes if isinstance(each := ORACLES[name.name], FunctionType)]
+        )
+    )
     return Qualification(tuple(outcomes), dict(versions()), package_hash(), now, complete, unseen)
 
 
-def not_exercised(oracles: Sequence[Callable[[], None]]) -> list[str]:
+def not_exercised(oracles: Sequence[FunctionType]) -> list[str]:
     """Return the public functions that are not named in the text of oracles, as users call them."""
-    names = (*verifai_jax.__all__, *(f"mtl.{name}" for name in mtl.__all__))
+    root = sys.modules["verifai_jax"]
+    names = (*root.__all__, *(f"mtl.{name}" for name in mtl.__all__))
     called: set[str] = set()
     for oracle in oracles:
-        text = inspect.getsource(oracle)
-        # What an oracle has defined at the top of its file counts as its own text.
-        text += "".join(v for v in vars(inspect.getmodule(oracle)).values() if isinstance(v, str))
-        called |= set(re.findall(r"\w+", text))
+        parts = [*ast.walk(ast.parse(inspect.getsource(oracle)))]
+        called |= {part.id for part in parts if isinstance(part, ast.Name)}
+        called |= {part.attr for part in parts if isinstance(part, ast.Attribute)}
+        # A process that an oracle starts has its program as a text.
+        for name in called & {name for name in oracle.__globals__ if name.isupper()}:
+            called |= set(re.findall(r"vj\.(\w+)", str(oracle.__globals__[name])))
     found = []
     for name in names:
-        value = verifai_jax if "." not in name else mtl
+        value = root if "." not in name else mtl
         if inspect.isroutine(getattr(value, name.rpartition(".")[2], None)):
             found += [f"vj.{name}"] if name.rpartition(".")[2] not in called else []
     return found

@@ -43,8 +43,10 @@ def readings() -> None:
     with _empty_folder():
         Path("drive.csv").write_text(RECORDED, encoding="utf-8")
         trace = mtl.read("drive.csv", time="when")
-    assert np.allclose(trace.clock() - trace.clock()[0], [0.0, 0.5, 1.0]), trace.clock()
-    assert np.allclose(trace.signals["speed"], [1.5, -2.25, 3.0]), trace.signals["speed"]
+    clock = np.asarray(trace.clock())
+    assert np.allclose(clock - clock[0], [0.0, 0.5, 1.0]), clock
+    speed = np.asarray(trace.signals["speed"])
+    assert np.allclose(speed, [1.5, -2.25, 3.0]), speed
     assert trace.units["speed"] == "km/h", trace.units
     formulas = {"now": "brake", "never": "always brake", "some": "eventually !brake"}
     truths = mtl.judge(formulas, trace)

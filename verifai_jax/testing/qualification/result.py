@@ -254,7 +254,10 @@ _BY_ORACLE = {
         "a truth value of a recording is read as its opposite",
     ),
     "judgements": ("a recording always holds", "a robustness on a recording is wrong"),
-    "monitors": ("a monitor takes the least value for the greatest", "a monitor forgets the beginning of a window"),
+    "monitors": (
+        "a monitor takes the least value for the greatest",
+        "a monitor forgets the beginning of a window",
+    ),
     "matrices": (
         "a violation is not shown in the trace matrix",
         "claims that were edited are believed",

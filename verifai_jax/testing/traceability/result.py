@@ -32,7 +32,7 @@ OUTCOMES = (VIOLATED, ERROR, SKIPPED, NOT_RUN, MET)
 
 
 class Result(NamedTuple):
-    """What a test or a run found of a requirement.
+    """A finding of a test or a run on a requirement.
 
     - `link`: `"tests"` or `"runs"`.
     - `name`: its name or folder.
