@@ -196,8 +196,12 @@ def _session(item: pytest.Item) -> Any:
 
 def _tell(item: pytest.Item, now: Any) -> None:
     """Note what came of a test where JUnit's report takes it from."""
+    from verifai_jax.testing.checking._test import source_hash
+
     for outcome in now.outcomes:
         item.user_properties += list(outcome.properties.items())
+    if now.outcomes and hasattr(item, "function"):
+        item.user_properties.append(("vj_source", source_hash(item.function)))
 
 
 def _failure(item: pytest.Item, found: Any, target: str | None) -> str:

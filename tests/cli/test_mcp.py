@@ -40,7 +40,7 @@ def request(number, method, **params):
 
 
 def answers(folder, *lines):
-    return [json.loads(line) for line in server(folder).answers(iter(lines))]
+    return [json.loads(line) for line in server(folder).answers(lines)]
 
 
 def test_messages(folder):
@@ -64,6 +64,57 @@ def test_messages(folder):
     assert "there is no tool 'shell'; there are list, check" in tool["error"]["message"]
     (newest,) = answers(folder, request(1, "initialize", protocolVersion="1999-01-01"))
     assert newest["result"]["protocolVersion"] == "2025-11-25"
+
+
+HOSTILE = [
+    "[" * 100_000,
+    '{"a":' * 100_000,
+    '{"id": NaN, "method": "ping"}',
+    '{"id": 1e999, "method": "ping"}',
+    '{"id": [], "method": "ping"}',
+    '{"id": true, "method": "ping"}',
+    '{"id": ' + "9" * 5000 + ', "method": "ping"}',
+    '{"id": 1, "method": "ping", "params": null}',
+    '{"id": 1, "method": "tools/call", "params": {"name": []}}',
+    '{"id": 1, "method": "tools/call", "params": {"name": {"a": 1}}}',
+    request(1, "tools/call", name="list", arguments={"location": "\ud800"}),
+    request(1, "tools/call", name="list", arguments={"location": "loop"}),
+    request(1, "tools/call", name="list", arguments={"location": "a" * 450}),
+]
+
+
+@pytest.mark.parametrize("line", HOSTILE, ids=lambda line: line[:60])
+def test_no_message_ends_the_server(folder, line):
+    def plain(name):
+        raise AssertionError(f"{name} is not JSON")
+
+    (folder / "loop").symlink_to(folder / "loop")
+    lines = server(folder).answers([line, request(2, "ping")])
+    first, second = (json.loads(each, parse_constant=plain) for each in lines)
+    assert first.get("error") or first["result"]["isError"]
+    assert second == {"jsonrpc": "2.0", "id": 2, "result": {}}
+
+
+@pytest.mark.slow
+def test_only_files_of_the_folder_are_run_and_only_the_result_is_on_descriptor_1(folder):
+    outside = folder.parent / "outside.py"
+    outside.write_text(f"open({str(folder / 'ran')!r}, 'w')")
+    (folder / "tests").mkdir()
+    for place in ("specs/link.py", "tests/test_link.py"):
+        (folder / place).symlink_to(outside)
+    noise = "import ctypes, os\nctypes.CDLL(None).printf(b'from C')\nos.write(1, b'raw')\n"
+    (folder / "specs" / "brake.py").write_text(noise + SPEC)
+    serving = server(folder)
+    listed = serving.call("list", {})
+    (target,) = (each["target"] for each in listed["structuredContent"]["targets"])
+    assert target == "specs/brake.py:brake"
+    assert "specs/link.py leads out of" in listed["content"][0]["text"]
+    traced = serving.call("trace", {"problem": target})
+    assert "tests/test_link.py leads out of" in traced["content"][0]["text"]
+    assert not (folder / "ran").exists()
+    (folder / "agent_problems").symlink_to(folder.parent)
+    with pytest.raises(ValueError, match="agent_problems leads out of the folder"):
+        serving._write({"name": "outside", "problem": target, "formula": "x > 0"})
 
 
 def test_each_tool_has_a_schema(folder):

@@ -1,6 +1,7 @@
 """Many requirements on many recordings: the verdicts of each alone, and what is said of all."""
 
 import concurrent.futures
+import hashlib
 import json
 from xml.etree import ElementTree
 
@@ -92,6 +93,14 @@ def test_a_fleet_has_the_verdicts_of_its_recordings_alone(logs, tmp_path):
     assert "sample times must increase" in page
     claims = json.loads((tmp_path / "report.claims.json").read_text())
     assert claims["claims"][0]["claim"] == "gap fails on 1 of 3 recordings with a verdict."
+    files = [path for path in logs.rglob("*") if path.is_file()]
+    assert len(found.inputs) >= len(files)
+    for path in files:
+        content = path.read_bytes()
+        (own,) = (each for each in found.inputs if each.name.endswith(path.name))
+        assert own.role == f"a recording, {len(content):,} bytes"
+        assert own.sha256 == hashlib.sha256(content).hexdigest()
+        assert own.sha256 in page
     with concurrent.futures.ThreadPoolExecutor(1) as executor:
         assert judge(requirements, logs, executor=executor) == found
 

@@ -24,8 +24,9 @@ from verifai_jax.analysis.odd_conditions import (
 )
 from verifai_jax.analysis.operational_domain import OperationalDomain
 from verifai_jax.core.messages.errors import check_names, unknown_name
-from verifai_jax.core.store.foreign_files import read_yaml
+from verifai_jax.core.store.foreign_files import read_text, read_yaml
 from verifai_jax.core.user_code.reads import documents
+from verifai_jax.core.user_code.sources import hashed_files
 from verifai_jax.features import FeatureSpace
 
 ABOUT = ("attribute", "unit", "reason", "source")
@@ -51,21 +52,23 @@ def read_odd(path: str | Path) -> OperationalDomain:
     **Raises:** `FileNotFoundError`; `ValueError` naming the entry, for any other file.
     """
     path = Path(path)
-    whole = _mapping(path)
+    files: dict[Path, None] = {}
+    whole = _mapping(path, files)
     said: dict[str, dict[str, str]] = {}
     if "openodd" in whole:
         check_names(f"entry of {path}", whole, ("openodd", "name", "features"))
         tree = {}
         for name in _listed(whole["openodd"]):
-            tree = _joined(tree, _with_imports(path.parent / name))
+            tree = _joined(tree, _with_imports(path.parent / name, files))
         for feature, about in (whole.get("features") or {}).items():
             if not isinstance(about, Mapping) or "attribute" not in about:
                 raise ValueError(f"{path}: feature {feature!r} needs its attribute")
             check_names(f"entry of feature {feature!r} of {path}", about, ABOUT)
             said[str(feature)] = {key: str(value) for key, value in about.items()}
     else:
-        tree = _joined({}, _with_imports(path))
-    return _domain(str(whole.get("name", path.stem)), str(path), tree, said)
+        tree = _joined({}, _with_imports(path, files))
+    found = _domain(str(whole.get("name", path.stem)), str(path), tree, said)
+    return replace(found, files=tuple(hashed_files(files, "the operational design domain")))
 
 
 def odd_of(
@@ -252,12 +255,14 @@ def _refuse_circles(name: str, above: tuple[str, ...], uses: Mapping[str, set[st
         _refuse_circles(other, (*above, name), uses)
 
 
-def _mapping(path: Path) -> dict[str, Any]:
+def _mapping(path: Path, files: dict[Path, None]) -> dict[str, Any]:
     if not path.exists():
         raise FileNotFoundError(f"there is no file of an operational design domain {path}")
     documents.add(str(path.resolve()))
+    files[path] = None
+    text = read_text(path)
     try:
-        whole = read_yaml(path.read_text(encoding="utf-8"))
+        whole = read_yaml(text)
     except ValueError as error:
         raise ValueError(f"{path} is not YAML: {error}") from None
     if not isinstance(whole, dict):
@@ -265,15 +270,17 @@ def _mapping(path: Path) -> dict[str, Any]:
     return whole
 
 
-def _with_imports(path: Path, above: tuple[Path, ...] = ()) -> dict[str, Any]:
+def _with_imports(
+    path: Path, files: dict[Path, None], above: tuple[Path, ...] = ()
+) -> dict[str, Any]:
     """Return a file of OpenODD together with those that it imports."""
     if path in above:
         raise ValueError(f"{path} imports itself")
-    whole = _mapping(path)
+    whole = _mapping(path, files)
     check_names(f"section of {path}", whole, SECTIONS)
     tree: dict[str, Any] = {}
     for name in _listed(whole.pop("IMPORT", None)):
-        tree = _joined(tree, _with_imports(path.parent / name, (*above, path)))
+        tree = _joined(tree, _with_imports(path.parent / name, files, (*above, path)))
     return _joined(tree, whole)
 
 

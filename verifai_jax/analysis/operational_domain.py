@@ -28,6 +28,7 @@ from verifai_jax.analysis.data.samples import Source
 from verifai_jax.core.display.lazy import lazy_import
 from verifai_jax.core.store.atomic_files import replacing
 from verifai_jax.core.store.foreign_files import write_yaml
+from verifai_jax.core.user_code.sources import Source as HashedFile
 from verifai_jax.features import Box, Categorical, DiscreteBox, Domain, FeatureSpace
 
 
@@ -39,6 +40,7 @@ class OperationalDomain:
     - `attributes`: its attributes, in the order of the taxonomy.
     - `modules`: its modules by name; those in `roots` have to hold.
     - `document`: the tree of the file, from which `write` writes.
+    - `files`: the files that it was read from, with their hashes.
     """
 
     name: str
@@ -46,6 +48,7 @@ class OperationalDomain:
     modules: Mapping[str, odd_conditions.Module] = field(repr=False)
     roots: tuple[str, ...]
     document: Mapping[str, Any] = field(repr=False)
+    files: tuple[HashedFile, ...] = field(default=(), repr=False, compare=False)
 
     @property
     def features(self) -> dict[str, odd_conditions.Attribute]:

@@ -5,16 +5,19 @@
         ...
         give_result(probability=found.probability, low=found.low, high=found.high)
 
-With `--json` the standard output is only this object; text for people goes to the standard error
-stream. Numbers that are not finite are null.
+With `--json` the standard output is only this object; text for people, and what libraries and
+processes write to descriptor 1, goes to the standard error stream. Numbers that are not finite are
+null.
 """
 
 import contextlib
+import ctypes
 import functools
 import json
 import math
+import os
 import sys
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import asdict, fields, is_dataclass
 from pathlib import Path
 from typing import Any
@@ -44,13 +47,34 @@ class ReportingCommand(click.Command):
         if not ctx.params.pop("as_json"):
             return super().invoke(ctx)
         try:
-            with contextlib.redirect_stdout(sys.stderr):
+            with contextlib.redirect_stdout(sys.stderr), _descriptor_to_errors():
                 return super().invoke(ctx)
         finally:
             # A gate that failed, or no verdict at all, has a result too.
             if _RESULT in ctx.meta:
                 about = {"command": ctx.info_name, "version": __version__}
                 click.echo(json.dumps(about | ctx.meta[_RESULT], indent=2, allow_nan=False))
+
+
+@contextlib.contextmanager
+def _descriptor_to_errors() -> Iterator[None]:
+    """Let what is written to descriptor 1, past Python, go to the error stream."""
+    try:
+        sys.stdout.flush()
+        kept = os.dup(1)
+    except OSError:  # It is closed.
+        yield
+        return
+    try:
+        with contextlib.suppress(OSError):
+            os.dup2(2, 1)
+        yield
+    finally:
+        # What C has buffered would come out at its end, after the result.
+        with contextlib.suppress(AttributeError, OSError, TypeError):
+            ctypes.CDLL(None).fflush(None)
+        os.dup2(kept, 1)
+        os.close(kept)
 
 
 command = functools.partial(click.command, cls=ReportingCommand)

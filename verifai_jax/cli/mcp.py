@@ -11,15 +11,16 @@ import re
 import shlex
 import subprocess
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, NamedTuple, TextIO
+from typing import Any, NamedTuple
 
 import click
 
 from verifai_jax._version import __version__
 from verifai_jax.cli.exit_codes import CommandError
+from verifai_jax.core.user_code.source_objects import FENCE
 
 VERSIONS = ("2025-11-25", "2025-06-18", "2025-03-26", "2024-11-05")
 """Versions of the protocol, the newest first."""
@@ -122,19 +123,31 @@ class Server:
     seconds: float
     spent: int = field(default=0, init=False)
 
-    def answers(self, lines: TextIO) -> Iterator[str]:
-        """Yield an answer to each request, as a line."""
+    def answers(self, lines: Iterable[str]) -> Iterator[str]:
+        """Yield an answer to each request, as a line; no line ends the server."""
         for line in filter(str.strip, lines):
             try:
-                request = json.loads(line)
-            except ValueError:
+                request = json.loads(line, parse_constant=_refuse_constant)
+            except (ValueError, RecursionError):
                 yield _line(None, error={"code": -32700, "message": "the message is not JSON"})
                 continue
-            valid = isinstance(request, dict) and isinstance(request.get("method"), str)
-            if not valid or not isinstance(request.get("params", {}), dict):
+            if not isinstance(request, dict):
                 yield _line(None, error={"code": -32600, "message": "this is not a request"})
+                continue
+            number = request.get("id")
+            whole = isinstance(number, str | int) and not isinstance(number, bool)
+            valid = whole or ("id" not in request)
+            method, params = request.get("method"), request.get("params", {})
+            if not valid or not isinstance(method, str) or not isinstance(params, dict):
+                error = {"code": -32600, "message": "this is not a request"}
+                yield _line(number if whole else None, error=error)
             elif "id" in request:  # Nothing is answered to a notification.
-                yield self._answer(request["id"], request["method"], request.get("params", {}))
+                try:
+                    yield self._answer(number, method, params)
+                except Exception as error:
+                    # Whatever it is, the next message may be a good one.
+                    text = f"{type(error).__name__}: {error}"[:SHOWN]
+                    yield _line(number, error={"code": -32603, "message": text})
 
     def _answer(self, number: object, method: str, params: Mapping[str, Any]) -> str:
         match method:
@@ -156,11 +169,11 @@ class Server:
                 return _line(number, result={"tools": tools})
             case "tools/call":
                 name, given = params.get("name"), params.get("arguments") or {}
-                if name not in TOOLS or not isinstance(given, dict):
-                    text = f"there is no tool {name!r}; there are {', '.join(TOOLS)}"
+                if not isinstance(name, str) or name not in TOOLS or not isinstance(given, dict):
+                    text = f"there is no tool {name!r:.80}; there are {', '.join(TOOLS)}"
                     return _line(number, error={"code": -32602, "message": text})
                 return _line(number, result=self.call(name, given))
-        return _line(number, error={"code": -32601, "message": f"no method {method!r}"})
+        return _line(number, error={"code": -32601, "message": f"no method {method!r:.80}"})
 
     def call(self, name: str, given: Mapping[str, Any]) -> dict[str, Any]:
         """Call a tool; errors are part of its answer, for the agent to read."""
@@ -190,7 +203,8 @@ class Server:
         done = self._run(words)
         text = done.stderr[-SHOWN:].strip()
         try:
-            result = json.loads(done.stdout) if done.stdout.strip() else {}
+            # A library may print something more while its process ends.
+            result, _ = json.JSONDecoder().raw_decode(done.stdout.lstrip() or "{}")
         except ValueError:
             result = {}
         failed = done.returncode not in (0, 1)
@@ -208,7 +222,7 @@ class Server:
             return subprocess.run(
                 command, cwd=self.folder, capture_output=True, text=True, timeout=self.seconds,
                 stdin=subprocess.DEVNULL, check=False, errors="replace",
-                env={**os.environ, "MPLBACKEND": "agg"},
+                env={**os.environ, "MPLBACKEND": "agg", FENCE: str(self.folder)},
             )  # fmt: skip
         except subprocess.TimeoutExpired:
             text = f"it was ended after {self.seconds:zg} s; take a smaller budget"
@@ -227,6 +241,8 @@ class Server:
         """Write a problem with another formula, and return its target."""
         name = values["name"]
         path = self.folder / OWN / f"{name}.py"
+        if not path.resolve().is_relative_to(self.folder):
+            raise Refused(f"{OWN} leads out of the folder of this server")
         path.parent.mkdir(exist_ok=True)
         text = (
             "from dataclasses import replace\n\nimport verifai_jax as vj\n"
@@ -275,6 +291,10 @@ def _content(text: str, result: Mapping[str, Any], failed: bool) -> dict[str, An
     return {"content": parts, "structuredContent": dict(result), "isError": failed}
 
 
+def _refuse_constant(name: str) -> None:
+    raise ValueError(f"{name} is not JSON")
+
+
 def _line(number: object, **answer: object) -> str:
     return json.dumps({"jsonrpc": "2.0", "id": number, **answer})
 
@@ -308,5 +328,6 @@ def mcp(folder: Path, budget: int, total: int, seconds: float) -> None:
     """
     if not folder.is_dir():
         raise CommandError(f"there is no folder {folder}", 2)
+    sys.stdin.reconfigure(errors="replace")  # pyright: ignore[reportAttributeAccessIssue]
     for line in Server(folder.resolve(), budget, total, seconds).answers(sys.stdin):
         click.echo(line)

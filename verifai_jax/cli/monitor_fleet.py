@@ -93,4 +93,6 @@ def load_requirements(
 
 def _is_file(formula: str) -> bool:
     """Return whether an argument names a file of requirements, whether or not it can be read."""
-    return Path(formula).suffix.lower() in (".toml", ".csv", ".yaml", ".yml", ".reqif")
+    from verifai_jax.mtl.requirements import ENDINGS
+
+    return Path(formula).suffix.lower() in ENDINGS

@@ -96,6 +96,7 @@ def report(
         odd=None if odd is None else read_odd(odd),
         assessment=assessment,
         problem=problem,
+        files=[folder] if folder.is_file() else [],
     )
     give_result(report=path, claims=claims_path(path))
     click.echo(f"  report       {path}")

@@ -22,6 +22,12 @@ FOLDER = PATH
     "--reports", type=FOLDER, multiple=True, help="Files or folders of reports  [default: reports]"
 )
 @option(
+    "--results",
+    type=FOLDER,
+    multiple=True,
+    help="Files of pytest --junitxml, or folders of them  [default: junit.xml]",
+)
+@option(
     "--without",
     multiple=True,
     type=click.Choice(["tests", "runs", "reports"]),
@@ -33,6 +39,7 @@ FOLDER = PATH
     missing="if a link is missing",
     suspect="if a link is suspect",
     incomplete="if a link is missing or suspect",
+    unmet="if a requirement is violated, not run, skipped or in error, or a link is suspect",
 )
 def trace(
     targets: tuple[str, ...],
@@ -40,6 +47,7 @@ def trace(
     tests: tuple[Path, ...],
     runs: tuple[Path, ...],
     reports: tuple[Path, ...],
+    results: tuple[Path, ...],
     without: tuple[str, ...],
     csv: Path | None,
     report: Path | None,
@@ -60,6 +68,7 @@ def trace(
     found = trace_matrix(
         targets,
         requirements=requirements,
+        results=results or [each for each in [Path("junit.xml")] if each.is_file()],
         **{name: None if name in without else given for name, given in asked.items()},
     )
     click.echo(printable(str(found)))
@@ -69,10 +78,11 @@ def trace(
     give_result(
         complete=found.complete,
         gaps=[gap._asdict() for gap in found.gaps],
-        rows=[row._asdict() for row in found.rows],
+        rows=[{**row._asdict(), "outcome": row.outcome} for row in found.rows],
     )
     missing, suspect = bool(found.missing), bool(found.suspect)
     failed = {"missing": missing, "suspect": suspect, "incomplete": missing or suspect}
+    failed["unmet"] = suspect or bool(found.unmet)
     check_gate(fail_on, failed)
 
 

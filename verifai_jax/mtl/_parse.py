@@ -26,6 +26,14 @@ MAX_TOKENS = 10_000
 is given by mistake is refused before it is parsed."""
 MAX_OFFERED = 300
 """Characters of a text that an error offers at most; a longer one would be cut when it is shown."""
+TYPOGRAPHY = {
+    "≤": "<=", "≥": ">=", "≠": "!=", "−": "-", "–": "-", "‑": "-", "×": "*", "·": "*", "÷": "/",
+    "²": "**2", "³": "**3", "∧": "&", "∨": "|", "¬": "!", "→": "->", "⇒": "->", "↔": "<->",
+    "⇔": "<->", "□": " always ", "◇": " eventually ", "\u00ad": "", "\u200b": "", "\u2060": "",
+    "\ufeff": "",
+}  # fmt: skip
+"""Characters that word processors write, outside of quotation marks, as they are written here."""
+_TYPED = re.compile(rf'"[^"\n]*"|[{"".join(TYPOGRAPHY)}]')
 _TOKEN = re.compile(r'"[^"\n]*"|[\w.]+|\S')
 
 
@@ -68,6 +76,8 @@ def _read(
         raise TypeError(f"a formula's text is a str; got {type(text).__name__}")
     import lark
 
+    text = text.translate(dict.fromkeys(map(ord, "“”„"), '"'))
+    text = _TYPED.sub(lambda found: TYPOGRAPHY.get(found[0], found[0]), text)
     _check_size(text)
     try:
         tree = parser().parse(text)

@@ -14,6 +14,7 @@ from verifai_jax.core.display.lazy import lazy_import
 from verifai_jax.core.display.notebook import InNotebook, frame_html
 from verifai_jax.core.messages.text import counted, printable, shorten
 from verifai_jax.core.store.atomic_files import replacing
+from verifai_jax.core.user_code.sources import Source
 from verifai_jax.mtl.requirements import Requirement
 
 if TYPE_CHECKING:
@@ -47,10 +48,15 @@ class Row(NamedTuple):
 
 @dataclass(frozen=True)
 class Judgement(InNotebook):
-    """The verdicts of requirements on recordings; `str()` writes the summary."""
+    """The verdicts of requirements on recordings; `str()` writes the summary.
+
+    **Fields:** `requirements`; `rows`, one for each recording and requirement; `inputs`, the files
+    of recordings and requirements with their hashes as they were read.
+    """
 
     requirements: tuple[Requirement, ...]
     rows: tuple[Row, ...] = field(repr=False)
+    inputs: tuple[Source, ...] = field(default=(), repr=False)
 
     @functools.cached_property
     def table(self) -> "pd.DataFrame":

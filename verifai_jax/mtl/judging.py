@@ -9,8 +9,10 @@ on a recording with NumPy, and common parts only once.
 """
 
 import functools
+import hashlib
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -20,8 +22,10 @@ from verifai_jax.core.compute.executors import Executor, check_executor, gather
 from verifai_jax.core.display.progress import count_done, shows_progress
 from verifai_jax.core.messages.errors import missing_name
 from verifai_jax.core.messages.text import format_time, one_line
+from verifai_jax.core.user_code.sources import Source, hashed_files
 from verifai_jax.core.values.trace import Trace
 from verifai_jax.mtl._robustness import first_nan
+from verifai_jax.mtl.containers import Episode
 from verifai_jax.mtl.evaluate import End
 from verifai_jax.mtl.formula import Formula
 from verifai_jax.mtl.host_values import HostValues
@@ -101,7 +105,15 @@ def judge(
         if ended is not None:
             ended(index, found)
 
-    named = named_recordings(recordings)
+    files = dict.fromkeys(Path(each.file) for each in requirements if each.file)
+    inputs = hashed_files(files, "requirements")
+
+    def seen() -> Iterator[tuple[str, Recording]]:
+        for name, source in named_recordings(recordings):
+            inputs.extend(_hashed(name, source))
+            yield name, source
+
+    named = seen()
     if executor is None:
         for index, (name, source) in enumerate(named):
             keep(index, judge_recording(requirements, name, source, reading))
@@ -114,7 +126,26 @@ def judge(
         gather(calls, keep)
     if not rows:
         raise ValueError("there is no recording to judge")
-    return Judgement(requirements, tuple(row for index in sorted(rows) for row in rows[index]))
+    ordered = tuple(row for index in sorted(rows) for row in rows[index])
+    return Judgement(requirements, ordered, tuple(dict.fromkeys(inputs)))
+
+
+def _hashed(name: str, source: Recording) -> list[Source]:
+    """Return a recording with its hash: its files, or its samples if it is in memory."""
+    if isinstance(source, str | Path | Episode):
+        path = source.path if isinstance(source, Episode) else source
+        return hashed_files([Path(path)], "a recording")
+    columns: Mapping[str, object] = (
+        source.to_dict("list")
+        if not isinstance(source, Trace)
+        else {**source.signals, "time": source.clock()}
+    )
+    whole = hashlib.sha256()
+    for column, values in sorted(columns.items(), key=str):
+        array = np.asarray(values)
+        whole.update(f"{column} {array.dtype} {array.shape}\n".encode())
+        whole.update(repr(values).encode() if array.dtype.hasobject else array.tobytes())
+    return [Source(name, "a recording in memory, by name and samples", whole.hexdigest())]
 
 
 def judge_recording(

@@ -1,34 +1,32 @@
 """Files of requirements: sentences with their formulas.
 
-    read_requirements("requirements.toml")              # tables [[requirement]]
-    read_requirements("requirements.yaml")              # a list `requirements`
-    read_requirements("requirements.csv")               # a row a requirement
-    read_requirements("requirements.reqif")             # OMG's exchange format
-    write_requirements(requirements, "requirements.csv")
-
-Source of ReqIF: OMG, Requirements Interchange Format 1.2, formal/2016-07-01. A file with a document
-type is refused unread, since its entities could read other files or expand without end.
+read_requirements("requirements.toml")              # tables [[requirement]]
+read_requirements("requirements.yaml")              # a list `requirements`
+read_requirements("requirements.csv")               # a row a requirement; also ; and tabs
+read_requirements("requirements.reqif")             # OMG's exchange format
+write_requirements(requirements, "requirements.csv")
 """
 
 import csv
 import os
 import tomllib
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from datetime import UTC, datetime
+from io import StringIO
+from itertools import zip_longest
 from pathlib import Path
-from xml.etree import ElementTree
-from xml.etree.ElementTree import Element
+from reprlib import repr as shown
 
 from verifai_jax.core.messages.errors import check_names
 from verifai_jax.core.store.atomic_files import replacing
-from verifai_jax.core.store.foreign_files import read_xml, read_yaml
+from verifai_jax.core.store.foreign_files import read_text, read_yaml
 from verifai_jax.core.user_code.reads import documents
 from verifai_jax.mtl._parse import parse
 from verifai_jax.mtl.formula import Formula
+from verifai_jax.mtl.reqif import links_of, read_reqif, reqif_document
 from verifai_jax.mtl.setting import as_formula
 
-ENDINGS = (".toml", ".yaml", ".yml", ".csv", ".reqif")
+ENDINGS = (".toml", ".yaml", ".yml", ".csv", ".reqif", ".reqifz")
 """Endings of files of requirements."""
 FIELDS: tuple[str, ...] = (
     "id",
@@ -82,7 +80,9 @@ class Requirement:
         """Return its fields as texts; empty ones are left out."""
         formula = "" if self.formula is None else str(self.formula)
         said = {name: getattr(self, name) for name in FIELDS}
-        said |= {"formula": formula, "links": " ".join(self.links)}
+        spaced = any(" " in link or "," in link for link in self.links)
+        links = "".join(f"{link}; " for link in self.links).strip() if spaced else ""
+        said |= {"formula": formula, "links": links or " ".join(self.links)}
         return {name: value for name, value in said.items() if value}
 
 
@@ -113,7 +113,7 @@ def read_requirements(
     definitions: Mapping[str, str] | None = None,
     need_formulas: bool = True,
 ) -> tuple[Requirement, ...]:
-    """Read requirements from a TOML, YAML, CSV or ReqIF file.
+    """Read requirements from a TOML, YAML, CSV or ReqIF file, or an archive `.reqifz` of these.
 
     A TOML file has a table `[[requirement]]` for each, and may have tables `[constants]` and
     `[definitions]` of names that the formulas use; a YAML file has the same as a list
@@ -141,9 +141,8 @@ def read_requirements(
     numbers, parts = dict(constants or {}), dict(definitions or {})
     entries: Sequence[Mapping[str, object]]
     if suffix == ".csv":
-        with open(path, encoding="utf-8-sig", newline="") as file:
-            entries = list(csv.DictReader(file))
-    elif suffix == ".reqif":
+        entries = _rows(path)
+    elif suffix in (".reqif", ".reqifz"):
         entries = read_reqif(path, FIELDS)
     else:
         entries, numbers, parts = _tables(path, numbers, parts)
@@ -151,7 +150,7 @@ def read_requirements(
     for index, entry in enumerate(entries, 1):
         where = f"requirement {index} of {path}"
         fields = _fields(where, entry, need_formulas)
-        links = tuple(fields.pop("links", "").replace(";", " ").replace(",", " ").split())
+        links = links_of(fields.pop("links", ""))
         try:
             text = fields.pop("formula", None)
             formula = None if text is None else parse(text, numbers, parts)
@@ -184,32 +183,61 @@ def write_requirements(requirements: Iterable[Requirement], path: str | Path) ->
     return path
 
 
+def _rows(path: Path) -> list[dict[str, object]]:
+    """Return the entries of a CSV file, separated by commas, semicolons or tabs."""
+    lines = StringIO(read_text(path)).readlines()
+    # Excel may say its separator first.
+    says = bool(lines) and lines[0].lower().startswith("sep=")
+    named = lines.pop(0)[4:].rstrip("\n") if says else ""
+    head = lines[0] if lines else ""
+    try:
+        separator = named or max((",", ";", "\t"), key=head.count)
+        table = [row for row in csv.reader(lines, delimiter=separator, strict=True) if any(row)]
+    except (csv.Error, TypeError) as error:
+        raise ValueError(f"{path} is not CSV: {error}") from None
+    names = [name.strip() for name in table[0]] if table else []
+    for name in filter(None, names):
+        if names.count(name) > 1:
+            raise ValueError(f"{path} has more than one column {name!r}")
+    for number, row in enumerate(table[1:], 1):
+        if over := [cell for cell, name in zip_longest(row, names) if cell and not name]:
+            raise ValueError(
+                f"requirement {number} of {path} has the cell {shown(over[0])} below no name: "
+                f"quote a text that contains {separator!r}"
+            )
+    return [dict(zip(names, row, strict=False)) for row in table[1:]]
+
+
 def _tables(
     path: Path, numbers: dict[str, float], parts: dict[str, str]
 ) -> tuple[Sequence[Mapping[str, object]], dict[str, float], dict[str, str]]:
     """Return the entries of a TOML or YAML file, and all names that their formulas may use."""
     kind = "TOML" if path.suffix.lower() == ".toml" else "YAML"
+    text = read_text(path)
     try:
-        text = path.read_text(encoding="utf-8")
-        whole: object = tomllib.loads(text) if kind == "TOML" else read_yaml(text)
+        whole: object = (tomllib.loads if kind == "TOML" else read_yaml)(text)
+    except RecursionError:
+        raise ValueError(f"{path} is nested too deeply: an entry has texts alone") from None
     except ValueError as error:
         raise ValueError(f"{path} is not {kind}: {error}") from None
     if not isinstance(whole, dict):
         raise ValueError(f"{path} must have a list `requirements`; got {type(whole).__name__}")
     listed = "requirements" if "requirements" in whole else "requirement"
     check_names(f"table of {path}", map(str, whole), (listed, "constants", "definitions"))
-    entries, own, named = (
-        whole.get(listed, []), whole.get("constants", {}), whole.get("definitions", {}),
-    )  # fmt: skip
+    entries = whole.get(listed) or []
+    own, named = (whole.get(name) or {} for name in ("constants", "definitions"))
+    for name, table in (("constants", own), ("definitions", named)):
+        if not isinstance(table, dict):
+            raise ValueError(f"{path}: {name} must be a table of names; got {shown(table)}")
     if not isinstance(entries, list) or not all(isinstance(entry, dict) for entry in entries):
         begins = "[[requirement]]" if kind == "TOML" else "- id: ..."
         raise ValueError(f"{path}: each requirement begins with a line {begins}")
     for name, value in own.items():
         if isinstance(value, bool) or not isinstance(value, int | float):
-            raise ValueError(f"{path}: constant {name!r} must be a number; got {value!r}")
+            raise ValueError(f"{path}: constant {name!r} must be a number; got {shown(value)}")
     for name, value in named.items():
         if not isinstance(value, str):
-            raise ValueError(f"{path}: definition {name!r} must be a text; got {value!r}")
+            raise ValueError(f"{path}: definition {name!r} must be a text; got {shown(value)}")
     return entries, {**own, **numbers}, {**named, **parts}
 
 
@@ -218,11 +246,11 @@ def _fields(where: str, entry: Mapping[str, object], need_formulas: bool) -> dic
     fields = {str(name): value for name, value in entry.items() if value not in (None, "", [])}
     for name, value in fields.items():
         if name == "links" and isinstance(value, list):
-            fields[name] = " ".join(map(str, value))
+            fields[name] = "".join(f"{link}; " for link in value)
         elif name == "severity" and isinstance(value, int) and not isinstance(value, bool):
             fields[name] = str(value)
         elif not isinstance(value, str):
-            raise ValueError(f"{where}: {name} must be a text; got {value!r}")
+            raise ValueError(f"{where}: {name} must be a text; got {shown(value)}")
     for name in FIELDS[: 1 + need_formulas]:
         if name not in fields:
             needed = "an id and a formula" if need_formulas else "an id"
@@ -237,147 +265,3 @@ def _checked(source: str, found: Sequence[Requirement]) -> tuple[Requirement, ..
     if repeated := next((name for name in names if names.count(name) > 1), None):
         raise ValueError(f"{source} has more than one requirement {repeated!r}")
     return tuple(found)
-
-
-NAMESPACE = "http://www.omg.org/spec/ReqIF/20110401/reqif.xsd"
-OTHER_NAMES = {"foreignid": "id"}
-"""Names of attributes in the implementation guide of ReqIF that stand for fields of ours."""
-MAX_LENGTH = 32000
-"""Characters of an attribute that other tools need to keep."""
-
-
-def read_reqif(path: Path, fields: Sequence[str]) -> list[dict[str, object]]:
-    """Read the objects of a ReqIF file.
-
-    **Arguments:**
-    - `fields`: the fields of a requirement; other attributes are left out.
-    **Returns:** a dictionary of texts for each object with at least one of the fields. An object
-    without an id gets its identifier in the file. Its `links` are its own, and the targets of its
-    relations.
-    **Raises:** `ValueError` for a file that is not ReqIF, or declares a document type.
-    """
-    root = read_xml(path.read_bytes(), str(path))
-    if _tag(root) != "REQ-IF":
-        raise ValueError(f"{path} is not ReqIF: its first element is {_tag(root)}, not REQ-IF")
-    names = {
-        str(each.get("IDENTIFIER")): _field(each.get("LONG-NAME", ""))
-        for each in root.iter()
-        if _tag(each).startswith("ATTRIBUTE-DEFINITION-") and each.get("IDENTIFIER")
-    }
-    choices = {
-        str(each.get("IDENTIFIER")): each.get("LONG-NAME", "")
-        for each in root.iter()
-        if _tag(each) == "ENUM-VALUE"
-    }
-    found: dict[str, dict[str, object]] = {}
-    for each in _named(root, "SPEC-OBJECT"):
-        values: dict[str, object] = {}
-        for value in each.iter():
-            if not _tag(value).startswith("ATTRIBUTE-VALUE-"):
-                continue
-            name = next((names.get(ref, "") for ref in _references(value, "DEFINITION")), "")
-            if name in fields and (text := _text(value, choices)):
-                values[name] = text
-        if values:
-            found[str(each.get("IDENTIFIER"))] = values
-    for identifier, values in found.items():
-        values.setdefault("id", identifier)
-    for each in _named(root, "SPEC-RELATION"):
-        ends = [next(_references(each, end), "") for end in ("SOURCE", "TARGET")]
-        if ends[0] in found and ends[1] in found:
-            links = str(found[ends[0]].get("links", "")).split()
-            target = str(found[ends[1]]["id"])
-            found[ends[0]]["links"] = " ".join(dict.fromkeys((*links, target)))
-    return list(found.values())
-
-
-def _tag(element: Element) -> str:
-    return str(element.tag).rpartition("}")[2]
-
-
-def _named(root: Element, tag: str) -> Iterator[Element]:
-    return (each for each in root.iter() if _tag(each) == tag)
-
-
-def _field(name: str) -> str:
-    plain = name.lower().removeprefix("reqif.").strip()
-    return OTHER_NAMES.get(plain, plain)
-
-
-def _references(element: Element, within: str) -> Iterator[str]:
-    """Yield the identifiers that a part of an element refers to."""
-    for part in _named(element, within):
-        for each in part.iter():
-            if _tag(each).endswith("-REF") and each.text:
-                yield each.text.strip()
-
-
-def _text(value: Element, choices: Mapping[str, str]) -> str:
-    """Return the text of a value: plain, formatted, or chosen from a list."""
-    if (plain := value.get("THE-VALUE")) is not None:
-        return plain.strip()
-    for each in _named(value, "THE-VALUE"):
-        return " ".join("".join(each.itertext()).split())
-    return ", ".join(choices.get(ref, ref) for ref in _references(value, "VALUES"))
-
-
-def reqif_document(
-    entries: Sequence[Mapping[str, str]], fields: Sequence[str], title: str
-) -> bytes:
-    """Write entries as a ReqIF document: an object for each, in one specification.
-
-    **Arguments:**
-    - `entries`: texts by field, one dictionary for each object.
-    - `fields`: the possible fields of an object.
-    """
-    now = datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
-
-    def add(parent: Element, tag: str, text: str = "", **given: str) -> Element:
-        named = {name.replace("_", "-"): value for name, value in given.items()}
-        element = ElementTree.SubElement(parent, tag, named)
-        element.text = text or None
-        return element
-
-    def known(parent: Element, tag: str, identifier: str, **more: str) -> Element:
-        return add(parent, tag, IDENTIFIER=identifier, LAST_CHANGE=now, **more)
-
-    root = Element("REQ-IF", xmlns=NAMESPACE)
-    header = add(add(root, "THE-HEADER"), "REQ-IF-HEADER", IDENTIFIER="_header")
-    add(header, "CREATION-TIME", now)
-    for tag, text in (
-        ("REQ-IF-TOOL-ID", "verifai_jax"),
-        ("REQ-IF-VERSION", "1.0"),
-        ("SOURCE-TOOL-ID", "verifai_jax"),
-        ("TITLE", title),
-    ):
-        add(header, tag, text)
-    content = add(add(root, "CORE-CONTENT"), "REQ-IF-CONTENT")
-    known(
-        add(content, "DATATYPES"), "DATATYPE-DEFINITION-STRING", "_text",
-        LONG_NAME="text", MAX_LENGTH=str(MAX_LENGTH),
-    )  # fmt: skip
-    kinds = add(content, "SPEC-TYPES")
-    kind = known(kinds, "SPEC-OBJECT-TYPE", "_requirement", LONG_NAME="requirement")
-    attributes = add(kind, "SPEC-ATTRIBUTES")
-    for name in fields:
-        long = {"id": "ReqIF.ForeignID", "text": "ReqIF.Text"}.get(name, name)
-        attribute = known(attributes, "ATTRIBUTE-DEFINITION-STRING", f"_{name}", LONG_NAME=long)
-        add(add(attribute, "TYPE"), "DATATYPE-DEFINITION-STRING-REF", "_text")
-    known(kinds, "SPECIFICATION-TYPE", "_document", LONG_NAME="document")
-    objects = add(content, "SPEC-OBJECTS")
-    specification = known(
-        add(content, "SPECIFICATIONS"), "SPECIFICATION", "_specification", LONG_NAME=title
-    )
-    add(add(specification, "TYPE"), "SPECIFICATION-TYPE-REF", "_document")
-    children = add(specification, "CHILDREN")
-    for index, entry in enumerate(entries, 1):
-        one = known(objects, "SPEC-OBJECT", f"_object-{index}")
-        values = add(one, "VALUES")
-        for name, text in entry.items():
-            value = add(values, "ATTRIBUTE-VALUE-STRING", THE_VALUE=text)
-            add(add(value, "DEFINITION"), "ATTRIBUTE-DEFINITION-STRING-REF", f"_{name}")
-        add(add(one, "TYPE"), "SPEC-OBJECT-TYPE-REF", "_requirement")
-        child = known(children, "SPEC-HIERARCHY", f"_line-{index}")
-        add(add(child, "OBJECT"), "SPEC-OBJECT-REF", f"_object-{index}")
-    ElementTree.indent(root)
-    return ElementTree.tostring(root, encoding="utf-8", xml_declaration=True)

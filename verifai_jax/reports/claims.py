@@ -4,12 +4,25 @@ claim = Claim("C1", "604 of 20000 simulations violate the property", ("table.par
 claims_json("balance", claims)                      # plain data that a safety case can cite
 """
 
+import hashlib
+import json
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
 FORMAT = 1
 """Number of the format of claims as JSON."""
+
+
+PAGE, SEAL = "report_sha256", "claims_sha256"
+"""Entries of a file of claims: the hashes of its report, and of all its other entries."""
+
+
+def sealed(claims: Mapping[str, Any]) -> dict[str, Any]:
+    """Return claims with the hash of their other entries, which tells whether they were edited."""
+    said = {name: value for name, value in claims.items() if name != SEAL}
+    text = json.dumps(said, sort_keys=True)
+    return {**said, SEAL: hashlib.sha256(text.encode()).hexdigest()}
 
 
 @dataclass(frozen=True)

@@ -14,6 +14,7 @@ from verifai_jax.core.display.progress import shows_progress
 from verifai_jax.core.messages.checks import check_count
 from verifai_jax.core.messages.errors import check_names
 from verifai_jax.core.store.atomic_files import replacing
+from verifai_jax.core.user_code.sources import file_hash, hashed_files
 from verifai_jax.estimation.comparison.result import Comparison, Transfer
 from verifai_jax.estimation.error_budgets.result import ErrorBudget
 from verifai_jax.estimation.result import Estimate
@@ -23,11 +24,12 @@ from verifai_jax.features import FeatureSpace
 from verifai_jax.mtl import Judgement
 from verifai_jax.problem.problem import Problem
 from verifai_jax.reports.assessment import with_assessment
+from verifai_jax.reports.claims import PAGE, sealed
 from verifai_jax.reports.comparison_report import comparison_page
 from verifai_jax.reports.estimate_report import estimate_page
 from verifai_jax.reports.failure_table_report import failure_table_page
 from verifai_jax.reports.judgement_report import judgement_page
-from verifai_jax.reports.optional_sections import with_errors, with_odd
+from verifai_jax.reports.optional_sections import with_errors, with_files, with_odd
 from verifai_jax.reports.page import write_page
 from verifai_jax.reports.run_question import About
 from verifai_jax.reports.run_report import run_page
@@ -52,6 +54,7 @@ def write_report(
     errors: ErrorBudget | None = None,
     odd: OperationalDomain | None = None,
     assessment: bool = False,
+    files: Sequence[str | Path] = (),
     progress: bool | None = None,
 ) -> Path:
     """Write the evidence report on a result as one HTML file, and its claims as JSON next to it.
@@ -76,6 +79,8 @@ def write_report(
       that a run covers. Features without their own units and reasons take those of the domain.
     - `assessment`: whether to add sections for an assessor: the claims as a tree, the nine steps of
       credibility with boxes to fill in, and a page to sign.
+    - `files`: further files that the report rests on; it lists them with their hashes, as it does
+      those of `odd`.
     - `progress`: whether to show one line of progress; see `core.display.progress` for the default.
     **Raises:** `UnknownNameError` for a unit or a reason of a feature that does not exist;
     `ValueError` for an invalid number of simulations, and for a run whose rows have changed since
@@ -134,10 +139,13 @@ def write_report(
         if not isinstance(result, Run):
             raise TypeError(f"odd= is for a report on a run; got {type(result).__name__}")
         page = with_odd(page, odd.coverage(result))
+    read = [*hashed_files(map(Path, files), "the result"), *(() if odd is None else odd.files)]
+    if read:
+        page = with_files(page, read)
     if assessment:
         page = with_assessment(page)
     write_page(page, path)
-    claims = json.dumps(page.claims, indent=2, allow_nan=False)
+    claims = json.dumps(sealed({**page.claims, PAGE: file_hash(path)}), indent=2, allow_nan=False)
     with replacing(claims_path(path)) as partial:
         partial.write_text(claims + "\n", encoding="utf-8", newline="\n")
     return path

@@ -8,6 +8,7 @@ from verifai_jax.reports.markup import paragraph, picture, preformatted, table
 from verifai_jax.reports.page import Page
 from verifai_jax.reports.provenance import Model
 from verifai_jax.reports.run_question import About
+from verifai_jax.reports.run_report import run_inputs
 from verifai_jax.reports.sections import MODEL, problem_content, result_page
 from verifai_jax.reports.studies import png
 
@@ -74,6 +75,7 @@ def failure_table_page(found: FailureTable, about: About, problem: Problem | Non
         ],
         limits=[*limits, *assumed],
         reproduce=[preformatted("\n".join(commands))],
+        files=[] if run is None else run_inputs(run),
     )
 
 

@@ -7,8 +7,13 @@ from verifai_jax.mtl.judgement import Judgement, Row
 from verifai_jax.reports.claims import Claim, claims_json
 from verifai_jax.reports.markup import Child, Markup, bullets, element, table
 from verifai_jax.reports.page import Page, Section
-from verifai_jax.reports.provenance import versions
-from verifai_jax.reports.sections import answers_section, claims_section
+from verifai_jax.reports.provenance import chained, versions
+from verifai_jax.reports.sections import (
+    answers_section,
+    chain_table,
+    chain_words,
+    claims_section,
+)
 
 MAX_ROWS = 2000
 """Verdicts that the report lists at most; those that fail are all among the first."""
@@ -38,6 +43,8 @@ def judgement_page(judgement: Judgement) -> Page:
     near = "none has a finite robustness"
     if tightest is not None:
         near = f"{tightest.requirement} on {tightest.file}: {tightest.explanation}"
+    links = tuple(chained(judgement.inputs))
+    chain = links[-1].chain if links else ""
     sections = (
         answers_section(
             [
@@ -57,14 +64,23 @@ def judgement_page(judgement: Judgement) -> Page:
             ),
         ),
         claims_section(claims),
-        Section("reproduce", "Versions", (table(["package", "version"], versions()),)),
+        Section(
+            "reproduce",
+            "Versions and inputs",
+            (
+                table(["package", "version"], versions()),
+                element("h3", "Inputs"),
+                chain_table(links),
+                chain_words(chain),
+            ),
+        ),
     )
     return Page(
         title=f"Requirements on {fleet}",
         headline=headline,
         tone=tone,
         sections=sections,
-        claims=claims_json("requirements", claims, ""),
+        claims=claims_json("requirements", claims, chain),
     )
 
 

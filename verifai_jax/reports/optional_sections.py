@@ -6,6 +6,7 @@ from typing import Any
 
 from verifai_jax.analysis import OddCoverage
 from verifai_jax.core.messages.text import format_percent
+from verifai_jax.core.user_code.sources import Source as Input
 from verifai_jax.estimation.error_budgets.result import ErrorBudget
 from verifai_jax.estimation.failure_modes import Mode, Modes
 from verifai_jax.features.english import number
@@ -73,6 +74,15 @@ def with_odd(page: Page, found: OddCoverage) -> Page:
         ),
     )
     return before_limits(page, section)
+
+
+def with_files(page: Page, files: Sequence[Input]) -> Page:
+    """Return a page with a section on further files, which are in its claims, too."""
+    rows = [(each.name, each.role, element("code", each.sha256)) for each in files]
+    content = table(["file", "what it is", "SHA-256"], rows)
+    section = Section("files", "Further files that this report rests on", (content,))
+    claims = {**page.claims, "files": [each._asdict() for each in files]}
+    return replace(before_limits(page, section), claims=claims)
 
 
 def _shares(row: Mapping[str, Any]) -> tuple[str, str, str]:

@@ -92,7 +92,7 @@ def run_page(
     found = study(run, traces, studies, modes)
     now = None if run.problem is None else run.problem.sources()
     model = Model.of(run.sources, now)
-    links = tuple(chained(_inputs(run, model)))
+    links = tuple(chained(run_inputs(run) + model.inputs))
     command = None
     if run.folder is not None and words is not None:
         command = report_command(run.folder, about.units, about.reasons, traces, studies, modes)
@@ -241,16 +241,16 @@ def run_claims(run: Run, studies: Studies) -> list[Claim]:
 
 def chain_of(run: Run) -> str:
     """Return the last hash of the chain for a present report on the run."""
-    links = chained(_inputs(run, Model.of(run.sources)))
+    links = chained(run_inputs(run) + Model.of(run.sources).inputs)
     return links[-1].chain if links else ""
 
 
-def _inputs(run: Run, model: Model) -> list[Input]:
-    files = [] if run.folder is None else folder_inputs(run.folder, FILES)
-    if run.folder is None:
-        digest = f"{run.table.digest(run.simulations):08x}"
-        files = [Input("table in memory (CRC-32)", "the table", digest)]
-    return files + model.inputs
+def run_inputs(run: Run) -> list[Input]:
+    """Return the files of a run with their hashes, or its table in memory."""
+    if run.folder is not None:
+        return folder_inputs(run.folder, FILES)
+    digest = f"{run.table.digest(run.simulations):08x}"
+    return [Input("table in memory (CRC-32)", "the table", digest)]
 
 
 def _reproduce(run: Run, reproduction: Reproduction) -> Section:

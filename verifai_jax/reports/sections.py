@@ -131,8 +131,7 @@ def chain_words(chain: str) -> Markup:
         "Each link is the SHA-256 of the link before (empty for the first), a line break, the name "
         "of the input, a line break, and its SHA-256. The last link stands for all inputs: ",
         element("code", chain),
-        ". Files of the model have the hashes that they had when the result was made. What the "
-        "system reads in any other way, such as in another process, is not among them.",
+        ".",
     )
 
 
@@ -144,6 +143,10 @@ def provenance_content(links: Sequence[Link], model: Model) -> list[Markup]:
             element("h3", "Inputs"),
             chain_table(tuple(links)),
             chain_words(links[-1].chain),
+            paragraph(
+                "Files of the model have the hashes that they had when the result was made. What "
+                "the system reads in any other way, such as in another process, is not among them."
+            ),
         ]
     return content
 

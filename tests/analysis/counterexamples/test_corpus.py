@@ -1,6 +1,8 @@
 """Counterexamples as files: what they hold, and every way in which a problem may have changed."""
 
+import importlib
 import json
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,9 +14,11 @@ from click.testing import CliRunner
 
 import verifai_jax as vj
 from verifai_jax.analysis.counterexamples import SavedCounterexample, save_counterexamples
+from verifai_jax.analysis.counterexamples._replay_counterexamples import OTHER
 from verifai_jax.analysis.counterexamples.corpus import renamed
 from verifai_jax.cli.main import main
 from verifai_jax.testing.checking import Check
+from verifai_jax.testing.checking._test import tested_problem as problem_tested_by
 
 SPACE = {
     "a": vj.Box(0.0, 2.0),
@@ -116,6 +120,47 @@ def test_a_feature_that_was_renamed_moved_or_narrowed(corpus):
     where = vj.FeatureSpace(SPACE, where=lambda f: f["a"] + f["wind"][0] < 1.0)
     refused = vj.replay_counterexamples(problem(space=where), corpus)
     assert "the constraint of the space refuses its features" in str(refused)
+
+
+NAMESAKES = """
+import numpy as np
+import verifai_jax as vj
+
+def simulate(features):
+    return vj.Trace({{"x": np.full(3, features["a"])}}, dt=1.0)
+
+def of(limit):
+    space = {{"a": vj.Box(0.0, 1.0)}}
+    return vj.Problem("brake", space, vj.blackbox(simulate), f"always x < {{limit}}")
+
+first, second = of({}), of({})
+
+@vj.test(of({}))
+def test_third(): pass
+"""
+
+
+@pytest.mark.thorough
+def test_problems_that_share_a_name(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for folder, limits in (("a", (0.1, 2, 3)), ("b", (0.2, 2, 3))):
+        (tmp_path / folder).mkdir()
+        (tmp_path / folder / "brake.py").write_text(NAMESAKES.format(*limits))
+    monkeypatch.syspath_prepend(tmp_path)
+    modules = [importlib.import_module(f"{folder}.brake") for folder in "ab"]
+    one, other = (module.first for module in modules)
+    for each in (one, other):
+        assert Check(8, search="uniform").run(each, "corpus").failed
+    assert len(list(Path("corpus").iterdir())) == 2  # The same features, and two files.
+    assert sorted(states(vj.replay_counterexamples(one, "corpus"))) == ["failing", OTHER]
+    for same in (modules[0].second, problem_tested_by(modules[1].test_third)):
+        assert set(states(vj.replay_counterexamples(same, "corpus"))) == {OTHER}
+        assert not Check(8, search="uniform").run(same, "corpus").failed
+    # A file that was moved still holds its problem.
+    (tmp_path / "b" / "brake.py").rename(tmp_path / "b" / "braking.py")
+    sys.modules.pop("b.brake")
+    moved = importlib.import_module("b.braking").first
+    assert sorted(states(vj.replay_counterexamples(moved, "corpus"))) == ["failing", OTHER]
 
 
 def test_names_of_columns():

@@ -14,6 +14,7 @@ from pathlib import Path
 import pytest
 
 from verifai_jax.testing.qualification import qualify
+from verifai_jax.testing.qualification._qualify import not_exercised
 from verifai_jax.testing.qualification.oracles import ORACLES
 from verifai_jax.testing.qualification.result import HAZARDS
 
@@ -83,6 +84,38 @@ PLANTED = {
     ),
 }  # fmt: skip
 """By identifier of the error: the file, what stands there, and what is planted in its place."""
+BY_ERROR = {
+    "a row of a recording is lost below its units": (
+        "mtl/recording.py",
+        "skip_rows_after_names=int(units)",
+        "skip_rows_after_names=2 * int(units)",
+    ),
+    "a truth value of a recording is read as its opposite": (
+        "mtl/recording.py",
+        "    trace = Trace(signals, dt=dt, times=times, notes=notes, units=units)",
+        "    signals = {n: ~v if v.dtype == bool else v for n, v in signals.items()}\n    trace = Trace(signals, dt=dt, times=times, notes=notes, units=units)",
+    ),
+    "a recording always holds": ("mtl/judging.py", '"holds" if ', '"holds" if True or '),
+    "a robustness on a recording is wrong": (
+        "mtl/host_values.py",
+        "                return -below[0]",
+        "                return below[0]",
+    ),
+    "a monitor takes the least value for the greatest": ("mtl/streams.py", "delay, sign * f.sign, 0.0, a, b)", "delay, -sign * f.sign, 0.0, a, b)"),
+    "a monitor forgets the beginning of a window": ("mtl/streams.py", 'return self.op("accumulate", (slot,), delay, sign * f.sign, 0.0, a, b)', 'return self.op("accumulate", (slot,), delay, sign * f.sign, 0.0, b, b)'),
+    "a violation is not shown in the trace matrix": (
+        "testing/traceability/evidence.py",
+        "    if len(broken):",
+        "    if len(broken) > 10**9:",
+    ),
+    "claims that were edited are believed": (
+        "testing/traceability/evidence.py",
+        "    if sealed(data) != data:",
+        "    if False:",
+    ),
+}  # fmt: skip
+"""The same by the text of the error."""
+PLANTED |= {n: BY_ERROR[hazard.error] for n, hazard in HAZARDS.items() if hazard.error in BY_ERROR}
 
 RUN = "import sys; from verifai_jax.testing.qualification import qualify; found = qualify(sys.argv[1:]);"
 RUN += "print(found); sys.exit(10 if found.passed else 11)"
@@ -136,6 +169,18 @@ def test_an_oracle_falls_and_is_said_to(monkeypatch, tmp_path):
     assert '"package_sha256"' in (tmp_path / "qualification.json").read_text()
     with pytest.raises(ValueError, match="'nothing'"):
         qualify(["nothing"])
+
+
+def test_what_is_not_exercised_is_listed(monkeypatch):
+    every = not_exercised([*ORACLES.values()])
+    assert {"vj.mtl.judge", "vj.mtl.watch", "vj.falsify", "vj.estimate", "vj.resume"}.isdisjoint(
+        every
+    )
+    assert {"vj.sweep", "vj.mtl.export_c"} <= set(every)
+    root = sys.modules["verifai_jax"]
+    monkeypatch.setattr(root, "__all__", [*root.__all__, "divine"])
+    monkeypatch.setattr(root, "divine", lambda: None, raising=False)
+    assert "vj.divine" in not_exercised([*ORACLES.values()])
 
 
 @pytest.mark.slow

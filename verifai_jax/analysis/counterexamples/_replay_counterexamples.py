@@ -12,7 +12,12 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 
-from verifai_jax.analysis.counterexamples.corpus import SavedCounterexample, read_corpus, renamed
+from verifai_jax.analysis.counterexamples.corpus import (
+    SavedCounterexample,
+    is_elsewhere,
+    read_corpus,
+    renamed,
+)
 from verifai_jax.core.compute.keys import run_keys
 from verifai_jax.core.display.notebook import InNotebook
 from verifai_jax.core.display.progress import shows_progress
@@ -144,7 +149,8 @@ def replay_counterexamples(
 
     Each is simulated with its features and its random key. A file whose features no longer fit the
     space is reported as no longer valid, with the reason. If its formulas have changed it is judged
-    by the present ones, with a note. Files of problems with other names are only counted.
+    by the present ones, with a note. Files of problems with other names, and of those of the same
+    name in another file or variable, are only counted.
 
     **Arguments:**
     - `problem`: the present problem.
@@ -162,7 +168,7 @@ def replay_counterexamples(
         results[path] = ReplayedCounterexample(path, INVALID, np.nan, np.nan, reason)
     batches: dict[tuple[int, str, str | None], _Batch] = {}
     for path, entry in entries.items():
-        if entry.problem != problem.name:
+        if entry.problem != problem.name or is_elsewhere(entry, problem):
             results[path] = ReplayedCounterexample(path, OTHER, np.nan, _lowest(entry))
             continue
         columns = renamed(entry.features, rename or {})

@@ -9,12 +9,14 @@ and the data to replay it. Nothing in it is executed: a replay needs the problem
 
 import hashlib
 import json
+import os
 import re
 import shlex
 import sys
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
+from types import FunctionType
 from typing import Any
 
 import jax
@@ -30,6 +32,7 @@ from verifai_jax.core.store.atomic_files import replacing
 from verifai_jax.evaluation.replay import replay
 from verifai_jax.falsification.model_changes import sources_of_row
 from verifai_jax.falsification.run import Run
+from verifai_jax.problem.problem import Problem
 
 FORMAT = 1
 """Format of the files; those of a later one are refused."""
@@ -51,8 +54,8 @@ class SavedCounterexample:
     - `precision`, `backend`: those of the simulation.
     - `verdict`: the verdict of closer replays of its row; empty if there were none.
     - `changed`: the departures from nominal, `[nominal, value]` by coordinate, if it was shrunk.
-    - `found`: the search, its budget, the number of simulations, the version, and the `sources`:
-      the files of the model, as a run records them.
+    - `found`: the search, its budget, the number of simulations, the version, the `sources`: the
+      files of the model, as a run records them, and the `origin` of the problem (`origin_of`).
     """
 
     problem: str
@@ -72,6 +75,8 @@ class SavedCounterexample:
     def name(self) -> str:
         """Name of its file: the problem's name, and a digest of what determines the simulation."""
         deciding = [self.problem, self.formulas, self.features, self.seed, self.row]
+        # Another problem of this name has files of its own.
+        deciding += [self.found["origin"]] if "origin" in self.found else []
         text = json.dumps(deciding, sort_keys=True)
         stem = re.sub(r"\W+", "-", self.problem).strip("-")[:60] or "counterexample"
         return f"{stem}-{hashlib.sha256(text.encode()).hexdigest()[:10]}.json"
@@ -248,6 +253,7 @@ def save_counterexamples(
                 "version": run.version,
                 "jax": jax.__version__,
                 "sources": _sources(run, row),
+                "origin": origin_of(problem),
             },
         )
         paths[saved.write(folder)] = None
@@ -259,6 +265,53 @@ def _sources(run: Run, row: int) -> dict[str, Any]:
     found = sources_of_row(run.sources, row)
     # Where the project lay on this machine is nobody else's concern.
     return {} if found is None else replace(found, root="", first=0).to_json()
+
+
+def origin_of(problem: Problem) -> list[str]:
+    """Return the file that makes a problem and, if others there have its name, its variable."""
+    file = problem.made_in[-1].file if problem.made_in else ""
+    here = Path(file).name if file else ""
+    if file and Path(file).is_relative_to(Path.cwd()):
+        here = Path(file).relative_to(Path.cwd()).as_posix()
+    return [here, _namesakes(problem, file).get(id(problem), "")]
+
+
+def is_elsewhere(saved: SavedCounterexample, problem: Problem) -> bool:
+    """Return whether a counterexample is that of another problem of the same name.
+
+    One whose file or variable is not there any more may be of this problem, which was moved.
+    """
+    origin = saved.found.get("origin")
+    if not isinstance(origin, list) or len(origin) != 2 or not all(map(_is_text, origin)):
+        return False
+    file = problem.made_in[-1].file if problem.made_in else ""
+    was, variable = Path(str(origin[0])), origin[1]
+    if not file or not was.name:
+        return False
+    if Path(file).parts[-len(was.parts) :] != was.parts:
+        return any((folder / was).is_file() for folder in Path(file).parents)
+    others = {key: name for key, name in _namesakes(problem, file).items() if key != id(problem)}
+    return variable in others.values()
+
+
+def _namesakes(problem: Problem, file: str) -> dict[int, str]:
+    """Return the variables, or the tests, of the problems in a module that share a name."""
+    for module in [*sys.modules.values()]:
+        path = getattr(module, "__file__", None)
+        if not file or not path or os.path.abspath(path) != file:
+            continue
+        named: dict[int, str] = {}
+        for name, value in vars(module).items():
+            held = vars(value).values() if isinstance(value, type) else [value]
+            for each in held:
+                # A test has its problem among its attributes.
+                tested = vars(each).values() if isinstance(each, FunctionType) else [each]
+                for part in tested:
+                    if isinstance(part, Problem) and part.name == problem.name:
+                        named.setdefault(id(part), name)
+        if id(problem) in named:
+            return named if len(named) > 1 else {}
+    return {}
 
 
 def read_corpus(folder: str | Path) -> tuple[dict[Path, SavedCounterexample], dict[Path, str]]:

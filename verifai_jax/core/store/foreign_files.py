@@ -1,10 +1,43 @@
-"""XML and YAML of files that may come from anywhere."""
+"""Texts, XML and YAML of files that may come from anywhere."""
 
+import codecs
+from pathlib import Path
 from xml.etree import ElementTree
 from xml.etree.ElementTree import Element
 from xml.parsers import expat
 
 from verifai_jax.core.messages.errors import require
+
+MARKS = (
+    (codecs.BOM_UTF32_LE, "utf-32"),
+    (codecs.BOM_UTF32_BE, "utf-32"),
+    (codecs.BOM_UTF16_LE, "utf-16"),
+    (codecs.BOM_UTF16_BE, "utf-16"),
+    (b"", "utf-8-sig"),
+)
+"""Bytes that a text begins with, and the encoding that they say; that of UTF-32 comes first, since
+it begins as that of UTF-16 does."""
+
+
+def read_text(path: Path) -> str:
+    """Read a text in UTF-8, or in what the mark at its beginning says, with ends of lines as in C.
+
+    **Raises:** `ValueError` for another encoding, which cannot be known.
+    """
+    data = path.read_bytes()
+    encoding = next(name for mark, name in MARKS if data.startswith(mark))
+    try:
+        text = data.decode(encoding)
+    except UnicodeDecodeError as error:
+        where = f"byte {error.start + 1} is 0x{data[error.start]:02x}"
+    else:
+        if "\0" not in text:
+            return text.replace("\r\n", "\n").replace("\r", "\n")
+        where = f"character {text.index(chr(0)) + 1} is 0"
+    raise ValueError(
+        f"{path} is not a text in {encoding.removesuffix('-sig').upper()} ({where}): save it as "
+        "UTF-8, in Excel as CSV UTF-8"
+    )
 
 
 def read_xml(data: bytes, name: str) -> Element:
@@ -25,7 +58,7 @@ def read_xml(data: bytes, name: str) -> Element:
     try:
         parser.Parse(data, True)
         return ElementTree.fromstring(data)
-    except (expat.ExpatError, ElementTree.ParseError) as error:
+    except (expat.ExpatError, ElementTree.ParseError, ValueError, LookupError) as error:
         raise ValueError(f"{name} is not XML: {error}") from None
 
 

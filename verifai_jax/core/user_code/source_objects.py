@@ -25,6 +25,8 @@ MAX_OBJECTS = 4000
 """Objects that are looked at, at most."""
 MAX_ENTRIES = 200
 """Entries of a container that are looked at, at most."""
+FENCE = "VERIFAI_JAX_FENCE"
+"""Variable of the environment with the only folder whose files may be run; unset, all may."""
 _OPAQUE = ("numpy", "jax", "jaxlib", "mujoco", "pandas", "scipy", "torch", "builtins")
 """Packages whose objects hold no functions of a user."""
 _COMPILED = ("programs", "_problems")

@@ -12,7 +12,7 @@ import hashlib
 import os
 import platform
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
@@ -238,6 +238,21 @@ def file_hash(file: Path) -> str:
 def _hash(file: str, changed: int, size: int, number: int) -> str:
     with open(file, "rb") as opened:
         return hashlib.file_digest(opened, "sha256").hexdigest()
+
+
+def hashed_files(paths: Iterable[Path], role: str) -> list[Source]:
+    """Return files, and all files in folders, with their sizes and hashes."""
+    found = []
+    for path in dict.fromkeys(paths):
+        for file in sorted(path.rglob("*")) if path.is_dir() else [path]:
+            if file.is_dir():
+                continue
+            try:
+                size, sha256 = f"{role}, {file.stat().st_size:,} bytes", file_hash(file)
+            except OSError as error:
+                size, sha256 = f"{role}, unreadable: {error.strerror}", ""
+            found.append(Source(shown_path(os.path.abspath(file)), size, sha256))
+    return found
 
 
 def versions() -> dict[str, str]:

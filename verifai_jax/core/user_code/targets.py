@@ -9,12 +9,14 @@ keeps a folder that came from elsewhere from choosing which file is run.
 
 import importlib
 import importlib.util
+import os
 import sys
 from pathlib import Path
 from types import ModuleType
 from typing import Protocol, TypeVar
 
 from verifai_jax.core.messages.errors import MissingExtra, unknown_name
+from verifai_jax.core.user_code.source_objects import FENCE
 from verifai_jax.core.user_code.user_errors import explain_user_error
 
 
@@ -167,6 +169,10 @@ def _import(location: str) -> ModuleType:
     if sys.path[0] != str(Path.cwd()):
         sys.path.insert(0, str(Path.cwd()))
     path = Path(location)
+    fence = os.environ.get(FENCE)
+    # A link in the folder may lead out of it; a module could come from anywhere.
+    if fence and not (path.exists() and path.resolve().is_relative_to(fence)):
+        raise TargetError(f"{location} leads out of {fence}; only files in it are run here")
     if not (location.endswith(".py") or path.exists()):
         try:
             return importlib.import_module(location)

@@ -10,6 +10,7 @@ assert run.best["rho"] > -0.5                    # further demands on the run
 
 import contextlib
 import functools
+import hashlib
 import inspect
 import warnings
 from collections.abc import Callable, Iterator, Mapping
@@ -124,6 +125,14 @@ def tested_problem(function: object) -> Problem | None:
     """Return the problem that a test function tests; None for any other object."""
     problem = getattr(function, TESTED, None)
     return load(problem) if isinstance(problem, str) else problem
+
+
+def source_hash(function: object) -> str:
+    """Return the SHA-256 of a test function's text, with its decorators; empty without a file."""
+    try:
+        return hashlib.sha256(inspect.getsource(function).encode()).hexdigest()  # pyright: ignore
+    except (OSError, TypeError):
+        return ""
 
 
 @functools.cache

@@ -8,6 +8,7 @@ test. With it, independent samples are drawn until the failure probability is kn
 above this limit.
 """
 
+import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -180,12 +181,16 @@ class CheckOutcome(InNotebook):
             "vj_seed": self.check.seed,
             "vj_budget": self.check.budget,
         }
+        if self.check.max_failure_probability is not None:
+            result["vj_max_failure_probability"] = self.check.max_failure_probability
         if self.replayed is not None:
             result["vj_replayed"] = len(self.replayed.replayed)
             result["vj_replayed_failing"] = len(self.replayed.failing)
         if self.run is not None:
             counts = self.run.table.counts
             result["vj_simulations"] = self.run.simulations
+            result["vj_formulas"] = json.dumps(self.run.formulas)
+            result["vj_model"] = self.run.model
             result["vj_counterexamples"] = counts.claimed
             result["vj_without_verdict"] = counts.without_verdict
             if counts.without_verdict < self.run.simulations:

@@ -4,11 +4,17 @@ found = qualify()
 found.save("qualification")
 """
 
+import ast
 import hashlib
+import inspect
+import re
+import sys
 import time
 from collections.abc import Sequence
 from datetime import UTC, datetime
+from types import FunctionType
 
+from verifai_jax import mtl
 from verifai_jax.core.messages.errors import check_names
 from verifai_jax.core.messages.text import one_line
 from verifai_jax.core.user_code.source_objects import PACKAGE
@@ -41,7 +47,32 @@ def qualify(only: Sequence[str] | None = None) -> Qualification:
         outcomes.append(Outcome(name, what, not message, round(seconds, 2), message))
     now = datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC")
     complete = len(outcomes) == len(ORACLES)
-    return Qualification(tuple(outcomes), dict(versions()), package_hash(), now, complete)
+    unseen = tuple(
+        not_exercised(
+            [each for name in outcomes if isinstance(each := ORACLES[name.name], FunctionType)]
+        )
+    )
+    return Qualification(tuple(outcomes), dict(versions()), package_hash(), now, complete, unseen)
+
+
+def not_exercised(oracles: Sequence[FunctionType]) -> list[str]:
+    """Return the public functions that are not named in the text of oracles, as users call them."""
+    root = sys.modules["verifai_jax"]
+    names = (*root.__all__, *(f"mtl.{name}" for name in mtl.__all__))
+    called: set[str] = set()
+    for oracle in oracles:
+        parts = [*ast.walk(ast.parse(inspect.getsource(oracle)))]
+        called |= {part.id for part in parts if isinstance(part, ast.Name)}
+        called |= {part.attr for part in parts if isinstance(part, ast.Attribute)}
+        # A process that an oracle starts has its program as a text.
+        for name in called & {name for name in oracle.__globals__ if name.isupper()}:
+            called |= set(re.findall(r"vj\.(\w+)", str(oracle.__globals__[name])))
+    found = []
+    for name in names:
+        value = root if "." not in name else mtl
+        if inspect.isroutine(getattr(value, name.rpartition(".")[2], None)):
+            found += [f"vj.{name}"] if name.rpartition(".")[2] not in called else []
+    return found
 
 
 def package_hash() -> str:

@@ -15,9 +15,9 @@ from pathlib import Path
 from typing import NamedTuple
 
 from verifai_jax.core.display.notebook import InNotebook
-from verifai_jax.core.messages.text import counted, format_seconds
+from verifai_jax.core.messages.text import counted, format_seconds, shorten
 from verifai_jax.core.store.atomic_files import replacing
-from verifai_jax.reports.markup import Markup, element, paragraph, table
+from verifai_jax.reports.markup import Markup, bullets, element, paragraph, table
 from verifai_jax.reports.page import Page, Section, write_page
 from verifai_jax.reports.signing import signing_section
 
@@ -45,6 +45,7 @@ class Qualification(InNotebook):
     - `package_sha256`: one hash of all files of the package, by name and content.
     - `date`: the date in UTC.
     - `complete`: whether all oracles were run.
+    - `not_exercised`: the public functions that no oracle of those that were run calls.
     """
 
     outcomes: tuple[Outcome, ...]
@@ -52,6 +53,7 @@ class Qualification(InNotebook):
     package_sha256: str
     date: str
     complete: bool = True
+    not_exercised: tuple[str, ...] = ()
 
     @property
     def passed(self) -> bool:
@@ -74,6 +76,8 @@ class Qualification(InNotebook):
             state = "passed" if each.passed else "FELL"
             lines.append(f"  {each.name:<{width}}  {state}, {format_seconds(each.seconds, 2)}")
             lines += [] if each.passed else [f"    {each.what}", f"    {each.message}"]
+        left = counted(len(self.not_exercised), "public function")
+        lines.append(f"  {left} not exercised: {shorten(', '.join(self.not_exercised), 60)}")
         lines.append(f"  package SHA-256 {self.package_sha256}")
         return "\n".join(lines)
 
@@ -109,6 +113,17 @@ class Qualification(InNotebook):
                                 for n, h in HAZARDS.items()
                             ],
                         ),
+                    ),
+                ),
+                Section(
+                    "scope",
+                    "What was not exercised",
+                    (
+                        paragraph(
+                            "No oracle above names these public functions; nothing is "
+                            "said about them:"
+                        ),
+                        bullets([element("code", name) for name in self.not_exercised]),
                     ),
                 ),
                 Section(
@@ -237,6 +252,19 @@ _BY_ORACLE = {
     "proofs": (
         "a proof takes integers for numbers that never wrap around",
         "a proof counts points that the constraint refuses as safe",
+    ),
+    "readings": (
+        "a row of a recording is lost below its units",
+        "a truth value of a recording is read as its opposite",
+    ),
+    "judgements": ("a recording always holds", "a robustness on a recording is wrong"),
+    "monitors": (
+        "a monitor takes the least value for the greatest",
+        "a monitor forgets the beginning of a window",
+    ),
+    "matrices": (
+        "a violation is not shown in the trace matrix",
+        "claims that were edited are believed",
     ),
 }
 HAZARDS = {

@@ -5,19 +5,45 @@ matrix.complete; matrix.missing; matrix.suspect
 matrix.table; matrix.to_csv("trace.csv"); matrix.report("trace.html")
 """
 
+from collections import Counter
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, NamedTuple
 
 from verifai_jax.core.display.notebook import Tabular
 from verifai_jax.core.messages.text import counted, listed, shorten
+from verifai_jax.core.user_code.sources import Source
 from verifai_jax.reports.markup import Child, element, paragraph, table
 from verifai_jax.reports.page import Page, Section, write_page
+from verifai_jax.reports.provenance import chained
+from verifai_jax.reports.sections import chain_table
 
 if TYPE_CHECKING:
     import pandas as pd
+SHOWN = 3
+"""Results of a row that the summary lists."""
 LINKS = ("tests", "runs", "claims", "reports")
 """Links of the chain after the problem, each with a column of its own."""
+
+
+VIOLATED, ERROR, SKIPPED, NOT_RUN, MET = "violated", "error", "skipped", "not run", "met"
+OUTCOMES = (VIOLATED, ERROR, SKIPPED, NOT_RUN, MET)
+"""What a test or a run may have found, the worst first."""
+
+
+class Result(NamedTuple):
+    """A finding of a test or a run on a requirement.
+
+    - `link`: `"tests"` or `"runs"`.
+    - `name`: its name or folder.
+    - `outcome`: one of `OUTCOMES`; `"error"` if simulations, or the test, came to no verdict.
+    - `text`: a sentence on the outcome.
+    """
+
+    link: str
+    name: str
+    outcome: str
+    text: str
 
 
 class Gap(NamedTuple):
@@ -41,6 +67,7 @@ class TraceRow(NamedTuple):
     - `requirement`, `text`: its identifier and its sentence; empty for a formula without one.
     - `formula`, `problem`: their names; empty if not written yet.
     - `tests`, `runs`, `claims`, `reports`: names of functions, folders and files.
+    - `results`: what its tests and runs found.
     """
 
     requirement: str
@@ -51,6 +78,13 @@ class TraceRow(NamedTuple):
     runs: tuple[str, ...] = ()
     claims: tuple[str, ...] = ()
     reports: tuple[str, ...] = ()
+    results: tuple[Result, ...] = ()
+
+    @property
+    def outcome(self) -> str:
+        """The worst outcome of its tests and runs; not run without any."""
+        found = {each.outcome for each in self.results} or {NOT_RUN}
+        return next(each for each in OUTCOMES if each in found)
 
 
 @dataclass(frozen=True)
@@ -58,12 +92,14 @@ class TraceMatrix(Tabular):
     """The chain requirement, formula, problem, tests, runs, claims, report.
 
     **Fields:** `rows`, one for each requirement and problem; `gaps`; `asked`, the requested kinds
-    of links, from `LINKS`. `str()` writes the summary.
+    of links, from `LINKS`; `inputs`, the files of evidence with their hashes. `str()` writes the
+    summary.
     """
 
     rows: tuple[TraceRow, ...]
     gaps: tuple[Gap, ...]
     asked: tuple[str, ...] = field(default=LINKS)
+    inputs: tuple[Source, ...] = field(default=(), repr=False)
 
     @property
     def missing(self) -> tuple[Gap, ...]:
@@ -81,12 +117,20 @@ class TraceMatrix(Tabular):
         return not self.gaps
 
     @property
+    def unmet(self) -> tuple[TraceRow, ...]:
+        """The rows that some test or run did not find to be met, or that none did."""
+        return tuple(row for row in self.rows if row.outcome != MET)
+
+    @property
     def table(self) -> "pd.DataFrame":
-        """A row for each requirement and problem, as texts; `gaps` is its last column."""
+        """A row for each requirement and problem, as texts, with its outcome, results and gaps."""
         import pandas as pd
 
-        names = ("requirement", "text", "formula", "problem", *self.asked, "gaps")
-        return pd.DataFrame(self._cells(), columns=list(names))
+        return pd.DataFrame(self._cells(), columns=self._heads())
+
+    def _heads(self) -> list[str]:
+        said = ("outcome", "results", "gaps")
+        return ["requirement", "text", "formula", "problem", *self.asked, *said]
 
     def _cells(self) -> list[list[str]]:
         rows = []
@@ -94,7 +138,8 @@ class TraceMatrix(Tabular):
             links = [", ".join(getattr(row, name)) for name in self.asked]
             subject = row.requirement or row.problem
             gaps = dict.fromkeys(f"{g.kind}: {g.link}" for g in self.gaps if g.subject == subject)
-            rows.append([*row[:4], *links, "; ".join(gaps)])
+            results = "; ".join(f"{each.name}: {each.outcome}, {each.text}" for each in row.results)
+            rows.append([*row[:4], *links, row.outcome, results, "; ".join(gaps)])
         return rows
 
     def summary(self) -> str:
@@ -108,11 +153,19 @@ class TraceMatrix(Tabular):
             name, text = row.requirement or "(none)", shorten(row.text, 50)
             lines.append(f"  {name:{width}}  {text}".rstrip())
             lines.append(f"  {'':{width}}  {has}")
+            worst = [each for each in row.results if each.outcome == row.outcome][:SHOWN]
+            said = "; ".join(f"{each.name}: {each.text}" for each in worst)
+            lines.append(f"  {'':{width}}  {row.outcome}{': ' if said else ''}{said}")
         for kind, gaps in (("Missing", self.missing), ("Suspect", self.suspect)):
             lines += ["", f"{kind}:", *(f"  {gap.text}" for gap in gaps)] if gaps else []
         return "\n".join(lines)
 
     def _verdict(self) -> str:
+        found = Counter(row.outcome for row in self.rows)
+        outcomes = listed([f"{found[each]:,} {each}" for each in OUTCOMES if found[each]])
+        return f"{self._links()}; {outcomes or 'nothing was asked'}"
+
+    def _links(self) -> str:
         if self.complete:
             return "every link is there, and fits"
         counts = [(len(self.missing), "missing"), (len(self.suspect), "suspect")]
@@ -130,20 +183,23 @@ class TraceMatrix(Tabular):
         ):
             code = element("code", formula) if formula else ""
             cells.append([requirement or f"(none: {row.problem})", text, code, *others])
-        heads = ["requirement", "text", "formula", "problem", *self.asked, "gaps"]
         gaps: list[list[Child]] = [[gap.subject, gap.kind, gap.link, gap.text] for gap in self.gaps]
         found = paragraph("Every link is there, and what it joins has not changed since.")
         if gaps:
             found = table(["subject", "kind", "link", "what it is"], gaps)
+        links = tuple(chained(self.inputs))
+        sound = self.complete and not self.unmet
+        broken = any(row.outcome == VIOLATED for row in self.rows)
         page = Page(
             title="From requirement to report",
             headline=f"{self._verdict()[:1].upper()}{self._verdict()[1:]}.",
-            tone="holds" if self.complete else "open",
+            tone="fails" if broken else "holds" if sound else "open",
             sections=(
-                Section("matrix", "The chain of each requirement", (table(heads, cells),)),
+                Section("matrix", "The chain of each requirement", (table(self._heads(), cells),)),
                 Section("gaps", "Links that are missing or suspect", (found,)),
+                Section("inputs", "Files of evidence", (chain_table(links),)),
             ),
-            claims={},
+            claims={"inputs_sha256_chain": links[-1].chain if links else ""},
         )
         write_page(page, path)
         return Path(path)
