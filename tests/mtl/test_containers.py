@@ -256,7 +256,7 @@ def test_several_clocks_in_one_table(tmp_path):
     trace = read(path, time={"t1": ["a"], "t2": ["b", "c"]})
     np.testing.assert_array_equal(trace.times, [0, 0.5, 1, 1.5, 2])
     np.testing.assert_array_equal(trace["b"], [np.nan, 5, np.nan, 6, np.nan])
-    np.testing.assert_array_equal(trace["c"], [np.nan, 1, np.nan, -1, np.nan])
+    np.testing.assert_array_equal(trace["c"], [np.nan, 1, np.nan, 0, np.nan])
     with pytest.raises(UnknownNameError, match="has no column 'd'"):
         read(path, time={"t1": ["d"]})
 

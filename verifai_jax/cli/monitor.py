@@ -381,7 +381,7 @@ def _columns(names: list[str], formula: "Formula") -> dict[str, str | list[str]]
 
 def _number(cells: dict[str, str], line: int, separator: str, name: str) -> float:
     text = cells[name].strip()
-    truths = {"true": 1.0, "false": -1.0, "": math.nan}
+    truths = {"true": True, "false": False, "": math.nan}
     if text.lower() in truths:
         return truths[text.lower()]
     try:

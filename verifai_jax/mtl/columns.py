@@ -52,9 +52,9 @@ def numbers_of(source: str, name: str, column: Any) -> np.ndarray:
     if not is_numeric(column):
         raise ValueError(f"column {name!r} of {source} {_fault(column)}")
     if types.is_boolean(kind) and column.null_count:
-        # Truth values count as +1 and -1, and a gap is neither.
-        truths = {True: 1.0, False: -1.0, None: np.nan}
-        return np.array([truths[cell] for cell in column.to_pylist()])
+        # Masked, so that a trace knows truth values with gaps for what they are.
+        known = np.asarray(column.is_valid())
+        return np.ma.array(np.asarray(column.fill_null(False)), mask=~known)
     if types.is_decimal(kind):
         column = column.cast("float64")
     return column.to_numpy() if hasattr(column, "chunks") else column.to_numpy(zero_copy_only=False)
@@ -106,10 +106,9 @@ def _vectors(source: str, name: str, column: Any) -> np.ndarray:
                     f"column {name!r} of {source} holds lists that are not vectors of numbers; in "
                     f"row {row} there is {_brief(entry)}"
                 )
-    truths = any(isinstance(entry, bool) for cell in rows for entry in cell)
-    if truths:
-        rows = [[None if e is None else 1.0 if e else -1.0 for e in cell] for cell in rows]
-    return np.array(rows, float).reshape(len(rows), width)
+    entries = [entry for cell in rows for entry in cell if entry is not None]
+    truths = bool(entries) and all(isinstance(entry, bool) for entry in entries)
+    return np.array(rows, object if truths else float).reshape(len(rows), width)
 
 
 def _brief(value: object) -> str:

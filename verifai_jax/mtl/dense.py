@@ -20,6 +20,7 @@ from jaxtyping import Float
 from verifai_jax.core.values.trace import Trace
 from verifai_jax.mtl import formula as ast
 from verifai_jax.mtl._parse import parse
+from verifai_jax.mtl.evaluate import alone
 from verifai_jax.mtl.expression import Arithmetic, Component, Duration, Number, Signal
 from verifai_jax.mtl.formula import Formula, Term
 from verifai_jax.mtl.host_values import FUNCTIONS, numbers
@@ -361,7 +362,9 @@ class _Dense:
 
     def leaf(self, f: Formula) -> Piecewise:
         if f.compared is None:
-            return self.expression(f.terms()[0])
+            (e,) = f.terms()
+            truths = set(filter(self.trace.is_truth, e.signals()))
+            return self.expression(e).map(lambda values: alone(values, e, truths))
         left, comparison, right = f.compared
         if comparison in ("<", "<="):
             left, right = right, left
@@ -383,10 +386,8 @@ class _Dense:
                         "robustness"
                     )
                 case Signal(name):
-                    own = self.trace[name]
-                    if own.ndim == 1:  # A vector is read by its component or norm.
-                        truth = own.dtype == bool  # It has no values between.
-                        values[id(part)] = self.samples(name, numbers(own), hold=truth)
+                    if self.trace[name].ndim == 1:  # A vector is read by its component or norm.
+                        values[id(part)] = self.samples(name, numbers(self.trace[name]))
                 case Component(Signal(name), index):
                     values[id(part)] = self.samples(name, numbers(self.trace[name])[:, index])
                 case Arithmetic("norm", (Signal(name),)):
@@ -402,7 +403,9 @@ class _Dense:
     def samples(self, name: str, values: np.ndarray, hold: bool = False) -> Piecewise:
         if np.isnan(values).any():
             raise ValueError(f"no verdict: signal {name!r} is NaN")
-        after = values if hold or self.method == "hold" else np.append(values[1:], values[-1:])
+        # A truth value has no values between.
+        hold = hold or self.method == "hold" or self.trace.is_truth(name)
+        after = values if hold else np.append(values[1:], values[-1:])
         return Piecewise(self.times, values, values, after, self.snap)
 
     def apply(self, name: str, operands: list[Piecewise], whole: Term | Formula) -> Piecewise:

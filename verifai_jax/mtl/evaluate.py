@@ -6,7 +6,7 @@ therefore cost nothing, and unbounded windows end there.
 """
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
@@ -65,6 +65,16 @@ def seconds_held(truth: Any, n: int, dt: float, xp: Any) -> Any:
     return xp.where(within(xp.isnan(truth)) > 0, xp.nan, within(truth > 0) * dt)
 
 
+def alone(value: Any, e: Term, truths: Collection[str]) -> Any:
+    """Return the value of an expression as a formula: a truth value is 1 or -1 there, not 1 or 0.
+
+    **Arguments:**
+    - `truths`: names of the signals of truth values.
+    """
+    signal = e.vector if isinstance(e, Component) else e
+    return 2 * value - 1 if isinstance(signal, Signal) and signal.name in truths else value
+
+
 def check_scalar(e: Term, shape: Sequence[int], lanes: int) -> None:
     """Refuse a vector signal where a number is needed. **Raises:** `TypeError`."""
     if isinstance(e, Signal) and len(shape) != 1 + lanes:
@@ -90,6 +100,7 @@ class Evaluator:
     valid samples, `[*lanes]` (truncate only; all when None). `lanes` is the number of lane axes;
     `open_right` makes windows half-open, as with `compat="pymtl"`. One period `dt` is `stride`
     samples long (`Trace.finely`), so windows, next and previous are that many times longer.
+    `truths` are the signals of truth values, which are numbers 1 and 0.
     """
 
     signals: Mapping[str, Float[Array, "time ..."]]
@@ -102,6 +113,7 @@ class Evaluator:
     open_right: bool = False
     lanes: int = 0
     stride: int = 1
+    truths: frozenset[str] = frozenset()
     #: Added to the values of leaves, `[time, *lanes]` each; differentiating by it weighs them.
     nudges: Mapping[Formula, Float[Array, "time ..."]] = field(default_factory=dict)
     _memo: dict[Any, Array] = field(default_factory=dict)
@@ -199,7 +211,8 @@ class Evaluator:
                 a, b = (self.expression(e, start, stop) for e in (left, right))
                 value = compared(comparison, a, b, boolean, jnp)
             case ast.Atom(e):
-                value = compared(">", self.expression(e, start, stop), 0.0, boolean, jnp)
+                value = alone(self.expression(e, start, stop), e, self.truths)
+                value = compared(">", value, 0.0, boolean, jnp)
         if f in self.nudges:
             value = value + self.nudges[f][start : stop + 1]
         return self._extended(value, last - first + 1)

@@ -313,7 +313,7 @@ def _signals(
     signals = {}
     for name in wanted:
         if name in vectors:
-            signals[name] = np.stack([values[part] for part in vectors[name]], axis=1)
+            signals[name] = np.ma.stack([values[part] for part in vectors[name]], axis=1)
         elif name in values:
             signals[name] = values[name]
         else:

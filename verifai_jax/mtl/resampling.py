@@ -16,6 +16,7 @@ from jaxtyping import Float, Int
 
 from verifai_jax.core.messages.errors import check_names
 from verifai_jax.core.messages.text import format_seconds, format_time
+from verifai_jax.core.values.gaps import has_truths
 from verifai_jax.core.values.trace import Trace, check_period
 from verifai_jax.mtl.setting import since_first
 
@@ -66,7 +67,7 @@ def resample(trace: Trace, dt: float, method: Method) -> Trace:
     signals, inner, notes = {}, {}, dict(trace.notes)
     for name, recorded in trace.signals.items():
         values = np.asarray(recorded)
-        if values.dtype == bool or method == "hold":
+        if trace.is_truth(name) or method == "hold":
             missing = gaps(values)
             if missing.any():
                 notes[
@@ -86,7 +87,7 @@ def resample(trace: Trace, dt: float, method: Method) -> Trace:
             {name: np.concatenate([signals[name], inner[name]])[positions] for name in signals},
             times=times,
         )
-    about = {"status": trace.status, "notes": notes, "units": trace.units}
+    about = {"status": trace.status, "notes": notes, "units": trace.units, "truths": trace.truths}
     return Trace(signals, dt=float(dt), between=between, **about)
 
 
@@ -186,9 +187,10 @@ def joined(
     for clock, part in zip(clocks, parts, strict=True):
         rows = np.searchsorted(union, clock)
         for name, column in part.items():
-            numbers = np.where(column, 1.0, -1.0) if column.dtype == bool else column
-            values[name] = np.full((len(union), *column.shape[1:]), np.nan)
-            values[name][rows] = numbers
+            shape = (len(union), *column.shape[1:])
+            truths = np.ma.masked_all(shape, bool)
+            values[name] = truths if has_truths(column) else np.full(shape, np.nan)
+            values[name][rows] = column
     return union, values
 
 
@@ -203,6 +205,8 @@ def without_gaps(trace: Trace, missing: Missing | Mapping[str, Missing]) -> Trac
         gap = gaps(signals[name])
         if not gap.any():
             continue
+        # A truth value has no values between.
+        way = "hold" if way == "interpolate" and trace.is_truth(name) else way
         done = {"hold": "its last one is held", "interpolate": "it is interpolated"}
         said = done.get(way, "these are left out")
         notes[f"signal {name!r} has no value in {gap.sum()} of {len(gap)} rows: {said} there"] = 1

@@ -50,7 +50,7 @@ class Setting(NamedTuple):
     """All static settings of one evaluation.
 
     `length` counts samples. One period `dt` is `stride` samples long: more than one if values were
-    recorded between the samples.
+    recorded between the samples. `truths` are the signals of truth values.
     """
 
     formula: Formula
@@ -62,6 +62,7 @@ class Setting(NamedTuple):
     end: End
     compat: str | None
     stride: int = 1
+    truths: frozenset[str] = frozenset()
 
 
 def as_formula(formula: Formula | str) -> Formula:
@@ -117,7 +118,7 @@ def prepare(
     signals = numbers_of_signals({name: trace.signals[name] for name in formula.signals()})
     setting = Setting(
         formula, trace.length, dt, semantics.kind, semantics.error, semantics.bound, end, compat,
-        stride,
+        stride, frozenset(name for name in formula.signals() if trace.is_truth(name)),
     )  # fmt: skip
     tau = None
     if semantics.kind == "smooth" and semantics.error is None:
@@ -134,14 +135,11 @@ def _missing_signal(name: str, trace: Trace) -> Exception:
 
 
 def numbers_of_signals(signals: dict[str, Samples]) -> dict[str, Array]:
-    """Return the signals as arrays of one floating type, with +1 for true and -1 for false."""
+    """Return the signals as arrays of one floating type, with 1 for true and 0 for false."""
     arrays = {name: as_array(value) for name, value in signals.items()}
     floats = [a.dtype for a in arrays.values() if jnp.issubdtype(a.dtype, jnp.floating)]
     dtype = jnp.result_type(*floats) if floats else jnp.result_type(float)
-    return {
-        name: (jnp.where(a, 1.0, -1.0) if a.dtype == bool else a).astype(dtype)
-        for name, a in arrays.items()
-    }
+    return {name: array.astype(dtype) for name, array in arrays.items()}
 
 
 def period(trace: Trace) -> float:
@@ -267,4 +265,5 @@ def evaluator_of(
         setting.compat == "pymtl",
         lanes,
         stride=setting.stride,
+        truths=setting.truths,
     )
