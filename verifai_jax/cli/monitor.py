@@ -353,7 +353,7 @@ def _samples(
 
 def _seconds_since(first: list[datetime.datetime], cell: str) -> float | None:
     """Return the seconds since the first date of the stream; None for a cell that is not a date."""
-    from verifai_jax.mtl.columns import moment_of
+    from verifai_jax.mtl.stamps import moment_of
 
     text = cell.strip()
     if not {"-", ":"} & set(text[1:]):

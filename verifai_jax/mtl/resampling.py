@@ -12,6 +12,7 @@ from fractions import Fraction
 from typing import Literal
 
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Float, Int
 
 from verifai_jax.core.messages.errors import check_names
@@ -19,6 +20,7 @@ from verifai_jax.core.messages.text import format_seconds, format_time
 from verifai_jax.core.values.gaps import has_truths
 from verifai_jax.core.values.trace import Trace, check_period
 from verifai_jax.mtl.setting import since_first
+from verifai_jax.mtl.stamps import merged, resolution_of
 
 Method = Literal["hold", "linear"]
 Missing = Literal["hold", "drop", "interpolate"]
@@ -181,7 +183,8 @@ def joined(
     - `stamps`: times of each clock in seconds, and their origin.
     """
     origin = min(start for _, start in stamps)
-    clocks = [seconds + float(start - origin) for seconds, start in stamps]
+    rounded = [resolution_of(seconds) for seconds, _ in stamps]
+    clocks = merged([seconds + float(start - origin) for seconds, start in stamps], rounded)
     union = np.unique(np.concatenate(clocks))
     values = {}
     for clock, part in zip(clocks, parts, strict=True):
@@ -226,6 +229,37 @@ def without_gaps(trace: Trace, missing: Missing | Mapping[str, Missing]) -> Trac
     return replace(trace, signals=signals, notes=notes, times=clock, dt=None)
 
 
+HOLE = 10.0
+"""Usual steps of a signal beyond which a step is a hole."""
+
+
+def check_holes(trace: Trace, max_gap: float | None) -> Trace:
+    """Return a trace with notes on times without a value of a signal, far longer than its period.
+
+    **Raises:** `ValueError` for one longer than `max_gap` seconds.
+    """
+    if isinstance(trace.times, Tracer):
+        return trace
+    times, notes, seen = np.asarray(trace.clock()), dict(trace.notes), set[bytes]()
+    for name, signal in trace.signals.items():
+        known = ~gaps(np.asarray(signal))
+        steps, own = np.diff(times[known]), times[known]
+        if not len(steps) or known.tobytes() in seen:
+            continue
+        seen.add(known.tobytes())
+        k, usual = int(np.argmax(steps)), float(np.median(steps))
+        what = f"signal {name!r} has no value from {format_time(own[k])} s to "
+        what += f"{format_time(own[k + 1])} s, {format_seconds(float(steps[k]))}"
+        if max_gap is not None and steps[k] > max_gap:
+            raise ValueError(f"{what}: more than max_gap, which is {format_seconds(max_gap)}")
+        if steps[k] > HOLE * usual:
+            hour = " (an hour is skipped where local times change to summer time)"
+            summer = hour if abs(steps[k] - 3600) <= 2 * usual else ""
+            note = f"{what}, where {format_seconds(usual)} is usual{summer}"
+            notes[note] = int(np.sum(steps > HOLE * usual))
+    return replace(trace, notes=notes)
+
+
 def check_increasing(times: np.ndarray) -> None:
     """Raise `ValueError` that names a row whose time is not finite, or not after its predecessor.
 
@@ -239,6 +273,8 @@ def check_increasing(times: np.ndarray) -> None:
     if not np.all(rises):
         k = int(np.argmin(rises))
         first, second = (format_time(float(t)) for t in times[k : k + 2])
+        hour = "; an hour comes twice where local times change from summer time"
         raise ValueError(
             f"sample times must increase; row {k + 1} has {first} s and row {k + 2} {second} s"
+            f"{hour if 3000 < float(times[k]) - float(times[k + 1]) <= 3600 else ''}"
         )
