@@ -135,7 +135,7 @@ def test_variables_of_a_dimension_share_its_coordinate(tmp_path, double, name):
         slow_time=Variable(dims=("slow_time",), values=days[:1], attrs={}),
     )
     opened = contextlib.nullcontext(found)
-    double(xarray={"open_dataset": lambda path, **_: opened, "open_zarr": lambda path: opened})
+    double(xarray={"open_dataset": lambda path, **_: opened, "open_zarr": lambda path, **_: opened})
     path = tmp_path / name
     path.mkdir() if name.endswith("zarr") else path.write_bytes(b"")
     trace = read(path)

@@ -19,19 +19,19 @@ from jaxtyping import Float
 
 from verifai_jax.core.values.trace import Trace
 from verifai_jax.mtl import formula as ast
-from verifai_jax.mtl._parse import parse
 from verifai_jax.mtl.evaluate import alone
 from verifai_jax.mtl.expression import Arithmetic, Component, Duration, Number, Signal
 from verifai_jax.mtl.formula import Formula, Term
 from verifai_jax.mtl.host_values import FUNCTIONS, numbers
 from verifai_jax.mtl.parametric import read_parametric
-from verifai_jax.mtl.resampling import Method
-from verifai_jax.mtl.setting import check_trace
+from verifai_jax.mtl.resampling import Method, check_increasing, gaps, held
+from verifai_jax.mtl.setting import as_formula, check_trace
+from verifai_jax.mtl.stamps import resolution_of
 from verifai_jax.mtl.tree import missing_case, postorder
 
 Values = Float[np.ndarray, " n"]
 SNAP = 1e-9
-"""Share of the shortest distance of samples within which two times are one: sums of decimals are
+"""Share of the usual distance of samples within which two times are one: sums of decimals are
 off by some units in the last place, and times that differ on purpose by far more."""
 
 
@@ -216,6 +216,14 @@ def witnessed(f: Piecewise, g: Piecewise, ahead: bool) -> Piecewise:
     """
     f, g = aligned(f, g, crossings=True)
     n = len(f.times)
+
+    # Unlike Python's own they give NaN for NaN.
+    def most(a: float, b: float) -> float:
+        return a if a >= b or a != a else b
+
+    def least(a: float, b: float) -> float:
+        return a if a <= b or a != a else b
+
     far_g, near_g, near_f = (g.left, g.right, f.right) if ahead else (g.right, g.left, f.left)
     # The least of f between a time within a piece and its far end, and the best from there on.
     lowest = np.minimum(f.right, f.left)
@@ -223,11 +231,11 @@ def witnessed(f: Piecewise, g: Piecewise, ahead: bool) -> Piecewise:
     now = -np.inf
     for k in range(n - 1, -1, -1) if ahead else range(n):
         if not ahead:
-            now = point[k] = max(g.point[k], min(f.point[k], now))
-        best[k] = max(far_g[k], now)
-        now = max(min(near_g[k], near_f[k]), min(lowest[k], best[k]))
+            now = point[k] = most(g.point[k], least(f.point[k], now))
+        best[k] = most(far_g[k], now)
+        now = most(least(near_g[k], near_f[k]), least(lowest[k], best[k]))
         if ahead:
-            now = point[k] = max(g.point[k], min(f.point[k], now))
+            now = point[k] = most(g.point[k], least(f.point[k], now))
     sides = (lowest, f.left) if ahead else (f.right, lowest)
     kept = Piecewise(f.times, point, *sides, f.snap)
     far = joined([kept, Piecewise(g.times, best, best, best, g.snap)], -1)
@@ -291,29 +299,111 @@ def dense_signal(formula: Formula | str, trace: Trace, method: Method = "linear"
     **Returns:** a function of the seconds since the first sample, with its breakpoints.
     """
     check_trace(trace)
-    formula = parse(formula) if isinstance(formula, str) else formula
-    trace = trace.trim()
-    if trace.times is None:
-        assert trace.dt is not None
-        times = np.arange(trace.length) * trace.dt
-    else:
-        clock = np.asarray(trace.times, float)
-        times = clock - clock[0]
-    snap = SNAP * float(np.min(np.diff(times), initial=math.inf)) if len(times) > 1 else SNAP
-    values = _Dense(trace, times, method, snap)
-    made: dict[int, Piecewise] = {}
-    for part in postorder(formula):
-        if isinstance(part, Formula):
-            made[id(part)] = values.formula(part, [made[id(p)] for p in part.valued()])
-    return made[id(formula)]
+    values = DenseValues(trace, method)
+    for name, signal in values.trace.signals.items():
+        if gaps(np.asarray(signal)).any() and name in as_formula(formula).signals():
+            raise ValueError(f"no verdict: signal {name!r} is NaN")
+    return values(as_formula(formula))
 
 
-class _Dense:
-    def __init__(self, trace: Trace, times: np.ndarray, method: Method, snap: float) -> None:
-        self.trace = trace
-        self.times = times
+class NotDense(ValueError):
+    """An error for a formula that has no meaning between samples."""
+
+
+class DenseValues:
+    """The values of formulas at every time on one trace, common parts computed once.
+
+    With `method="hold"` a signal keeps its last value in gaps; with `"linear"` values are NaN where
+    they depend on a gap.
+    """
+
+    def __init__(self, trace: Trace, method: Method) -> None:
+        self.trace = trace = trace.trim()
+        clock = np.asarray(trace.clock())
+        check_increasing(clock)
+        self.times = clock - clock[0]
         self.method = method
-        self.snap = snap
+        steps = np.diff(self.times)
+        self.snap = SNAP
+        if len(steps):
+            # Stamps are rounded, the more so the longer ago their clock began.
+            rounding = 0.0 if trace.times is None else 2 * resolution_of(np.asarray(trace.times))
+            near = max(SNAP * float(np.median(steps)), rounding)
+            self.snap = min(near, float(steps.min()) / 4)
+        self._known: dict[tuple[Formula, bool], Piecewise] = {}
+
+    def __call__(self, formula: Formula, boolean: bool = False) -> Piecewise:
+        """Compute the robustness, or above zero where it holds and below where not."""
+        for part in postorder(formula):
+            if isinstance(part, Formula) and (part, boolean) not in self._known:
+                below = [self._known[p, boolean] for p in part.valued()]
+                value = self.formula(part, below)
+                if boolean and isinstance(part, ast.Leaf):
+                    value = self.truth(part, value)
+                self._known[part, boolean] = value
+        return self._known[formula, boolean]
+
+    def truth(self, f: Formula, margin: Piecewise) -> Piecewise:
+        """Return 1 where a predicate holds and -1 where not."""
+        at_zero = f.compared is not None and f.compared[1] in (">=", "<=", "==")
+        margin, _ = aligned(margin, self.constant(0.0), crossings=True)
+
+        def sign(x: Values) -> Values:
+            holds = (x > 0) | (at_zero & (x == 0))
+            return np.where(np.isnan(x), x, np.where(holds, 1.0, -1.0))
+
+        with np.errstate(invalid="ignore"):
+            steady = margin.right == margin.left
+            inside = sign(np.where(steady, margin.right, (margin.right + margin.left) / 2))
+        return Piecewise(margin.times, sign(margin.point), inside, inside, self.snap)
+
+    def decision(self, formula: Formula) -> tuple[Formula, float] | None:
+        """Return the predicate and the time that decide the robustness; None if none does."""
+        t = 0.0
+        while not isinstance(formula, ast.Leaf):
+            wanted = float(self(formula)(np.array([t]))[0])
+            wanted = -wanted if isinstance(formula, ast.Not) else wanted
+            options = self._operands(formula, t)
+            found = [(abs(values - wanted), part, times) for part, times, values in options]
+            if not math.isfinite(wanted) or not found:
+                return None
+            away, part, times = min(found, key=lambda each: float(np.nanmin(each[0])))
+            formula, t = part, float(times[int(np.nanargmin(away))])
+        return (formula, t) if formula.is_predicate else None
+
+    def _operands(self, f: Formula, t: float) -> list[tuple[Formula, Values, Values]]:
+        """Return operands with the times at which one may decide, and what it gives there."""
+        if not isinstance(f, ast.Window | ast.Witness):
+            now = np.array([t])
+            return [(part, now, self(part)(now)) for part in f.valued()]
+        ends = (f.interval.start, f.interval.end)
+        low, high = (t + e for e in ends) if f.side == "ahead" else (t - e for e in ends[::-1])
+        if isinstance(f, ast.Window):
+            times = self._between(low, high, f.operand)
+            return [(f.operand, times, self(f.operand)(times))] if len(times) else []
+        kept, found = f.valued()
+        times = self._between(*((t, high) if f.side == "ahead" else (low, t)), kept, found)
+        times = times if f.side == "ahead" else times[::-1]
+        left, right = self(kept)(times), self(found)(times)
+        # The least of `kept` from now to each time, which does not count itself.
+        so_far = np.minimum.accumulate(np.append(np.inf, left[:-1]))
+        # Within a piece there are times between a time and the end of the piece.
+        so_far[1::2] = np.minimum(so_far, left)[1::2]
+        due = (times >= low - self.snap) & (times <= high + self.snap)
+        if not due.any():
+            return []
+        k = int(np.argmax(np.where(due, np.minimum(right, so_far), -np.inf)))
+        if right[k] <= so_far[k]:
+            return [(found, times[[k]], right[[k]])]
+        return [(kept, times[: k + k % 2], left[: k + k % 2])]
+
+    def _between(self, low: float, high: float, *parts: Formula) -> Values:
+        """Return breakpoints of formulas in a window, its ends, and a time between each two."""
+        last = max(float(self(part).times[-1]) for part in parts) + 1.0
+        low, high = max(low, 0.0), min(high, max(last, low))
+        own = np.concatenate([[low, high], *(self(part).times for part in parts)])
+        own = np.unique(own[(own >= low) & (own <= high)]) if low <= high else own[:0]
+        return np.sort(np.concatenate([own, (own[:-1] + own[1:]) / 2]))
 
     def constant(self, value: float) -> Piecewise:
         one = np.full(1, value)
@@ -338,7 +428,7 @@ class _Dense:
             case ast.Derived():
                 return below[0]
             case ast.Next() | ast.Prev():
-                raise ValueError(
+                raise NotDense(
                     f"{f} counts samples, and between samples there are none: give a time, as in "
                     "eventually[0, 0.1] or once[0, 0.1]"
                 )
@@ -381,7 +471,7 @@ class _Dense:
                 case Number(value):
                     values[id(part)] = self.constant(value)
                 case Duration():
-                    raise ValueError(
+                    raise NotDense(
                         f"{part} counts samples, and between samples there are none: judge it by "
                         "robustness"
                     )
@@ -401,10 +491,9 @@ class _Dense:
         return values[id(e)]
 
     def samples(self, name: str, values: np.ndarray, hold: bool = False) -> Piecewise:
-        if np.isnan(values).any():
-            raise ValueError(f"no verdict: signal {name!r} is NaN")
         # A truth value has no values between.
         hold = hold or self.method == "hold" or self.trace.is_truth(name)
+        values = held(values) if hold else values
         after = values if hold else np.append(values[1:], values[-1:])
         return Piecewise(self.times, values, values, after, self.snap)
 
@@ -419,7 +508,7 @@ class _Dense:
         straight = name in ("+", "-", "neg") or (name == "*" and any(held))
         straight = straight or (name == "/" and held[-1])
         if not (straight or all(held)) or (name == "norm" and self.method != "hold"):
-            raise ValueError(
+            raise NotDense(
                 f"{whole} is not straight between samples: judge it with method='hold', or record "
                 "it as a signal of its own"
             )

@@ -32,6 +32,8 @@ class Row(NamedTuple):
     - `instant`: time of the deciding sample in seconds; NaN if there is none.
     - `explanation`: the predicate that decides at that time, with its margin.
     - `error`: the reason why there is no verdict.
+    - `note`: what to know of the recording and the verdict, such as a hole.
+    - `unit`: unit of the robustness as recorded, or else that of the requirement.
     """
 
     file: str
@@ -41,6 +43,8 @@ class Row(NamedTuple):
     instant: float = math.nan
     explanation: str = ""
     error: str = ""
+    note: str = ""
+    unit: str = ""
 
 
 @dataclass(frozen=True)
@@ -81,6 +85,11 @@ class Judgement(InNotebook):
     def of(self, requirement: str) -> list[Row]:
         """Return the rows of a requirement that have a verdict."""
         return [row for row in self.rows if row.requirement == requirement and row.verdict]
+
+    def unit_of(self, requirement: Requirement) -> str:
+        """Return the unit of a requirement's robustness; empty if recordings have several."""
+        units = {row.unit for row in self.of(requirement.id)} or {requirement.unit}
+        return units.pop() if len(units) == 1 else ""
 
     @property
     def tightest(self) -> Row | None:
@@ -175,9 +184,11 @@ class Judgement(InNotebook):
             row = spread.loc[each.id]
             share = f"{int(row['failing'])} of {int(row['verdicts'])}"
             numbers = "".join(f"{row[q]:>z12.4g}" for q in ("0", "0.5") if row["verdicts"])
-            lines.append(f"  {each.id:{width}}  {share:<10}{numbers} {each.unit}".rstrip())
+            unit = self.unit_of(each)
+            lines.append(f"  {each.id:{width}}  {share:<10}{numbers} {unit}".rstrip())
         lines += _listed("Failing, the worst first:", failing)
         lines += _listed("Without a verdict:", _together(missing))
+        lines += _listed("Notes:", _together(row._replace(error=row.note) for row in self.rows))
         if (tightest := self.tightest) is not None and not failing:
             lines += ["", f"Tightest: {tightest.requirement} on {tightest.file}"]
             lines += [f"  {tightest.explanation}"] if tightest.explanation else []
@@ -246,9 +257,11 @@ def _listed(title: str, rows: Sequence[Row]) -> list[str]:
     return lines
 
 
-def _together(rows: Sequence[Row]) -> list[Row]:
+def _together(rows: Iterable[Row]) -> list[Row]:
     """Return rows of a recording with one error as one row, which names the requirements."""
     found: dict[tuple[str, str], list[str]] = {}
     for row in rows:
+        if not row.error:
+            continue
         found.setdefault((row.file, row.error), []).append(row.requirement)
     return [Row(file, ", ".join(names), error=error) for (file, error), names in found.items()]

@@ -14,14 +14,14 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
-
 from verifai_jax.core.compute.executors import Executor, check_executor, gather
 from verifai_jax.core.display.progress import count_done, shows_progress
 from verifai_jax.core.messages.errors import missing_name
-from verifai_jax.core.messages.text import format_time, one_line
+from verifai_jax.core.messages.text import format_time, listed, one_line
 from verifai_jax.core.values.trace import Trace
 from verifai_jax.mtl._robustness import first_nan
+from verifai_jax.mtl.columns import LeftOut
+from verifai_jax.mtl.dense import DenseValues, NotDense
 from verifai_jax.mtl.evaluate import End
 from verifai_jax.mtl.formula import Formula
 from verifai_jax.mtl.host_values import HostValues
@@ -29,8 +29,9 @@ from verifai_jax.mtl.judgement import Judgement, Row
 from verifai_jax.mtl.recorded import Recording, Recordings, named_recordings
 from verifai_jax.mtl.recording import read
 from verifai_jax.mtl.requirements import Requirement, Requirements, requirements_of
-from verifai_jax.mtl.resampling import Method, Missing, resample, without_gaps
-from verifai_jax.mtl.setting import check_horizon
+from verifai_jax.mtl.resampling import Method, Missing, check_holes, resample, without_gaps
+from verifai_jax.mtl.setting import SamplingError, check_horizon, check_reach, period
+from verifai_jax.mtl.units import plain_unit, unit_of, units_of
 
 _signals = functools.lru_cache(1024)(Formula.signals)
 _text = functools.lru_cache(1024)(Formula.__str__)
@@ -42,11 +43,22 @@ class Reading(NamedTuple):
 
     time: str
     dt: float | None
+    time_unit: str | None
     resample_to: float | None
     method: Method | None
     missing: Missing | Mapping[str, Missing] | None
+    max_gap: float | None
     end: End
     explain: bool
+
+
+class Found(NamedTuple):
+    """What is found of a formula on a recording; see `Row`."""
+
+    robustness: float
+    holds: bool
+    instant: float = math.nan
+    explanation: str = ""
 
 
 @shows_progress("judging", "recordings")
@@ -55,10 +67,12 @@ def judge(
     recordings: Recordings,
     *,
     time: str = "time",
+    time_unit: str | None = None,
     dt: float | None = None,
     resample_to: float | None = None,
     method: Method | None = None,
     missing: Missing | Mapping[str, Missing] | None = None,
+    max_gap: float | None = None,
     end: End = "hold",
     explain: bool = True,
     executor: Executor | None = None,
@@ -70,13 +84,21 @@ def judge(
     Recordings are read one after another, each once, and none is kept in memory. One that cannot be
     read or judged gives a row without a verdict, with the reason.
 
+    The samples of an even clock decide. On an uneven one the recorded times decide, as in
+    `dense_robustness`: each signal keeps its value until its next sample (`method="linear"`: lines
+    join its samples), and windows begin and end at any time. Formulas that count samples, those
+    that are not straight between them, and `end="truncate"` need an even clock; where `resample_to`
+    gives one, a note says by how much times may be off.
+
     **Arguments:**
     - `formulas`: a formula, a sequence of formulas, or a dictionary by identifier;
       `read_requirements` reads them from a file.
     - `recordings`: paths of files, of folders (all recordings in them and their subfolders), traces
       or data frames: one, a sequence, or a dictionary by name; or a problem, which is simulated.
-    - `time`, `dt`, `resample_to`, `method`, `missing`: as in `read`; given traces are resampled and
-      their gaps treated as well.
+    - `time`, `time_unit`, `dt`, `missing`, `max_gap`: as in `read`; the gaps of given traces are
+      treated as well.
+    - `resample_to`, `method`: the even clock for formulas that need one, and what is between
+      samples, `"hold"` or `"linear"`.
     - `end`: as in `robustness`.
     - `explain`: whether to find the deciding predicate and instant.
     - `executor`: anything with the `submit` of `concurrent.futures`, to read and judge in parallel;
@@ -87,11 +109,13 @@ def judge(
     `FileNotFoundError` for a folder or a file that does not exist.
     """
     requirements = requirements_of(formulas)
-    if (resample_to is None) != (method is None):
+    if resample_to is not None and method is None:
         raise ValueError('resampling needs both: resample_to=PERIOD, method="hold" or "linear"')
+    if method not in (None, "hold", "linear"):
+        raise ValueError(f"method is 'hold' or 'linear'; got {method!r}")
     if end not in ("hold", "truncate", "strict"):
         raise ValueError(f"end is 'hold', 'truncate' or 'strict'; got {end!r}")
-    reading = Reading(time, dt, resample_to, method, missing, end, explain)
+    reading = Reading(time, dt, time_unit, resample_to, method, missing, max_gap, end, explain)
     rows: dict[int, Sequence[Row]] = {}
 
     def keep(index: int, found: Sequence[Row]) -> None:
@@ -129,66 +153,129 @@ def judge_recording(
 def _trace(source: Recording, reading: Reading) -> Trace:
     if not isinstance(source, Trace):
         return read(
-            source, time=reading.time, dt=reading.dt, resample_to=reading.resample_to,
-            method=reading.method, missing=reading.missing,
+            source, time=reading.time, time_unit=reading.time_unit, dt=reading.dt,
+            missing=reading.missing, max_gap=reading.max_gap,
         )  # fmt: skip
-    trace = source if reading.missing is None else without_gaps(source, reading.missing)
-    if reading.resample_to is not None and reading.method is not None:
-        return resample(trace, reading.resample_to, reading.method)
-    return trace
+    trace = check_holes(source.trim(), reading.max_gap)
+    return trace if reading.missing is None else without_gaps(trace, reading.missing)
 
 
 def _judged(
     requirements: Sequence[Requirement], name: str, trace: Trace, reading: Reading
 ) -> list[Row]:
-    trace = trace.trim()
-    truncated = reading.end == "truncate"
-    values = HostValues.of(trace, "truncate" if truncated else "hold")
-    clock = np.asarray(trace.finely().clock())
+    trace, units = trace.trim(), units_of(trace.signals, trace.units)
+    said = [note for note in trace.notes if not isinstance(note, LeftOut)]
+    find = finder(trace, reading)
     rows = []
     for each in requirements:
         try:
-            rows.append(_row(each, name, trace, values, clock, reading))
+            _check_signals(each.formalized, trace)
+            found, note = find(each.formalized)
+            unit, other = _unit(each, units)
+            notes = "; ".join(filter(None, [*said, note, other]))
+            verdict = "holds" if found.holds else "fails"
+            decided = (found.robustness, found.instant, found.explanation)
+            rows.append(Row(name, each.id, verdict, *decided, note=notes, unit=unit))
         except (ValueError, TypeError) as error:
             rows.append(Row(name, each.id, error=one_line(str(error))))
     return rows
 
 
-def _row(
-    requirement: Requirement,
-    name: str,
-    trace: Trace,
-    values: HostValues,
-    clock: Float[np.ndarray, " time"],
-    reading: Reading,
-) -> Row:
-    """Judge one requirement on one recording."""
-    formula = requirement.formalized
+def finder(trace: Trace, reading: Reading) -> Callable[[Formula], tuple[Found, str]]:
+    """Return a function that decides formulas on one trace, and notes how if that is not exact."""
+
+    @functools.cache
+    def sampled() -> tuple[HostValues, Trace]:
+        own = trace
+        if reading.resample_to is not None and reading.method is not None:
+            own = resample(own, reading.resample_to, reading.method)
+        return HostValues.of(own, "truncate" if reading.end == "truncate" else "hold"), own
+
+    try:
+        period(trace)
+        even = reading.resample_to is None and reading.method != "linear"
+    except SamplingError:
+        even = False
+    dense = None
+    if not even and reading.end != "truncate":
+        dense = DenseValues(trace, reading.method or "hold")
+
+    def find(formula: Formula) -> tuple[Found, str]:
+        if dense is not None:
+            if reading.end == "strict":
+                check_reach(formula, float(dense.times[-1]), 0.0)
+            try:
+                return _found_densely(formula, dense, trace, reading), ""
+            except NotDense:
+                if reading.resample_to is None:
+                    period(trace)  # Its error says what to do about an uneven clock.
+        values, own = sampled()
+        if reading.end == "strict":
+            check_horizon(formula, own, values.dt)
+        off = [note for note in own.notes if note not in trace.notes]
+        return _found(formula, values, own, reading), "; ".join(off)
+
+    return find
+
+
+def _check_signals(formula: Formula, trace: Trace) -> None:
     for signal in _signals(formula):
         if signal not in trace.signals:
             raise missing_name("the recording", "signal", signal, trace.signals)
-    if reading.end == "strict":
-        check_horizon(formula, trace, values.dt)
+
+
+def _found(formula: Formula, values: HostValues, trace: Trace, reading: Reading) -> Found:
     robustness = float(values.first(formula))
     if math.isnan(robustness):
-        missing = f"no verdict: {first_nan(formula, trace)}"
-        return Row(name, requirement.id, error=missing)
+        raise ValueError(f"no verdict: {first_nan(formula, trace)}")
     # At a robustness of zero the comparison decides.
     holds = robustness > 0 or (robustness == 0 and float(values.first(formula, boolean=True)) > 0)
-    instant, why = _decision(values, formula, clock) if reading.explain else (math.nan, "")
-    return Row(name, requirement.id, "holds" if holds else "fails", robustness, instant, why)
-
-
-def _decision(
-    values: HostValues, formula: Formula, clock: Float[np.ndarray, " time"]
-) -> tuple[float, str]:
-    """Return the deciding instant of a formula in seconds, and the deciding predicate as text."""
+    if not reading.explain:
+        return Found(robustness, holds)
     walk = values.walk(formula)
     found = walk.decision(formula)
     if found is None:
-        return math.nan, "no sample decides"
+        return Found(robustness, holds, explanation="no sample decides")
     predicate, sample = found
     # Beyond the end a recording repeats its last sample, so that is where to look.
-    instant = float(clock[min(sample, len(clock) - 1)])
-    margin = walk.at(predicate, sample)
-    return instant, f"{_text(predicate)} has margin {margin:z.4g} at {format_time(instant)} s"
+    instant = float(np.asarray(trace.finely().clock())[min(sample, values.length - 1)])
+    return Found(robustness, holds, instant, _because(predicate, walk.at(*found), instant))
+
+
+def _found_densely(
+    formula: Formula, values: DenseValues, trace: Trace, reading: Reading
+) -> Found:
+    now = np.zeros(1)
+    robustness = float(values(formula)(now)[0])
+    if math.isnan(robustness):
+        raise ValueError(f"no verdict: {first_nan(formula, trace)}")
+    holds = robustness > 0 or (robustness == 0 and float(values(formula, True)(now)[0]) > 0)
+    if not reading.explain:
+        return Found(robustness, holds)
+    found = values.decision(formula)
+    if found is None:
+        return Found(robustness, holds, explanation="no sample decides")
+    predicate, t = found
+    clock = np.asarray(trace.clock())
+    sample = int(np.searchsorted(values.times, t + values.snap, "right")) - 1
+    # A held value is that of a sample.
+    at = values.times[sample] if values.method == "hold" else min(t, values.times[-1])
+    margin = float(values(predicate)(np.array([at]))[0])
+    instant = float(clock[0] + at) if at != values.times[sample] else float(clock[sample])
+    return Found(robustness, holds, instant, _because(predicate, margin, instant))
+
+
+def _because(predicate: Formula, margin: float, instant: float) -> str:
+    return f"{_text(predicate)} has margin {margin:z.4g} at {format_time(instant)} s"
+
+
+def _unit(requirement: Requirement, units: Mapping[str, str]) -> tuple[str, str]:
+    """Return the unit of a robustness as recorded, and a note if the requirement has another."""
+    leaves = [part for part in requirement.formalized.subformulas() if part.is_predicate]
+    terms = [term for leaf in leaves for term in leaf.terms()]
+    known = list(dict.fromkeys(unit for term in terms if (unit := unit_of(term, units, []))))
+    wanted = plain_unit(requirement.unit)
+    if not known:
+        return requirement.unit, ""
+    note = f"its robustness is in {listed(known)} as recorded, and the requirement says {wanted}"
+    return known[0] if len(known) == 1 else "", note if wanted and known != [wanted] else ""

@@ -32,7 +32,9 @@ def resample(trace: Trace, dt: float, method: Method) -> Trace:
     """Resample signals on an even clock, from the first sample time to the last.
 
     Verdicts on the result use both the new samples and the recorded ones: those recorded between
-    new samples are kept in `between`. A missing value (NaN) is not a sample of its signal, as in a
+    new samples are kept in `between`. But windows are counted in periods of the clock, so each end
+    of one may be off by less than a period, as a note says; `judge` and `dense_robustness` decide
+    at the recorded times. A missing value (NaN) is not a sample of its signal, as in a
     log of topics that arrive at different times: `"hold"` keeps the signal's last value, with a
     note; `"linear"` leaves a gap.
 
@@ -67,6 +69,12 @@ def resample(trace: Trace, dt: float, method: Method) -> Trace:
     on_clock = np.abs(clock[cell] - elapsed) <= tolerance
     passed = np.flatnonzero(~((index[cell] == np.arange(len(elapsed))) & on_clock))
     signals, inner, notes = {}, {}, dict(trace.notes)
+    if len(passed):
+        late = float(np.max(elapsed[passed] - clock[cell[passed]]))
+        notes[
+            f"samples are up to {format_seconds(late, 4)} later than the clock of "
+            f"{format_seconds(dt)}: by so much each end of a window may be off"
+        ] = len(passed)
     for name, recorded in trace.signals.items():
         values = np.asarray(recorded)
         if trace.is_truth(name) or method == "hold":

@@ -236,11 +236,15 @@ def _at(trace: Trace, k: int) -> str:
 
 def check_horizon(formula: Formula, trace: Trace, dt: float) -> None:
     """Raise `HorizonError` for a formula that looks beyond the end of a trace."""
-    horizon = formula.horizon(dt)
     length = trace.length
     if trace.valid is not None and not isinstance(trace.valid, Tracer):
         length = int(np.min(np.asarray(trace.valid)))
-    duration = (length - 1) * dt
+    check_reach(formula, (length - 1) * dt, dt)
+
+
+def check_reach(formula: Formula, duration: float, dt: float) -> None:
+    """Raise `HorizonError` for a formula that looks beyond a duration in seconds."""
+    horizon = formula.horizon(dt)
     if horizon > duration * (1 + 1e-9) + 1e-9 * dt:
         what = "has no end" if math.isinf(horizon) else f"looks {format_seconds(horizon)} ahead"
         lasts = format_seconds(duration)
