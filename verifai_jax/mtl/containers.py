@@ -4,6 +4,7 @@ Each table has one clock: a topic of MCAP, the variables of one dimension, or a 
 times. The caller names its column of times. Nothing in a file is unpickled.
 """
 
+import itertools
 import json
 import operator
 import re
@@ -61,13 +62,28 @@ def matrix_column(array: np.ndarray) -> Any:
 def bag_files(folder: Path) -> list[Path]:
     """Return the files of a folder that is one bag: those that ROS 2's `metadata.yaml` names.
 
-    Without it, `NAME_0.mcap`, `NAME_1.mcap` and so on in a folder called `NAME` are one bag.
+    Without it, `NAME_0.mcap`, `NAME_1.mcap` and so on are one if their folder is called `NAME`, or
+    if each begins within a second after the one before ends.
     """
     files = [file for file in folder.glob("*.mcap") if re.search(r"_\d+$", file.stem)]
     files.sort(key=lambda file: int(file.stem.rpartition("_")[2]))
     stems = {file.stem.rpartition("_")[0] for file in files}
-    named = (folder / "metadata.yaml").is_file()
-    return files if len(stems) == 1 and (named or stems == {folder.resolve().name}) else []
+    if len(stems) != 1:
+        return []
+    named = (folder / "metadata.yaml").is_file() or stems == {folder.resolve().name}
+    return files if named or _follow_each_other(files) else []
+
+
+def _follow_each_other(files: Sequence[Path]) -> bool:
+    reader, spans = require("mcap.reader", EXTRA), []
+    for each in files:
+        try:
+            with open(each, "rb") as file:
+                about = reader.make_reader(file).get_summary().statistics
+                spans.append((about.message_start_time, about.message_end_time))
+        except (require("mcap.exceptions", EXTRA).McapError, AttributeError):
+            return False  # A damaged file, or one without a summary.
+    return all(0 <= b[0] - a[1] <= 10**9 for a, b in itertools.pairwise(spans))
 
 
 def _messages(path: Path, notes: dict[str, int]) -> Iterator[tuple[Any, Any, Any]]:
@@ -129,7 +145,7 @@ def read_mcap(paths: Sequence[Path], time: str, notes: dict[str, int]) -> list[T
                 _flatten(topic, decode(message.data), row)
             except MissingExtra:
                 raise
-            except Exception as error:  # noqa: BLE001
+            except Exception as error:
                 faults.setdefault(channel.topic, []).append(error)
                 continue
             topics.setdefault(topic, []).append((message.log_time, row))

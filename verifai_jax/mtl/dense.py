@@ -364,9 +364,9 @@ class DenseValues:
             wanted = float(self(formula)(np.array([t]))[0])
             wanted = -wanted if isinstance(formula, ast.Not) else wanted
             options = self._operands(formula, t)
-            found = [(abs(values - wanted), part, times) for part, times, values in options]
-            if not math.isfinite(wanted) or not found:
+            if not math.isfinite(wanted) or not options:
                 return None
+            found = [(abs(values - wanted), part, times) for part, times, values in options]
             away, part, times = min(found, key=lambda each: float(np.nanmin(each[0])))
             formula, t = part, float(times[int(np.nanargmin(away))])
         return (formula, t) if formula.is_predicate else None

@@ -14,6 +14,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
+
 from verifai_jax.core.compute.executors import Executor, check_executor, gather
 from verifai_jax.core.display.progress import count_done, shows_progress
 from verifai_jax.core.messages.errors import missing_name
@@ -145,12 +146,13 @@ def judge_recording(
 ) -> list[Row]:
     """Return a row for each requirement on one recording; also called by workers."""
     try:
-        return _judged(requirements, name, _trace(source, reading), reading)
+        return _judged(requirements, name, read_recording(source, reading), reading)
     except (ValueError, TypeError, OSError) as error:
         return [Row(name, each.id, error=one_line(str(error))) for each in requirements]
 
 
-def _trace(source: Recording, reading: Reading) -> Trace:
+def read_recording(source: Recording, reading: Reading) -> Trace:
+    """Return a recording as a trace, not resampled."""
     if not isinstance(source, Trace):
         return read(
             source, time=reading.time, time_unit=reading.time_unit, dt=reading.dt,
@@ -193,7 +195,7 @@ def finder(trace: Trace, reading: Reading) -> Callable[[Formula], tuple[Found, s
 
     try:
         period(trace)
-        even = reading.resample_to is None and reading.method != "linear"
+        even = reading.method is None
     except SamplingError:
         even = False
     dense = None
@@ -242,9 +244,7 @@ def _found(formula: Formula, values: HostValues, trace: Trace, reading: Reading)
     return Found(robustness, holds, instant, _because(predicate, walk.at(*found), instant))
 
 
-def _found_densely(
-    formula: Formula, values: DenseValues, trace: Trace, reading: Reading
-) -> Found:
+def _found_densely(formula: Formula, values: DenseValues, trace: Trace, reading: Reading) -> Found:
     now = np.zeros(1)
     robustness = float(values(formula)(now)[0])
     if math.isnan(robustness):

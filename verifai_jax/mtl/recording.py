@@ -70,10 +70,11 @@ def read(
 
     Columns `p[0]`, `p[1]`, ... become one vector signal `p`, and so does a column of lists of equal
     length. Columns without numbers are left out, with a note, unless named in `columns`. An empty
-    cell, `-` or `n/a` is a gap (NaN), and words such as `true` or `ON` are truth values. In a CSV file commas, semicolons or tabs separate the columns, as the first
-    line shows; numbers may have a decimal comma if all of them do. Comment lines (`#`) before the
-    names are skipped, and a row of units may follow the names. A last line that was cut, messages
-    that cannot be decoded and topics of an unknown kind are left out, with a note.
+    cell, `-` or `n/a` is a gap (NaN), and words such as `true` or `ON` are truth values. In a CSV
+    file commas, semicolons or tabs separate the columns, as the first line shows; numbers may have
+    a decimal comma if all of them do. Comment lines (`#`) before the names are skipped, and a row
+    of units may follow the names. A last line that was cut, messages that cannot be decoded and
+    topics of an unknown kind are left out, with a note.
 
     Data with several clocks, such as the topics of an MCAP file, the groups of an HDF5 file or
     several files, become one trace with the instants of all clocks; a signal has a gap where only
@@ -83,16 +84,16 @@ def read(
 
     **Arguments:**
     - `source`: the path of a `.csv` (first line: names), `.parquet`, `.npz` (each array is a
-      column), `.mcap`, `.nc`, `.h5` or `.hdf5` file, of a `.zarr` store, or of the folder of a
-      LeRobot data set or of one bag in several `.mcap` files; a `pandas.DataFrame`, whose index is a column if it has a name; or several
-      paths.
-    - `time`: the column of sample times: numbers, dates (ISO 8601 as text) or durations; its name
-      may be followed by a unit, as in `time [ms]` or `time_ms`. That unit, one in a row of units or
-      in an attribute of the file counts. Dates and durations become seconds since the first one,
-      and so do numbers that can only be milli-, micro- or nanoseconds since 1970, with a note. For several clocks in one table, a
+      column), `.mcap`, `.nc`, `.h5` or `.hdf5` file, of a `.zarr` store, of the folder of a LeRobot
+      data set, or of a bag in several `.mcap` files; a `pandas.DataFrame`, whose index is a column
+      if it has a name; or several paths.
+    - `time`: the column of sample times: numbers, dates (ISO 8601 as text) or durations. Their unit
+      may follow its name (`time [ms]`, `time_ms`), or stand in a row of units or an attribute.
+      Dates and durations become seconds since the first one, and so do numbers that can only be
+      milli-, micro- or nanoseconds since 1970, with a note. For several clocks in one table, a
       dictionary from each clock to its columns, `{"t_imu": ["gyro"], "t_gps": ["speed"]}`.
-    - `time_unit`: the unit of the sample times, whatever the recording says: `"ms"`, `"us"`, `"ns"`,
-      `"s"`, `"min"`, `"h"` or `"d"`. Without any, they are in seconds.
+    - `time_unit`: the unit of the sample times, whatever the recording says: `"ms"`, `"us"`,
+      `"ns"`, `"s"`, `"min"`, `"h"` or `"d"`. Without any, they are in seconds.
     - `dt`: the sampling period, if there is no column of times.
     - `columns`: the signals to read; all when left out.
     - `resample_to`, `method`: a period to resample to, and the method (`"hold"` or `"linear"`).
@@ -252,9 +253,7 @@ def _refuse_repeated(source: str, names: Sequence[str]) -> None:
         raise ValueError(f"{source} has more than one column {', '.join(map(repr, repeated))}")
 
 
-def _file_tables(
-    path: Path, time: str, episode: int | None, notes: dict[str, int]
-) -> list[Table]:
+def _file_tables(path: Path, time: str, episode: int | None, notes: dict[str, int]) -> list[Table]:
     """Read the Arrow tables of a file, one for each of its clocks."""
     import pyarrow
 
@@ -416,9 +415,7 @@ def read_csv(path: Path, notes: dict[str, int]) -> Table:
     return _with_units(again, below[0]) if units else again
 
 
-def _without_cut_line(
-    data: bytes, separators: int, separator: str, notes: dict[str, int]
-) -> bytes:
+def _without_cut_line(data: bytes, separators: int, separator: str, notes: dict[str, int]) -> bytes:
     """Return a table without its last line where that was cut, as by a loss of power."""
     whole, end, last = data.rstrip(b"\0\r\n").rpartition(b"\n")
     before, cells = (

@@ -50,7 +50,7 @@ def scale_of(text: str) -> Scale | None:
 
     **Raises:** `ValueError` for a date that does not exist.
     """
-    found = WRITTEN.match(text.strip().lower())
+    found = WRITTEN.match(text.strip(" ()[]").lower())
     many, word, since = found.groups() if found else (None, "", None)
     seconds = WORDS.get(word) or WORDS.get(word.removesuffix("s"))
     if seconds is None:
@@ -125,7 +125,7 @@ def seconds_of(
             f"column {name!r} of {source} holds lists of {values.shape[1]} numbers, where each row "
             "must have one sample time"
         )
-    scale, note = _scale(f"column {name!r} of {source}", name, values, unit, told)
+    scale, note = scale_of_times(f"column {name!r} of {source}", name, values, told, unit)
     if scale == Scale(Fraction(1)):
         return values, Fraction(0), note
     known = values[np.isfinite(values)]
@@ -137,10 +137,15 @@ def seconds_of(
     return (values - first) * many / parts, begin, note
 
 
-def _scale(
-    column: str, name: str, values: np.ndarray, unit: str, told: str | None
+def scale_of_times(
+    column: str, name: str, values: np.ndarray, told: str | None, unit: str = ""
 ) -> tuple[Scale, str]:
-    """Return the scale of sample times and a note on it, or ask for it."""
+    """Return the scale of sample times and a note on it.
+
+    **Arguments:**
+    - `column`: what to call the column, by its `name`; see `seconds_of`.
+    **Raises:** `ValueError` that asks for the unit.
+    """
     said = [text for text in (unit, unit_in_name(name)) if _counts(text)]
     said = said if told is None else [told]
     scales = [scale_of(text) for text in said]

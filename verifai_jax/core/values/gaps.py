@@ -40,8 +40,8 @@ def has_truths(signal: Any) -> bool:
     """Return whether the samples of a signal that are not missing are truth values."""
     if isinstance(signal, list | tuple):
         entries = np.ravel(np.array(signal, object)).tolist() if len(signal) else []
-    elif getattr(signal, "dtype", None) != object:
-        return getattr(signal, "dtype", None) == bool
+    elif getattr(getattr(signal, "dtype", None), "kind", "") != "O":
+        return getattr(getattr(signal, "dtype", None), "kind", "") == "b"
     else:
         entries = np.ravel(np.asarray(signal)).tolist()
     known = [entry for entry in entries if not _is_missing(entry)]

@@ -112,8 +112,9 @@ class Trace(InNotebook):
         signals = {name: with_gaps(name, signal) for name, signal in self.signals.items()}
         truths = set(self.truths & signals.keys())
         for name, given in self.signals.items():
-            floats = getattr(signals[name], "dtype", None) == float and signals[name] is not given
-            truths |= {name} if floats and has_truths(given) else set()
+            changed = isinstance(signals[name], np.ndarray) and signals[name] is not given
+            if changed and signals[name].dtype.kind == "f" and has_truths(given):
+                truths.add(name)
         object.__setattr__(self, "truths", frozenset(truths))
         object.__setattr__(self, "signals", signals)
         lengths = {}
@@ -168,7 +169,11 @@ class Trace(InNotebook):
 
     @classmethod
     def from_dataframe(
-        cls, frame: "pd.DataFrame", time: str = "time", dt: float | None = None
+        cls,
+        frame: "pd.DataFrame",
+        time: str = "time",
+        dt: float | None = None,
+        time_unit: str | None = None,
     ) -> "Trace":
         """Make a trace from a `pandas.DataFrame` with a column for each signal.
 
@@ -179,10 +184,12 @@ class Trace(InNotebook):
         - `time`: the column of sample times in seconds, or the name of the index; dates and
           durations become seconds since the first one.
         - `dt`: the sampling period in seconds, if there is no column of times.
+        - `time_unit`: the unit of the sample times, if their name does not end with it.
         **Raises:** `ValueError` for a frame without rows, numbers or sample times, and for times
         that do not increase.
         """
-        return lazy_import("verifai_jax.mtl.recording", "read")(frame, time=time, dt=dt)
+        read = lazy_import("verifai_jax.mtl.recording", "read")
+        return read(frame, time=time, dt=dt, time_unit=time_unit)
 
     @property
     def length(self) -> int:
@@ -191,7 +198,7 @@ class Trace(InNotebook):
 
     def is_truth(self, name: str) -> bool:
         """Return whether a signal consists of truth values, which may have gaps."""
-        return name in self.truths or getattr(self.signals[name], "dtype", None) == bool
+        return name in self.truths or has_truths(self.signals[name])
 
     def clock(self) -> Real[Array | np.ndarray, " time"]:
         """Return the sample times `[time]` in seconds, in double precision if they are concrete.
