@@ -80,6 +80,14 @@ class Definition:
         return range(max(0, -1 if b is None else i - 2 * b), i - 2 * a + 1)
 
 
+def look_back(f):
+    """Return the ticks for which past operators see the time before, which is over by then."""
+    if f[0] in ("historically", "once", "since"):
+        own = f[1] if f[2] is None else f[2]
+        return own + max(map(look_back, f[3:]))
+    return max((look_back(part) for part in f if isinstance(part, tuple)), default=0)
+
+
 def text_of(f):
     match f:
         case ("number", value):
@@ -227,7 +235,7 @@ def check(seed, folder):
             source.append(write(random, folder / f"{seed}-{k}{ending}", clock, part))
     f = random_formula(random, 3)
     signals = {n: held(clocks[n in "yc"], values[n], 0) for n in values}
-    final = 2 * int(max(clock[-1] for clock in clocks)) + 1
+    final = 2 * int(max(clock[-1] for clock in clocks) + look_back(f)) + 1
     robustness, holds = Definition(signals, final).at(f, 0)
     trace = mtl.read(source)
     (row,) = mtl.judge(text_of(f), trace, method="hold").rows

@@ -30,7 +30,8 @@ def table(path, name, stamps, unit=None, x=(1, 2, 3, 4)):
         ("time", "ms", 100), ("time", "[ms]", 100), ("time [ms]", None, 100),
         ("time (us)", None, 10**5), ("Time_ms", None, 100), ("time_usec", None, 10**5),
         ("timeNs", None, 10**8), ("time", "Microseconds", 10**5), ("time.nanosec", None, 10**8),
-        ("time", "0.1 s", 1), ("time", "100 ms", 1), ("time", "milliseconds since boot", 100),
+        ("time [0.1 s]", None, 1), ("time (100 ms)", None, 1),
+        ("time", "milliseconds since boot", 100),
         ("time (ms)", "ms", 100),
     ],
 )  # fmt: skip
@@ -125,10 +126,8 @@ def test_a_hole_is_a_note_or_an_error(tmp_path):
     with pytest.raises(ValueError, match="more than max_gap"):
         mtl.read(path, max_gap=5.0)
     begin = pd.date_range("2024-03-31 01:59:58", periods=20, freq="100ms")
-    local = begin.where(begin < "2024-03-31 02:00", begin + pd.Timedelta("1h"))
-    assert "summer time" in str(mtl.read(pd.DataFrame({"time": local, "x": 1.0})).notes)[:0] or True
-    frame = pd.DataFrame({"time": local.append(local[-1:] + pd.Timedelta("1h")), "x": 1.0})
-    assert "an hour is skipped" in str(mtl.read(frame).notes)
+    local = [t + pd.Timedelta("1h") * (k >= 10) for k, t in enumerate(begin)]
+    assert "an hour is skipped" in str(mtl.read(pd.DataFrame({"time": local, "x": 1.0})).notes)
 
 
 def test_a_time_that_comes_again_counts_twice(tmp_path):
@@ -156,7 +155,8 @@ def test_the_rest_of_a_log_that_was_cut_is_read(tmp_path):
 def test_a_late_answer_does_not_pass():
     req, ack = np.full(8, -0.5), np.full(8, -0.5)
     req[2], ack[6] = 0.5, 0.5
-    trace = Trace({"req": req, "ack": ack}, times=[0, 0.1, 0.21, 0.3, 0.4, 0.5, 0.59, 0.7])
+    times = np.array([0, 0.1, 0.21, 0.3, 0.4, 0.5, 0.59, 0.7])
+    trace = Trace({"req": req, "ack": ack}, times=times)
     formula = "always (req > 0 -> eventually[0,0.3] ack > 0)"
     for options in ({}, {"resample_to": 0.1, "method": "hold"}):
         (row,) = mtl.judge(formula, trace, **options).rows
@@ -202,6 +202,8 @@ def test_one_bad_topic_does_not_spoil_the_bag(tmp_path):
     assert "1 message of topic /a cannot be decoded" in notes
     data = (tmp_path / "a.mcap").read_bytes()
     (tmp_path / "b.mcap").write_bytes(data[: len(data) // 2])
+    assert "is damaged or was cut: only its first" in str(mtl.read(tmp_path / "b.mcap").notes)
+    (tmp_path / "b.mcap").write_bytes(data[:30])
     with pytest.raises(ValueError, match=r"b\.mcap cannot be read"):
         mtl.read(tmp_path / "b.mcap")
 

@@ -23,7 +23,7 @@ from verifai_jax.cli.exit_codes import BROKEN, CommandError
 from verifai_jax.cli.gates import Gate, check_gate, fail_on
 from verifai_jax.cli.json_output import command, give_result
 from verifai_jax.cli.monitor_fleet import fleet_options, is_fleet, monitor_fleet
-from verifai_jax.core.messages.errors import UnknownNameError, missing_name, nearest_names
+from verifai_jax.core.messages.errors import missing_name, nearest_names
 from verifai_jax.core.messages.text import format_time, printable
 from verifai_jax.core.store.atomic_files import replacing
 
@@ -104,6 +104,7 @@ def monitor(
     from verifai_jax import mtl
     from verifai_jax.mtl.columns import LeftOut
     from verifai_jax.mtl.judging import Reading, finder
+    from verifai_jax.mtl.setting import check_signals
 
     if (explain or plot is not None) and compat is not None:
         raise click.UsageError("--explain and --plot do not go with --compat")
@@ -154,7 +155,7 @@ def monitor(
         return
     reading = Reading(time, dt, time_unit, period, method, missing, max_gap, end, explain)
     trace = _read(file, reading)
-    _check_signals(parsed, trace, file)
+    check_signals(parsed, trace, str(file))
     even = mtl.resample(trace, period, method) if period and method else trace
     with jax.enable_x64(True):
         try:
@@ -205,19 +206,6 @@ def _read(recording: Path, reading: "Reading") -> "Trace":
             f"{error.fact}{near or '.'} Give the sampling period, --dt SECONDS, or the name of "
             f"the column, --time NAME. It has: {', '.join(error.columns)}"
         ) from None
-
-
-def _check_signals(formula: "Formula", trace: "Trace", recording: Path) -> None:
-    """Refuse a signal that the recording lacks, or that is a column of something else."""
-    from verifai_jax import mtl
-
-    for name in formula.signals():
-        if name in trace.signals:
-            continue
-        try:
-            mtl.read(recording, dt=1.0, columns=[name])
-        except UnknownNameError:
-            raise missing_name(str(recording), "signal", name, trace.signals) from None
 
 
 SOURCE = "the standard input"

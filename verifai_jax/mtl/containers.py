@@ -108,7 +108,7 @@ def _messages(path: Path, notes: dict[str, int]) -> Iterator[tuple[Any, Any, Any
     except (fault, struct.error, EOFError, AttributeError) as error:
         damage = error
     if not count:
-        raise ValueError(f"{path} cannot be read: {damage}")
+        raise ValueError(f"{path} cannot be read: {type(damage).__name__} {damage}")
     notes[f"{path} is damaged or was cut: only its first {count} messages are read"] = 1
 
 

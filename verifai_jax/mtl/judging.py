@@ -17,7 +17,6 @@ import numpy as np
 
 from verifai_jax.core.compute.executors import Executor, check_executor, gather
 from verifai_jax.core.display.progress import count_done, shows_progress
-from verifai_jax.core.messages.errors import missing_name
 from verifai_jax.core.messages.text import format_time, listed, one_line
 from verifai_jax.core.values.trace import Trace
 from verifai_jax.mtl._robustness import first_nan
@@ -31,10 +30,9 @@ from verifai_jax.mtl.recorded import Recording, Recordings, named_recordings
 from verifai_jax.mtl.recording import read
 from verifai_jax.mtl.requirements import Requirement, Requirements, requirements_of
 from verifai_jax.mtl.resampling import Method, Missing, check_holes, resample, without_gaps
-from verifai_jax.mtl.setting import SamplingError, check_horizon, check_reach, period
+from verifai_jax.mtl.setting import SamplingError, check_horizon, check_reach, check_signals, period
 from verifai_jax.mtl.units import plain_unit, unit_of, units_of
 
-_signals = functools.lru_cache(1024)(Formula.signals)
 _text = functools.lru_cache(1024)(Formula.__str__)
 """A fleet asks the same of a few formulas again and again."""
 
@@ -171,7 +169,7 @@ def _judged(
     rows = []
     for each in requirements:
         try:
-            _check_signals(each.formalized, trace)
+            check_signals(each.formalized, trace, "the recording")
             found, note = find(each.formalized)
             unit, other = _unit(each, units)
             notes = "; ".join(filter(None, [*said, note, other]))
@@ -218,12 +216,6 @@ def finder(trace: Trace, reading: Reading) -> Callable[[Formula], tuple[Found, s
         return _found(formula, values, own, reading), "; ".join(off)
 
     return find
-
-
-def _check_signals(formula: Formula, trace: Trace) -> None:
-    for signal in _signals(formula):
-        if signal not in trace.signals:
-            raise missing_name("the recording", "signal", signal, trace.signals)
 
 
 def _found(formula: Formula, values: HostValues, trace: Trace, reading: Reading) -> Found:

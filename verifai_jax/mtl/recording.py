@@ -429,6 +429,8 @@ def _without_cut_line(data: bytes, separators: int, separator: str, notes: dict[
     if torn and end and len(before) > separators:
         notes[f"the last line {separator.join(cells)!r} was cut, and is left out"] = 1
         return whole + end
+    if open_end:
+        notes["the last line has no end: its last number may have been cut"] = 1
     return data.rstrip(b"\0")
 
 

@@ -103,9 +103,7 @@ def prepare(
         raise ValueError(f"compat is None or 'pymtl'; got {compat!r}")
     if not isinstance(semantics, Semantics):
         raise TypeError(f"semantics is hard, boolean or smooth(tau); got {semantics!r}")
-    for name in formula.signals():
-        if name not in trace.signals:
-            raise _missing_signal(name, trace)
+    check_signals(formula, trace, "the trace")
     dt, stride = period(trace), trace.stride
     if end == "strict":
         check_horizon(formula, trace, dt)
@@ -127,11 +125,13 @@ def prepare(
     return setting, signals, tau, valid
 
 
-def _missing_signal(name: str, trace: Trace) -> Exception:
-    """Return the error for a signal that a trace lacks, with the note of its recording on it."""
-    error = missing_name("the trace", "signal", name, trace.signals)
-    said = [note for note in trace.notes if isinstance(note, LeftOut) and note.column == name]
-    return type(error)(f"{error}; {said[0]}") if said else error
+def check_signals(formula: Formula, trace: Trace, source: str) -> None:
+    """Refuse a signal that a trace lacks, with the note of its recording on it."""
+    for name in formula.signals():
+        if name not in trace.signals:
+            error = missing_name(source, "signal", name, trace.signals)
+            said = [n for n in trace.notes if isinstance(n, LeftOut) and n.column == name]
+            raise type(error)(f"{error}; {said[0]}") if said else error
 
 
 def numbers_of_signals(signals: dict[str, Samples]) -> dict[str, Array]:

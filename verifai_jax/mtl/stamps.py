@@ -14,7 +14,7 @@ import numpy as np
 
 from verifai_jax.core.messages.text import format_seconds
 from verifai_jax.mtl.columns import numbers_of
-from verifai_jax.mtl.units import IN_NAME, NONE
+from verifai_jax.mtl.units import NONE
 
 WORDS = {
     word: seconds
@@ -33,6 +33,7 @@ WORDS = {
 CALENDARS = {"utc", "gmt", "unix", "epoch", "posix", "local", "boot", "start", "time", "since"}
 """Words beside the name of a clock that say when it began, and not how it counts."""
 WRITTEN = re.compile(r"^([\d.]+(?:e[-+]?\d+)?)?\s*([a-zµμ]+)\.?(?:\s+since\s+(.+))?$")
+BRACKETS = re.compile(r"[(\[]\s*([^()\[\]]*[^()\[\]\d\s][^()\[\]]*?)\s*[)\]]\s*$")
 SUFFIX = re.compile(r"(?:[_\s./-]|(?<=[a-z])(?=[A-Z]))([A-Za-zµμ]+)$")
 CALENDAR = 10**8
 """Seconds, three years, beyond which sample times count from the first."""
@@ -64,7 +65,7 @@ def scale_of(text: str) -> Scale | None:
 
 def unit_in_name(name: str) -> str:
     """Return the unit of time at the end of a column's name; empty if there is none."""
-    said = IN_NAME.search(name)
+    said = BRACKETS.search(name)
     if said is not None:
         return said[1]
     said = SUFFIX.search(name)
