@@ -24,7 +24,14 @@ from verifai_jax.mtl.expression import Arithmetic, Component, Duration, Number, 
 from verifai_jax.mtl.formula import Formula, Term
 from verifai_jax.mtl.host_values import FUNCTIONS, numbers
 from verifai_jax.mtl.parametric import read_parametric
-from verifai_jax.mtl.resampling import Method, check_increasing, gaps, held
+from verifai_jax.mtl.resampling import (
+    Method,
+    check_increasing,
+    gaps,
+    held,
+    hold_note,
+    recorded_samples,
+)
 from verifai_jax.mtl.setting import as_formula, check_trace
 from verifai_jax.mtl.stamps import resolution_of
 from verifai_jax.mtl.tree import missing_case, postorder
@@ -318,10 +325,10 @@ class DenseValues:
     """
 
     def __init__(self, trace: Trace, method: Method) -> None:
-        self.trace = trace = trace.trim()
-        clock = np.asarray(trace.clock())
-        check_increasing(clock)
-        self.times = clock - clock[0]
+        self.trace = trace = recorded_samples(trace)
+        self.clock = np.asarray(trace.clock())
+        check_increasing(self.clock)
+        self.times = self.clock - self.clock[0]
         self.method = method
         steps = np.diff(self.times)
         self.snap = SNAP
@@ -357,8 +364,15 @@ class DenseValues:
             inside = sign(np.where(steady, margin.right, (margin.right + margin.left) / 2))
         return Piecewise(margin.times, sign(margin.point), inside, inside, self.snap)
 
-    def decision(self, formula: Formula) -> tuple[Formula, float] | None:
-        """Return the predicate and the time that decide the robustness; None if none does."""
+    def first(self, formula: Formula, boolean: bool = False) -> float:
+        """Compute the value at the first sample."""
+        return float(self(formula, boolean)(np.zeros(1))[0])
+
+    def decision(self, formula: Formula) -> tuple[Formula, float, float] | None:
+        """Return the predicate that decides the robustness, its margin then, and the sample time.
+
+        A time between samples is returned where signals are straight. None if none decides.
+        """
         t = 0.0
         while not isinstance(formula, ast.Leaf):
             wanted = float(self(formula)(np.array([t]))[0])
@@ -369,7 +383,13 @@ class DenseValues:
             found = [(abs(values - wanted), part, times) for part, times, values in options]
             away, part, times = min(found, key=lambda each: float(np.nanmin(each[0])))
             formula, t = part, float(times[int(np.nanargmin(away))])
-        return (formula, t) if formula.is_predicate else None
+        if not formula.is_predicate:
+            return None
+        sample = int(np.searchsorted(self.times, t + self.snap, "right")) - 1
+        now = self.times[sample] if self.method == "hold" else min(t, self.times[-1])
+        # The sample's own time, without a rounding.
+        when = self.clock[sample] + (now - self.times[sample])
+        return formula, float(self(formula)(np.array([now]))[0]), float(when)
 
     def _operands(self, f: Formula, t: float) -> list[tuple[Formula, Values, Values]]:
         """Return operands with the times at which one may decide, and what it gives there."""
@@ -404,6 +424,12 @@ class DenseValues:
         own = np.concatenate([[low, high], *(self(part).times for part in parts)])
         own = np.unique(own[(own >= low) & (own <= high)]) if low <= high else own[:0]
         return np.sort(np.concatenate([own, (own[:-1] + own[1:]) / 2]))
+
+    def held(self, formula: Formula) -> list[str]:
+        """Return notes on signals of a formula whose values are held in gaps."""
+        names = formula.signals() if self.method == "hold" else ()
+        missing = {name: gaps(np.asarray(self.trace.signals[name])) for name in names}
+        return [hold_note(name, rows) for name, rows in missing.items() if rows.any()]
 
     def constant(self, value: float) -> Piecewise:
         one = np.full(1, value)

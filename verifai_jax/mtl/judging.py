@@ -205,7 +205,7 @@ def finder(trace: Trace, reading: Reading) -> Callable[[Formula], tuple[Found, s
             if reading.end == "strict":
                 check_reach(formula, float(dense.times[-1]), 0.0)
             try:
-                return _found_densely(formula, dense, trace, reading), ""
+                return _found(formula, dense, trace, reading), "; ".join(dense.held(formula))
             except NotDense:
                 if reading.resample_to is None:
                     period(trace)  # Its error says what to do about an uneven clock.
@@ -218,7 +218,9 @@ def finder(trace: Trace, reading: Reading) -> Callable[[Formula], tuple[Found, s
     return find
 
 
-def _found(formula: Formula, values: HostValues, trace: Trace, reading: Reading) -> Found:
+def _found(
+    formula: Formula, values: HostValues | DenseValues, trace: Trace, reading: Reading
+) -> Found:
     robustness = float(values.first(formula))
     if math.isnan(robustness):
         raise ValueError(f"no verdict: {first_nan(formula, trace)}")
@@ -226,39 +228,16 @@ def _found(formula: Formula, values: HostValues, trace: Trace, reading: Reading)
     holds = robustness > 0 or (robustness == 0 and float(values.first(formula, boolean=True)) > 0)
     if not reading.explain:
         return Found(robustness, holds)
-    walk = values.walk(formula)
-    found = walk.decision(formula)
+    found = values.decision(formula) if isinstance(values, DenseValues) else None
+    if isinstance(values, HostValues) and (decided := values.walk(formula).decision(formula)):
+        # Beyond the end a recording repeats its last sample, so that is where to look.
+        instant = np.asarray(trace.finely().clock())[min(decided[1], values.length - 1)]
+        found = decided[0], values.walk(formula).at(*decided), float(instant)
     if found is None:
         return Found(robustness, holds, explanation="no sample decides")
-    predicate, sample = found
-    # Beyond the end a recording repeats its last sample, so that is where to look.
-    instant = float(np.asarray(trace.finely().clock())[min(sample, values.length - 1)])
-    return Found(robustness, holds, instant, _because(predicate, walk.at(*found), instant))
-
-
-def _found_densely(formula: Formula, values: DenseValues, trace: Trace, reading: Reading) -> Found:
-    now = np.zeros(1)
-    robustness = float(values(formula)(now)[0])
-    if math.isnan(robustness):
-        raise ValueError(f"no verdict: {first_nan(formula, trace)}")
-    holds = robustness > 0 or (robustness == 0 and float(values(formula, True)(now)[0]) > 0)
-    if not reading.explain:
-        return Found(robustness, holds)
-    found = values.decision(formula)
-    if found is None:
-        return Found(robustness, holds, explanation="no sample decides")
-    predicate, t = found
-    clock = np.asarray(trace.clock())
-    sample = int(np.searchsorted(values.times, t + values.snap, "right")) - 1
-    # A held value is that of a sample.
-    at = values.times[sample] if values.method == "hold" else min(t, values.times[-1])
-    margin = float(values(predicate)(np.array([at]))[0])
-    instant = float(clock[0] + at) if at != values.times[sample] else float(clock[sample])
-    return Found(robustness, holds, instant, _because(predicate, margin, instant))
-
-
-def _because(predicate: Formula, margin: float, instant: float) -> str:
-    return f"{_text(predicate)} has margin {margin:z.4g} at {format_time(instant)} s"
+    predicate, margin, instant = found
+    why = f"{_text(predicate)} has margin {margin:z.4g} at {format_time(instant)} s"
+    return Found(robustness, holds, instant, why)
 
 
 def _unit(requirement: Requirement, units: Mapping[str, str]) -> tuple[str, str]:

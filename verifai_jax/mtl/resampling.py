@@ -48,7 +48,7 @@ def resample(trace: Trace, dt: float, method: Method) -> Trace:
     if method not in ("hold", "linear"):
         raise ValueError(f"method is 'hold' or 'linear'; got {method!r}")
     check_period(dt)
-    trace = _recorded(trace)
+    trace = check_holes(recorded_samples(trace), None)
     check_increasing(np.asarray(trace.clock() if trace.times is None else trace.times))
     elapsed, resolution = np.asarray(trace.clock()), 0.0
     if trace.times is not None:
@@ -80,10 +80,7 @@ def resample(trace: Trace, dt: float, method: Method) -> Trace:
         if trace.is_truth(name) or method == "hold":
             missing = gaps(values)
             if missing.any():
-                notes[
-                    f"signal {name!r} has no value in {missing.sum()} of {len(missing)} rows: "
-                    "its last one is held there"
-                ] = int(missing.sum())
+                notes[hold_note(name, missing)] = int(missing.sum())
             values = held(values)
             signals[name], inner[name] = values[index], values[passed]
         else:
@@ -101,7 +98,7 @@ def resample(trace: Trace, dt: float, method: Method) -> Trace:
     return Trace(signals, dt=float(dt), between=between, **about)
 
 
-def _recorded(trace: Trace) -> Trace:
+def recorded_samples(trace: Trace) -> Trace:
     """Return the samples that count, each once, those between others among them."""
     trace = trace.trim()
     if trace.between is None:
@@ -138,6 +135,12 @@ def gaps(values: np.ndarray) -> np.ndarray:
     if values.dtype.kind != "f":
         return np.zeros(len(values), bool)
     return np.asarray(np.any(np.isnan(values).reshape(len(values), -1), axis=1))
+
+
+def hold_note(name: str, missing: np.ndarray) -> str:
+    """Return the note on a signal whose value is missing in some rows, and held there."""
+    rows = f"{missing.sum()} of {len(missing)} rows"
+    return f"signal {name!r} has no value in {rows}: its last one is held there"
 
 
 def held(values: np.ndarray) -> np.ndarray:
@@ -192,7 +195,8 @@ def joined(
     """
     origin = min(start for _, start in stamps)
     rounded = [resolution_of(seconds) for seconds, _ in stamps]
-    clocks = merged([seconds + float(start - origin) for seconds, start in stamps], rounded)
+    since = [np.asarray(seconds, float) + float(start - origin) for seconds, start in stamps]
+    clocks = merged(since, rounded)
     union = np.unique(np.concatenate(clocks))
     values = {}
     for clock, part in zip(clocks, parts, strict=True):
