@@ -611,9 +611,9 @@ class TestMonitor:
             ),
             (
                 ["always mode > 1", "drive.csv"],
-                "'mode' of drive.csv holds no numbers; it starts with",
+                "column 'mode' holds no numbers; it starts with",
             ),
-            (["always dist > 1", "uneven.csv"], "Resample it: --resample 0.75 --method hold"),
+            (["always next dist > 1", "uneven.csv"], "Resample it: --resample 0.75 --method hold"),
             (
                 ["always dist > 1", "drive.csv", "--resample", "1"],
                 "--resample PERIOD goes with --me",

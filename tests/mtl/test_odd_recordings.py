@@ -1,6 +1,6 @@
 """Recordings with odd clocks, units and truth values, judged as a definition over all times does.
 
-Times are whole ticks of 10 ms. Held signals are constant at each tick and between each two, so an
+Times are whole ticks of 50 ms. Held signals are constant at each tick and between each two, so an
 evaluation at even numbers (the ticks) and odd ones (the times between) sees every value there is.
 """
 
@@ -14,7 +14,7 @@ import pytest
 
 from verifai_jax import mtl
 
-TICK = 0.01
+TICK = 0.05
 EPOCH = 1_700_000_000
 
 
@@ -133,8 +133,8 @@ def random_formula(random, depth):
         left = left if random.random() < 0.5 else ("+", left, random_term(random, 1))
         return ("compare", sign, left, random_term(random, 1))
     grow = functools.partial(random_formula, random, depth - 1)
-    a = int(random.integers(0, 30) * random.integers(0, 2))
-    b = None if random.random() < 0.2 else a + int(random.integers(0, 60))
+    a = int(random.integers(0, 6) * random.integers(0, 2))
+    b = None if random.random() < 0.2 else a + int(random.integers(0, 12))
     kind = random.integers(0, 9)
     match kind:
         case 0:
@@ -150,8 +150,8 @@ def random_formula(random, depth):
 
 def random_clock(random, even):
     if even:
-        return 10 * np.arange(random.integers(4, 12))
-    return np.cumsum(np.append(0, random.integers(3, 25, size=random.integers(3, 10))))
+        return 2 * np.arange(random.integers(4, 12))
+    return np.cumsum(np.append(0, random.integers(1, 6, size=random.integers(3, 10))))
 
 
 def stamps_of(random, ticks):
@@ -160,23 +160,23 @@ def stamps_of(random, ticks):
     seconds = ticks * TICK
     match kind:
         case 0:
-            return "time_ms", "", ticks * 10
+            return "time_ms", "", ticks * 50
         case 1:
-            return "Time [us]", "", ticks * 10_000 + 123_450_000
+            return "Time [us]", "", ticks * 50_000 + 123_450_000
         case 2:
-            return "time", "ms", ticks * 10.0
+            return "time", "ms", ticks * 50.0
         case 3:
             return "time", "", EPOCH + seconds + 0.3
         case 4:
-            return "time", "", (EPOCH * 100 + ticks) * 10_000_000
+            return "time", "", (EPOCH * 20 + ticks) * 50_000_000
         case 5:
             return "time(min)", "", seconds / 60
         case 6:
             return "time", "(s)", np.cumsum(np.append(0.0, np.diff(ticks) * TICK))
         case 7:
             begin = np.datetime64("2024-03-01T10:00:00.000")
-            return "time", "", (begin + (ticks * 10).astype("timedelta64[ms]")).astype(str)
-    return "timeNs", "", ticks * 10_000_000
+            return "time", "", (begin + (ticks * 50).astype("timedelta64[ms]")).astype(str)
+    return "timeNs", "", ticks * 50_000_000
 
 
 def cells_of(random, values):

@@ -178,15 +178,18 @@ def monitor(
         for note in filter(None, (*trace.notes, off)):
             if not isinstance(note, LeftOut) or note.column in parsed.signals():
                 click.echo(f"note: {printable(note)}")
-        if explain and even.dt is None:
-            click.echo(because)
-        elif explain or plot is not None:
-            why = mtl.explain(parsed, even, end=end)
-            if explain:
-                click.echo(str(why))
+        try:
+            why = mtl.explain(parsed, even, end=end) if explain or plot is not None else None
+        except mtl.SamplingError as error:
             if plot is not None:
-                mtl.draw(why, plot)
-                click.echo(f"picture {plot}")
+                raise ValueError(f"{error.fact}. A picture needs --resample and --method") from None
+            why = None
+        if explain:
+            # Recorded times decide where there is a method, and a picture is of an even clock.
+            click.echo(str(why) if why is not None and method is None else because)
+        if plot is not None and why is not None:
+            mtl.draw(why, plot)
+            click.echo(f"picture {plot}")
     give_result(formula=str(parsed), holds=holds, robustness=rho)
     check_gate(fail_on, {"violation": not holds, "incomplete": not holds})
 
@@ -351,8 +354,8 @@ def _samples(
             if stamp is None:
                 stamp, whole = number(clock), cell.strip().isdecimal()
                 raw = [*raw, stamp] if len(raw) < 2 else raw
-                told = np.array(raw, int if whole else float)
-                scale, _ = scale_of_times(f"column {clock!r} of {SOURCE}", clock, told, time_unit)
+                chosen = np.array(raw, int if whole else float)
+                scale, _ = scale_of_times(f"column {clock!r} of {SOURCE}", clock, chosen, time_unit)
                 many, parts = scale.seconds.as_integer_ratio()
                 stamp = stamp * many / parts
         yield Sample(line, stamp, signals)

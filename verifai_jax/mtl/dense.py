@@ -225,10 +225,10 @@ def witnessed(f: Piecewise, g: Piecewise, ahead: bool) -> Piecewise:
     n = len(f.times)
 
     # Unlike Python's own they give NaN for NaN.
-    def most(a: float, b: float) -> float:
+    def greater(a: float, b: float) -> float:
         return a if a >= b or a != a else b
 
-    def least(a: float, b: float) -> float:
+    def smaller(a: float, b: float) -> float:
         return a if a <= b or a != a else b
 
     far_g, near_g, near_f = (g.left, g.right, f.right) if ahead else (g.right, g.left, f.left)
@@ -238,11 +238,11 @@ def witnessed(f: Piecewise, g: Piecewise, ahead: bool) -> Piecewise:
     now = -np.inf
     for k in range(n - 1, -1, -1) if ahead else range(n):
         if not ahead:
-            now = point[k] = most(g.point[k], least(f.point[k], now))
-        best[k] = most(far_g[k], now)
-        now = most(least(near_g[k], near_f[k]), least(lowest[k], best[k]))
+            now = point[k] = greater(g.point[k], smaller(f.point[k], now))
+        best[k] = greater(far_g[k], now)
+        now = greater(smaller(near_g[k], near_f[k]), smaller(lowest[k], best[k]))
         if ahead:
-            now = point[k] = most(g.point[k], least(f.point[k], now))
+            now = point[k] = greater(g.point[k], smaller(f.point[k], now))
     sides = (lowest, f.left) if ahead else (f.right, lowest)
     kept = Piecewise(f.times, point, *sides, f.snap)
     far = joined([kept, Piecewise(g.times, best, best, best, g.snap)], -1)

@@ -52,7 +52,7 @@ class Reading(NamedTuple):
 
 
 class Found(NamedTuple):
-    """What is found of a formula on a recording; see `Row`."""
+    """Result of one formula on one recording; see `Row`."""
 
     robustness: float
     holds: bool

@@ -131,7 +131,7 @@ def check_signals(formula: Formula, trace: Trace, source: str) -> None:
         if name not in trace.signals:
             error = missing_name(source, "signal", name, trace.signals)
             said = [n for n in trace.notes if isinstance(n, LeftOut) and n.column == name]
-            raise type(error)(f"{error}; {said[0]}") if said else error
+            raise type(error)(f"{str(error).rstrip('.')}; {said[0]}") if said else error
 
 
 def numbers_of_signals(signals: dict[str, Samples]) -> dict[str, Array]:

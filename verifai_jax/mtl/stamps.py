@@ -87,7 +87,7 @@ def find_clock(names: Iterable[str], time: str) -> str | None:
 
 
 def seconds_of(
-    source: str, name: str, column: Any, unit: str = "", told: str | None = None
+    source: str, name: str, column: Any, unit: str = "", chosen: str | None = None
 ) -> tuple[np.ndarray, Fraction, str]:
     """Return the sample times of an Arrow column in seconds; NaN for an empty cell.
 
@@ -96,7 +96,7 @@ def seconds_of(
 
     **Arguments:**
     - `unit`: the unit that the recording gives; one in the name counts, too.
-    - `told`: the unit that the user gives, which counts alone.
+    - `chosen`: the unit that the user gives, which counts alone.
     **Returns:** the times, their origin in seconds since 1970 (0 for numbers in seconds), and a
     note, or nothing.
     **Raises:** the errors of `numbers_of`; `ValueError` for lists of numbers, and for numbers whose
@@ -126,7 +126,7 @@ def seconds_of(
             f"column {name!r} of {source} holds lists of {values.shape[1]} numbers, where each row "
             "must have one sample time"
         )
-    scale, note = scale_of_times(f"column {name!r} of {source}", name, values, told, unit)
+    scale, note = scale_of_times(f"column {name!r} of {source}", name, values, chosen, unit)
     if scale == Scale(Fraction(1)):
         return values, Fraction(0), note
     known = values[np.isfinite(values)]
@@ -139,7 +139,7 @@ def seconds_of(
 
 
 def scale_of_times(
-    column: str, name: str, values: np.ndarray, told: str | None, unit: str = ""
+    column: str, name: str, values: np.ndarray, chosen: str | None, unit: str = ""
 ) -> tuple[Scale, str]:
     """Return the scale of sample times and a note on it.
 
@@ -148,7 +148,7 @@ def scale_of_times(
     **Raises:** `ValueError` that asks for the unit.
     """
     said = [text for text in (unit, unit_in_name(name)) if _counts(text)]
-    said = said if told is None else [told]
+    said = said if chosen is None else [chosen]
     scales = [scale_of(text) for text in said]
     ask = f'{column}: say it, as in time_unit="ms" (ns, us, ms, s, min, h or d)'
     if None in scales:
@@ -159,7 +159,7 @@ def scale_of_times(
     if scales:
         scale = scales[0]
         assert scale is not None
-        if told is None and epoch_unit(values * float(scale.seconds)) != "s":
+        if chosen is None and epoch_unit(values * float(scale.seconds)) != "s":
             raise ValueError(f"the sample times cannot be in {said[0]}, as it says, in {ask}")
         return scale, ""
     if large != "s":
@@ -172,7 +172,7 @@ def scale_of_times(
     whole = values.dtype.kind in "iu"
     # Seconds that a clock counts are by ones, by minutes, or by half hours.
     if (whole and step > 1 and step % 60) or (step >= 1000 and step % 1800):
-        sight = ", ".join(f"{stamp:g}" for stamp in known[:3].tolist())
+        sight = ", ".join(f"{stamp:zg}" for stamp in known[:3].tolist())
         raise ValueError(
             f"the unit of the sample times {sight}, ... is not known, which in seconds would be "
             f"{format_seconds(step)} apart or more, in {ask}"
@@ -264,8 +264,8 @@ def merged(clocks: Sequence[np.ndarray], errors: Sequence[float]) -> list[np.nda
     - `errors`: by how much the times of each clock are rounded, in seconds.
     """
     every = np.concatenate(clocks)
-    least = min((float(np.diff(c).min()) for c in clocks if len(c) > 1), default=np.inf)
-    near = min(4 * max(*errors, resolution_of(every)), least / 4)
+    shortest = min((float(np.diff(c).min()) for c in clocks if len(c) > 1), default=np.inf)
+    near = min(4 * max(*errors, resolution_of(every)), shortest / 4)
     order = np.sort(every)
     begins = order[np.append(True, np.diff(order) > near)]
     return [begins[np.searchsorted(begins, clock + near / 2, "right") - 1] for clock in clocks]

@@ -216,11 +216,11 @@ def _reader(
     columns: Sequence[tuple[str, int | None]],
 ) -> Callable[[Mapping[str, Any]], Sequence[float]]:
     """Return what takes the numbers of a sample, as fast as Python can."""
-    places = [(name.removeprefix(ALONE), index) for name, index in columns]
-    names = [name for name, index in places if index is None]
+    sources = [(name.removeprefix(ALONE), index) for name, index in columns]
+    names = [name for name, index in sources if index is None]
     if len(names) > 1 and len(names) == len(columns):
         return operator.itemgetter(*names)
-    return lambda sample: [sample[n] if i is None else sample[n][i] for n, i in places]
+    return lambda sample: [sample[n] if i is None else sample[n][i] for n, i in sources]
 
 
 def _number(column: str, sample: Mapping[str, Any], index: int | None) -> float:
