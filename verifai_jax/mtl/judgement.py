@@ -188,7 +188,7 @@ class Judgement(InNotebook):
             lines.append(f"  {each.id:{width}}  {share:<10}{numbers} {unit}".rstrip())
         lines += _listed("Failing, the worst first:", failing)
         lines += _listed("Without a verdict:", _together(missing))
-        lines += _listed("Notes:", _together(row._replace(error=row.note) for row in self.rows))
+        lines += _noted(self.rows)
         if (tightest := self.tightest) is not None and not failing:
             lines += ["", f"Tightest: {tightest.requirement} on {tightest.file}"]
             lines += [f"  {tightest.explanation}"] if tightest.explanation else []
@@ -257,11 +257,24 @@ def _listed(title: str, rows: Sequence[Row]) -> list[str]:
     return lines
 
 
-def _together(rows: Iterable[Row]) -> list[Row]:
+def _noted(rows: Sequence[Row]) -> list[str]:
+    """Return each note once, with the recordings that it is about."""
+    found: dict[str, dict[str, None]] = {}
+    for row in rows:
+        for note in filter(None, row.note.split("; ")):
+            found.setdefault(note, {})[row.file] = None
+    lines = ["", "Notes:"] if found else []
+    for note, files in list(found.items())[:SHOWN]:
+        where = next(iter(files)) if len(files) == 1 else counted(len(files), "recording")
+        lines.append(f"  {shorten(note, 160)} ({where})")
+    if len(found) > SHOWN:
+        lines.append(f"  and {len(found) - SHOWN} more in the table")
+    return lines
+
+
+def _together(rows: Sequence[Row]) -> list[Row]:
     """Return rows of a recording with one error as one row, which names the requirements."""
     found: dict[tuple[str, str], list[str]] = {}
     for row in rows:
-        if not row.error:
-            continue
         found.setdefault((row.file, row.error), []).append(row.requirement)
     return [Row(file, ", ".join(names), error=error) for (file, error), names in found.items()]
