@@ -6,7 +6,7 @@ therefore cost nothing, and unbounded windows end there.
 """
 
 import math
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
@@ -19,7 +19,7 @@ from verifai_jax.mtl import formula as ast
 from verifai_jax.mtl import windows
 from verifai_jax.mtl.expression import Arithmetic, Component, Duration, Number, Signal
 from verifai_jax.mtl.formula import Formula, Interval, Term
-from verifai_jax.mtl.semantics import compared
+from verifai_jax.mtl.semantics import alone, compared
 from verifai_jax.mtl.tree import missing_case
 
 End = Literal["hold", "truncate", "strict"]
@@ -63,16 +63,6 @@ def seconds_held(truth: Any, n: int, dt: float, xp: Any) -> Any:
     if n > len(truth):
         n = len(truth)
     return xp.where(within(xp.isnan(truth)) > 0, xp.nan, within(truth > 0) * dt)
-
-
-def alone(value: Any, e: Term, truths: Collection[str]) -> Any:
-    """Return the value of an expression as a formula: a truth value is 1 or -1 there, not 1 or 0.
-
-    **Arguments:**
-    - `truths`: names of the signals of truth values.
-    """
-    signal = e.vector if isinstance(e, Component) else e
-    return 2 * value - 1 if isinstance(signal, Signal) and signal.name in truths else value
 
 
 def check_scalar(e: Term, shape: Sequence[int], lanes: int) -> None:

@@ -19,10 +19,10 @@ from jaxtyping import Float
 from verifai_jax.core.messages.errors import missing_name
 from verifai_jax.core.values.trace import Trace, without_wrapping
 from verifai_jax.mtl import formula as ast
-from verifai_jax.mtl.evaluate import End, alone, check_scalar, check_vector, samples, seconds_held
+from verifai_jax.mtl.evaluate import End, check_scalar, check_vector, samples, seconds_held
 from verifai_jax.mtl.expression import Arithmetic, Component, Duration, Number, Signal
 from verifai_jax.mtl.formula import Formula, Interval, Term
-from verifai_jax.mtl.semantics import compared
+from verifai_jax.mtl.semantics import alone, compared
 from verifai_jax.mtl.setting import check_trace, period
 from verifai_jax.mtl.tree import missing_case, postorder
 from verifai_jax.mtl.walk import Walk
