@@ -475,9 +475,7 @@ def _with_gaps(value: object) -> np.ndarray:
     """Return an array whose masked entries are NaN; NumPy's own conversion drops the mask."""
     if not isinstance(value, np.ma.MaskedArray) or not np.ma.getmaskarray(value).any():
         return np.asarray(value)
-    numbers = np.asarray(value.data)
-    numbers = np.where(numbers, 1.0, -1.0) if numbers.dtype == bool else numbers
-    return np.where(np.ma.getmaskarray(value), np.nan, numbers)
+    return np.where(np.ma.getmaskarray(value), np.nan, np.asarray(value.data).astype(float))
 
 
 def encoded(number: int, result: object) -> bytes:

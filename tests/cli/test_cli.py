@@ -579,7 +579,7 @@ class TestMonitor:
 
     @pytest.mark.thorough
     def test_many_requirements_on_many_recordings(self, call, tmp_path):
-        (tmp_path / "all.csv").write_text("id,formula\ngap,always dist > 1\nnear,G dist >= 2\n")
+        (tmp_path / "all.csv").write_text("id,formula\ngap,always X dist > 1\nnear,G X dist >= 2\n")
         (tmp_path / "logs").mkdir()
         (tmp_path / "drive.csv").rename(tmp_path / "logs" / "drive.csv")
         (tmp_path / "uneven.csv").rename(tmp_path / "logs" / "uneven.csv")
@@ -589,7 +589,7 @@ class TestMonitor:
         assert "dist >= 2 has margin -0.5 at 1 s" in output
         assert (tmp_path / "out" / "j.xml").exists()
         assert (tmp_path / "out" / "r.html").exists()
-        one = ("monitor", "always dist > 0", "logs")
+        one = ("monitor", "always X dist > 0", "logs")
         assert "is not evenly sampled" in call(*one, "--fail-on", "incomplete", code=1)
         call(*one, "--resample", "0.5", "--method", "hold", "--fail-on", "incomplete")
         assert "no requirement had a verdict" in call("monitor", "other > 0", "logs", code=3)
@@ -611,9 +611,9 @@ class TestMonitor:
             ),
             (
                 ["always mode > 1", "drive.csv"],
-                "'mode' of drive.csv holds no numbers; it starts with",
+                "column 'mode' holds no numbers; it starts with",
             ),
-            (["always dist > 1", "uneven.csv"], "Resample it: --resample 0.75 --method hold"),
+            (["always next dist > 1", "uneven.csv"], "Resample it: --resample 0.75 --method hold"),
             (
                 ["always dist > 1", "drive.csv", "--resample", "1"],
                 "--resample PERIOD goes with --me",

@@ -32,10 +32,10 @@ def test_nothing_under_a_mask_is_judged():
     ("signal", "wanted"),
     [
         (np.ma.masked_array([1, 2, 3], mask=[0, 0, 1]), [1, 2, np.nan]),
-        (np.ma.masked_array([True, False, True], mask=[0, 0, 1]), [1, -1, np.nan]),
+        (np.ma.masked_array([True, False, True], mask=[0, 0, 1]), [1, 0, np.nan]),
         (np.ma.masked_invalid([1.0, np.inf, 2.0]), [1, np.nan, 2]),
         (np.array([1.0, None, 2], object), [1, np.nan, 2]),
-        (np.array([True, None, False], object), [1, np.nan, -1]),
+        (np.array([True, None, False], object), [1, np.nan, 0]),
         (pd.array([1, None, 3], dtype="Int64"), [1, np.nan, 3]),
         ([1.0, np.ma.masked, 3.0], [1, np.nan, 3]),
         (
@@ -102,7 +102,7 @@ def test_frames_with_missing_values_have_gaps():
     )
     trace = read(frame)
     np.testing.assert_array_equal(trace["x"], [1, np.nan, 3])
-    np.testing.assert_array_equal(trace["on"], [1, np.nan, -1])
+    np.testing.assert_array_equal(trace["on"], [1, np.nan, 0])
     np.testing.assert_array_equal(trace["n"], [1, np.nan, 3])
     np.testing.assert_array_equal(trace["o"], [1, np.nan, 2.5])
     assert Trace({"x": HIDDEN}, dt=1.0).status in (None, Status.OK)

@@ -1,4 +1,4 @@
-"""Resampling hides nothing: verdicts are those of the clock's samples and the recorded ones."""
+"""Resampling loses no sample: verdicts are those of the clock's samples and the recorded ones."""
 
 from dataclasses import replace
 

@@ -23,13 +23,14 @@ from verifai_jax.cli.exit_codes import BROKEN, CommandError
 from verifai_jax.cli.gates import Gate, check_gate, fail_on
 from verifai_jax.cli.json_output import command, give_result
 from verifai_jax.cli.monitor_fleet import fleet_options, is_fleet, monitor_fleet
-from verifai_jax.core.messages.errors import UnknownNameError, missing_name, nearest_names
+from verifai_jax.core.messages.errors import missing_name, nearest_names
 from verifai_jax.core.messages.text import format_time, printable
 from verifai_jax.core.store.atomic_files import replacing
 
 if TYPE_CHECKING:
     from verifai_jax import Formula
     from verifai_jax.core.values.trace import Trace
+    from verifai_jax.mtl.judging import Reading
     from verifai_jax.mtl.resampling import Missing
 
 
@@ -38,6 +39,8 @@ if TYPE_CHECKING:
 @click.argument("recording", nargs=-1, type=PATH)
 @option("--dt", type=float, help="Sampling period in seconds, instead of a column of times.")
 @option("--time", default="time", help="Column of sample times.")
+@option("--time-unit", help="Unit of the sample times (ns, us, ms, s, min, h, d), if none is said.")
+@option("--max-gap", type=float, help="Longest time in seconds without a value of a signal.")
 @option("--resample", "period", type=float, help="Period in seconds to resample to.")
 @option("--method", type=click.Choice(["hold", "linear"]), help="Interpolation to resample.")
 @option(
@@ -69,6 +72,8 @@ def monitor(
     recording: tuple[Path, ...],
     dt: float | None,
     time: str,
+    time_unit: str | None,
+    max_gap: float | None,
     period: float | None,
     method: Literal["hold", "linear"] | None,
     missing: "Missing | None",
@@ -98,6 +103,8 @@ def monitor(
 
     from verifai_jax import mtl
     from verifai_jax.mtl.columns import LeftOut
+    from verifai_jax.mtl.judging import Reading, finder
+    from verifai_jax.mtl.setting import check_signals
 
     if (explain or plot is not None) and compat is not None:
         raise click.UsageError("--explain and --plot do not go with --compat")
@@ -121,7 +128,7 @@ def monitor(
         if plot is not None or compat is not None:
             raise click.UsageError("--plot and --compat go with one formula on one recording")
         options = {"time": time, "dt": dt, "resample_to": period, "method": method, "end": end}
-        options["missing"] = missing
+        options |= {"missing": missing, "time_unit": time_unit, "max_gap": max_gap}
         found = monitor_fleet(formula, recording, numbers, named, report, junit, jobs, options)
         failing, unjudged = bool(found.failing), bool(found.without_verdict)
         check_gate(fail_on, {"violation": failing, "incomplete": failing or unjudged})
@@ -129,11 +136,11 @@ def monitor(
     (file,) = recording
     parsed = mtl.parse(formula, numbers, named)
     if str(file) == "-":
-        whole = (plot, compat, period)
+        whole = (plot, compat, period, max_gap)
         if explain or end != "hold" or any(option is not None for option in whole):
             raise click.UsageError(
-                "a stream goes with --dt, --time, --missing hold, --const, --define and --fail-on; "
-                "other options need the whole recording"
+                "a stream goes with --dt, --time, --time-unit, --missing hold, --const, --define "
+                "and --fail-on; other options need the whole recording"
             )
         if missing in ("drop", "interpolate"):
             why = {
@@ -141,78 +148,67 @@ def monitor(
                 "interpolate": "needs the value after a gap, which a stream has not had yet",
             }[missing]
             raise click.UsageError(f"--missing {missing} {why}: use --missing hold")
-        holds = monitor_stream(parsed, sys.stdin, time, dt, hold=missing == "hold")
+        held = missing == "hold"
+        holds = monitor_stream(parsed, sys.stdin, time, dt, hold=held, time_unit=time_unit)
         give_result(formula=str(parsed), holds=holds)
         check_gate(fail_on, {"violation": not holds, "incomplete": not holds})
         return
-    trace = _read(file, time, dt, period, method, missing)
-    _check_signals(parsed, trace, file)
+    reading = Reading(time, dt, time_unit, period, method, missing, max_gap, end, explain)
+    trace = _read(file, reading)
+    check_signals(parsed, trace, str(file))
+    even = mtl.resample(trace, period, method) if period and method else trace
     with jax.enable_x64(True):
         try:
-            rho = float(mtl.robustness(parsed, trace, end=end, compat=compat))
+            if compat is None:
+                (rho, holds, *_, because), off = finder(trace, reading)(parsed)
+            else:
+                rho, off = float(mtl.robustness(parsed, even, end=end, compat=compat)), ""
+                holds, because = bool(mtl.satisfied(parsed, even, end, compat)), ""
         except mtl.HorizonError as error:
             advice = "Use --end hold or --end truncate, or a longer recording"
             raise ValueError(f"{error.fact}. {advice}") from None
         except mtl.SamplingError as error:
             advice = f"Resample it: --resample {error.dt:zg} --method hold (or linear)"
             raise ValueError(f"{error.fact}. {advice}") from None
-        try:
-            holds = bool(mtl.satisfied(parsed, trace, end, compat))
         except ValueError as error:
-            if math.isnan(rho):
+            if str(error).startswith("no verdict"):
                 raise CommandError(str(error), BROKEN) from None
             raise
         click.echo(f"{'holds' if holds else 'fails'} with robustness {rho:z.10g}")
-        for note in trace.notes:
-            if isinstance(note, LeftOut) and note.column in parsed.signals():
+        for note in filter(None, (*trace.notes, off)):
+            if not isinstance(note, LeftOut) or note.column in parsed.signals():
                 click.echo(f"note: {printable(note)}")
-        if explain or plot is not None:
-            why = mtl.explain(parsed, trace, end=end)
-            if explain:
-                click.echo(str(why))
+        try:
+            why = mtl.explain(parsed, even, end=end) if explain or plot is not None else None
+        except mtl.SamplingError as error:
             if plot is not None:
-                mtl.draw(why, plot)
-                click.echo(f"picture {plot}")
+                raise ValueError(f"{error.fact}. A picture needs --resample and --method") from None
+            why = None
+        if explain:
+            # Recorded times decide where there is a method, and a picture is of an even clock.
+            click.echo(str(why) if why is not None and method is None else because)
+        if plot is not None and why is not None:
+            mtl.draw(why, plot)
+            click.echo(f"picture {plot}")
     give_result(formula=str(parsed), holds=holds, robustness=rho)
     check_gate(fail_on, {"violation": not holds, "incomplete": not holds})
 
 
-def _read(
-    recording: Path,
-    time: str,
-    dt: float | None,
-    period: float | None,
-    method: Literal["hold", "linear"] | None,
-    missing: "Missing | None",
-) -> "Trace":
+def _read(recording: Path, reading: "Reading") -> "Trace":
     """Read the recording; errors name the missing option of this command."""
     from verifai_jax import mtl
+    from verifai_jax.mtl.judging import read_recording
 
-    if (period is None) != (method is None):
+    if reading.resample_to is not None and reading.method is None:
         raise click.UsageError("--resample PERIOD goes with --method hold or --method linear")
     try:
-        return mtl.read(
-            recording, time=time, dt=dt, resample_to=period, method=method, missing=missing
-        )
+        return read_recording(recording, reading)
     except mtl.TimeColumnError as error:
-        near = nearest_names(time, error.columns)
+        near = nearest_names(reading.time, error.columns)
         raise ValueError(
             f"{error.fact}{near or '.'} Give the sampling period, --dt SECONDS, or the name of "
             f"the column, --time NAME. It has: {', '.join(error.columns)}"
         ) from None
-
-
-def _check_signals(formula: "Formula", trace: "Trace", recording: Path) -> None:
-    """Refuse a signal that the recording lacks, or that is a column of something else."""
-    from verifai_jax import mtl
-
-    for name in formula.signals():
-        if name in trace.signals:
-            continue
-        try:
-            mtl.read(recording, dt=1.0, columns=[name])
-        except UnknownNameError:
-            raise missing_name(str(recording), "signal", name, trace.signals) from None
 
 
 SOURCE = "the standard input"
@@ -230,13 +226,14 @@ class Sample(NamedTuple):
 
 def monitor_stream(
     formula: "Formula", lines: Iterable[str], time: str, dt: float | None, show: Any = click.echo,
-    hold: bool = False,
+    hold: bool = False, time_unit: str | None = None,
 ) -> bool:  # fmt: skip
     """Monitor samples until the verdict is certain, or until they end.
 
     **Arguments:**
     - `lines`: the lines of CSV; the first contains the names.
-    - `time`: the column of sample times in seconds, or of dates (ISO 8601).
+    - `time`: the column of sample times, or of dates (ISO 8601).
+    - `time_unit`: their unit; by default the one at the end of the column's name, or seconds.
     - `dt`: the sampling period in seconds, if there is no column of times.
     - `show`: a function that prints a line.
     - `hold`: whether a gap keeps the last value of its signal.
@@ -246,7 +243,7 @@ def monitor_stream(
     from verifai_jax import mtl
 
     vectors: dict[str, int] = {}
-    samples = _samples(lines, formula, None if dt is not None else time, vectors)
+    samples = _samples(lines, formula, None if dt is not None else time, vectors, time_unit)
     samples, period = _period(samples, dt)
     first = next(samples, None)  # After it the sizes of vectors are known.
     samples = samples if first is None else itertools.chain([first], samples)
@@ -313,16 +310,22 @@ def _period(samples: Iterator[Sample], dt: float | None) -> tuple[Iterator[Sampl
 
 
 def _samples(
-    lines: Iterable[str], formula: "Formula", time: str | None, vectors: dict[str, int]
-) -> Iterator[Sample]:
+    lines: Iterable[str], formula: "Formula", time: str | None, vectors: dict[str, int],
+    time_unit: str | None,
+) -> Iterator[Sample]:  # fmt: skip
     """Read samples one by one, no line before it is needed, and note the sizes of `vectors`."""
+    import numpy as np
+
+    from verifai_jax.mtl.stamps import find_clock, scale_of_times
+
     lines = iter(lines)
     header = next(lines, "")
     if not header.strip():
         raise ValueError(f"{SOURCE} is empty; its first line has the names of the columns")
     separator = max((",", ";", "\t"), key=header.count)
     names = [name.strip() for name in next(csv.reader([header], delimiter=separator))]
-    if time is not None and time not in names:
+    clock = None if time is None else find_clock(names, time)
+    if time is not None and clock is None:
         raise ValueError(
             f"{SOURCE} has no column {time!r} of sample times. Give the sampling period, --dt "
             f"SECONDS, or the name of the column, --time NAME. It has: {', '.join(names)}"
@@ -330,6 +333,7 @@ def _samples(
     columns = _columns(names, formula)
     vectors |= {name: len(parts) for name, parts in columns.items() if isinstance(parts, list)}
     rows = csv.reader(lines, delimiter=separator)
+    raw: list[float] = []
     first: list[datetime.datetime] = []
     for row in rows:
         if not row:
@@ -345,15 +349,21 @@ def _samples(
             for name, parts in columns.items()
         }
         stamp = None
-        if time is not None:
-            stamp = _seconds_since(first, row[names.index(time)])
-            stamp = number(time) if stamp is None else stamp
+        if clock is not None:
+            stamp = _seconds_since(first, cell := row[names.index(clock)])
+            if stamp is None:
+                stamp, whole = number(clock), cell.strip().isdecimal()
+                raw = [*raw, stamp] if len(raw) < 2 else raw
+                chosen = np.array(raw, int if whole else float)
+                scale, _ = scale_of_times(f"column {clock!r} of {SOURCE}", clock, chosen, time_unit)
+                many, parts = scale.seconds.as_integer_ratio()
+                stamp = stamp * many / parts
         yield Sample(line, stamp, signals)
 
 
 def _seconds_since(first: list[datetime.datetime], cell: str) -> float | None:
     """Return the seconds since the first date of the stream; None for a cell that is not a date."""
-    from verifai_jax.mtl.columns import moment_of
+    from verifai_jax.mtl.stamps import moment_of
 
     text = cell.strip()
     if not {"-", ":"} & set(text[1:]):
@@ -380,10 +390,11 @@ def _columns(names: list[str], formula: "Formula") -> dict[str, str | list[str]]
 
 
 def _number(cells: dict[str, str], line: int, separator: str, name: str) -> float:
+    from verifai_jax.mtl.columns import GAPS, TRUTHS
+
     text = cells[name].strip()
-    truths = {"true": 1.0, "false": -1.0, "": math.nan}
-    if text.lower() in truths:
-        return truths[text.lower()]
+    if text in TRUTHS or text in GAPS:
+        return TRUTHS.get(text, math.nan)
     try:
         return float(text.replace(",", ".") if separator == ";" else text)
     except ValueError:

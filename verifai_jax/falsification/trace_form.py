@@ -25,7 +25,8 @@ SAMPLES = 256
 class TraceForm:
     """The form of the modelled traces.
 
-    - `signals`: names and components (0 for a plain signal), in order.
+    - `signals`: names and components (0 for a plain signal) in order; -1 and less, -1 of them for
+      a plain signal, where they are truth values.
     - `dt`: sampling period in seconds.
     - `length`: number of samples.
     - `stride`: step between the samples of a modelled trace that the monitor reads.
@@ -72,8 +73,6 @@ class TraceForm:
         own, parts = np.arange(self.length), []
         for name, _ in self.signals:
             signal = np.asarray(trace.signals[name])
-            # Truth values are +1 and -1 in formulas.
-            signal = np.where(signal, 1.0, -1.0) if signal.dtype == bool else signal
             signal = signal.reshape(len(signal), -1)
             # A shorter one stays as it ended.
             signal = signal[np.minimum(own, len(signal) - 1)]
@@ -97,17 +96,20 @@ class TraceForm:
         columns = flat.reshape(-1, len(positions))
         columns = columns[:, left] * (1 - weight) + columns[:, right] * weight
         signals, first = {}, 0
-        for name, components in self.signals:
+        for name, number in self.signals:
+            components = max(number, -1 - number)
             signal = columns[first : first + max(components, 1)]
             signals[name] = signal.T if components else signal[0]
             first += max(components, 1)
-        return Trace(signals, self.dt * self.stride, finite=tuple(signals))
+        truths = frozenset(name for name, number in self.signals if number < 0)
+        return Trace(signals, self.dt * self.stride, finite=tuple(signals), truths=truths)
 
 
 def signals_of(trace: Trace, names: list[str]) -> tuple[tuple[str, int], ...]:
-    """Return the components of these signals of a trace; a plain signal has component 0."""
+    """Return the components of these signals of a trace, as `TraceForm` has them."""
     shapes = [(name, np.shape(trace.signals[name])) for name in names]
-    return tuple((name, int(np.prod(s[1:])) if len(s) > 1 else 0) for name, s in shapes)
+    numbers = {name: int(np.prod(s[1:])) if len(s) > 1 else 0 for name, s in shapes}
+    return tuple((name, -1 - k if trace.is_truth(name) else k) for name, k in numbers.items())
 
 
 def _bounds(formulas: Iterable[Formula], dt: float) -> list[int]:

@@ -211,6 +211,7 @@ def _influence(
             jnp.asarray(tau, dtype),
             setting.end,
             stride=setting.stride,
+            truths=setting.truths,
             nudges=dict(zip(leaves, nudges, strict=True)),
         )
         return e.value(setting.formula, 0, 0)[0]

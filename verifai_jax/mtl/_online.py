@@ -118,13 +118,11 @@ def _plan(monitor: Online) -> Plan:
 
 @functools.partial(jax.jit, static_argnums=0, inline=True)
 def _step(monitor: Online, state: State, sample: dict[str, Any]) -> State:
-    signals = {name: jnp.asarray(value)[None] for name, value in sample.items()}
+    arrays = {name: jnp.asarray(value)[None] for name, value in sample.items()}
+    truths = frozenset(name for name, array in arrays.items() if array.dtype == bool)
     dtype = jnp.result_type(float)
-    signals = {
-        name: jnp.where(a, 1.0, -1.0) if a.dtype == bool else a.astype(dtype)
-        for name, a in signals.items()
-    }
-    evaluator = Evaluator(signals, 1, monitor.dt, kind=monitor.kind)
+    signals = {name: array.astype(dtype) for name, array in arrays.items()}
+    evaluator = Evaluator(signals, 1, monitor.dt, kind=monitor.kind, truths=truths)
     margins = [(evaluator.value(f, 0, 0)[0], sign) for f, sign in monitor.plan.leaves]
     last = tuple(jnp.asarray(m if sign > 0 else -m, dtype) for m, sign in margins)
     _, cells = advance(monitor.plan, state.count, last, state.cells)

@@ -63,7 +63,8 @@ class Goals:
         signals = {}
         for i, leaf in enumerate(self.leaves):
             setting, arrays, _, valid = prepare(leaf, trace, hard, end, None)
-            evaluator = Evaluator(arrays, setting.length, setting.dt, valid=valid)
+            clock = setting.length, setting.dt
+            evaluator = Evaluator(arrays, *clock, valid=valid, truths=setting.truths)
             margin = evaluator.value(leaf, 0, setting.length - 1)
             size = sum(
                 jnp.mean(jnp.abs(jnp.asarray(evaluator.expression(side, 0, setting.length - 1))))

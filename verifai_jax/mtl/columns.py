@@ -1,17 +1,24 @@
 """Conversion of a recording's columns to numbers, with errors for invalid cells.
 
 numbers_of("flight.csv", "x", column)               # [time], or [time, k] of a column of lists
-seconds_of("flight.csv", "time", column)            # from the first, and when that was
 """
 
-import datetime
-from fractions import Fraction
 from typing import Any
 
 import numpy as np
 
-FRACTIONS = {"s": 1, "ms": 10**3, "us": 10**6, "ns": 10**9}
-"""Units of Arrow's times, as fractions of a second."""
+GAPS = (
+    "", "-", "--", "#N/A", "#N/A N/A", "#NA", "-1.#IND", "-1.#QNAN", "-NaN", "-nan", "1.#IND",
+    "1.#QNAN", "N/A", "NA", "NULL", "NaN", "n/a", "nan", "null", "None", "none", "n.a.",
+)  # fmt: skip
+"""Words in a table for a missing number."""
+TRUTHS = {
+    word: truth
+    for pair in (("true", "false"), ("on", "off"), ("yes", "no"))
+    for truth, small in zip((True, False), pair, strict=True)
+    for word in (small, small.upper(), small.capitalize())
+}
+"""Words in a table for truth values."""
 
 
 class LeftOut(str):
@@ -52,9 +59,9 @@ def numbers_of(source: str, name: str, column: Any) -> np.ndarray:
     if not is_numeric(column):
         raise ValueError(f"column {name!r} of {source} {_fault(column)}")
     if types.is_boolean(kind) and column.null_count:
-        # Truth values count as +1 and -1, and a gap is neither.
-        truths = {True: 1.0, False: -1.0, None: np.nan}
-        return np.array([truths[cell] for cell in column.to_pylist()])
+        # Masked, so that a trace knows truth values with gaps for what they are.
+        known = np.asarray(column.is_valid())
+        return np.ma.array(np.asarray(column.fill_null(False)), mask=~known)
     if types.is_decimal(kind):
         column = column.cast("float64")
     return column.to_numpy() if hasattr(column, "chunks") else column.to_numpy(zero_copy_only=False)
@@ -62,12 +69,9 @@ def numbers_of(source: str, name: str, column: Any) -> np.ndarray:
 
 def _fault(column: Any) -> str:
     """Say why a column holds no numbers; rows are counted from 1."""
-    from pyarrow import csv
-
     # A column with a text in it keeps the words for a missing number as texts, too.
-    missing = {None, *csv.ConvertOptions().null_values}
     cells = column.to_pylist()
-    given = [c for c in cells if not (isinstance(c, str | None) and c in missing)]
+    given = [c for c in cells if not (c is None or (isinstance(c, str) and c in GAPS))]
     if not given:
         return "is empty"
     texts = [cell for cell in given if not _reads_as_number(cell)]
@@ -106,92 +110,11 @@ def _vectors(source: str, name: str, column: Any) -> np.ndarray:
                     f"column {name!r} of {source} holds lists that are not vectors of numbers; in "
                     f"row {row} there is {_brief(entry)}"
                 )
-    truths = any(isinstance(entry, bool) for cell in rows for entry in cell)
-    if truths:
-        rows = [[None if e is None else 1.0 if e else -1.0 for e in cell] for cell in rows]
-    return np.array(rows, float).reshape(len(rows), width)
+    entries = [entry for cell in rows for entry in cell if entry is not None]
+    truths = bool(entries) and all(isinstance(entry, bool) for entry in entries)
+    return np.array(rows, object if truths else float).reshape(len(rows), width)
 
 
 def _brief(value: object) -> str:
     text = repr(value)
     return text if len(text) <= 40 else f"{text[:37]}..."
-
-
-def seconds_of(source: str, name: str, column: Any) -> tuple[np.ndarray, Fraction]:
-    """Return the sample times of an Arrow column in seconds; NaN for an empty cell.
-
-    Dates, times of day and durations, also as ISO 8601 texts, become seconds since the first one,
-    which is subtracted before rounding.
-
-    **Returns:** the times, and their origin in seconds since 1970; 0 for numbers in seconds.
-    **Raises:** the errors of `numbers_of`; `ValueError` for lists of numbers.
-    """
-    from pyarrow import types
-
-    kind = column.type
-    if types.is_string(kind) or types.is_large_string(kind):
-        moments = _moments(column.to_pylist())
-        if moments is not None:
-            return moments
-    if types.is_date(kind):
-        column, kind = column.cast("timestamp[ms]"), None
-    if kind is None or types.is_timestamp(kind) or types.is_duration(kind) or types.is_time(kind):
-        fraction = FRACTIONS[column.type.unit]
-        wide = "int32" if getattr(column.type, "bit_width", 64) == 32 else "int64"
-        counts = column.cast(wide).to_pylist()
-        first = next((count for count in counts if count is not None), 0)
-        seconds = [np.nan if c is None else (c - first) / fraction for c in counts]
-        return np.array(seconds), Fraction(first, fraction)
-    values = numbers_of(source, name, column)
-    if values.ndim > 1:
-        raise ValueError(
-            f"column {name!r} of {source} holds lists of {values.shape[1]} numbers, where each row "
-            "must have one sample time"
-        )
-    unit = epoch_unit(values)
-    if unit == "s":
-        return values, Fraction(0)
-    first = values[0].item()
-    seconds = [(stamp - first) / FRACTIONS[unit] for stamp in values.tolist()]
-    return np.array(seconds), Fraction(first) / FRACTIONS[unit]
-
-
-def epoch_unit(values: np.ndarray) -> str:
-    """Return the unit of sample times: `s`, or the unit of a calendar clock.
-
-    A unit is chosen if the numbers in seconds would lie over three thousand years after 1970.
-    """
-    known = values[np.isfinite(values)]
-    size = float(np.min(known)) if known.size and known.ndim == 1 else 0.0
-    return "s" if size < 1e11 else "ms" if size < 1e14 else "us" if size < 1e17 else "ns"
-
-
-def moment_of(text: str) -> datetime.datetime:
-    """Return the time of an ISO 8601 text, which may be only a time of day.
-
-    **Raises:** `ValueError` for any other text.
-    """
-    try:
-        return datetime.datetime.fromisoformat(text)
-    except ValueError:
-        return datetime.datetime.fromisoformat(f"2000-01-01T{text}")
-
-
-def _moments(texts: list[str | None]) -> tuple[np.ndarray, Fraction] | None:
-    """Return the seconds from the first ISO 8601 text to each; None if a text is no moment."""
-    moments: list[datetime.datetime | None] = []
-    for text in texts:
-        try:
-            moments.append(moment_of(text.strip()) if text else None)
-        except ValueError:
-            return None
-    first = next((moment for moment in moments if moment is not None), None)
-    if first is None:
-        return None
-    try:
-        seconds = [np.nan if m is None else (m - first).total_seconds() for m in moments]
-        zone = first.tzinfo or datetime.UTC
-        since = first.replace(tzinfo=zone) - datetime.datetime(1970, 1, 1, tzinfo=datetime.UTC)
-        return np.array(seconds), Fraction(since // datetime.timedelta(microseconds=1), 10**6)
-    except TypeError:  # Some have a time zone and others have none.
-        return None

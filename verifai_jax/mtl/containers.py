@@ -4,14 +4,20 @@ Each table has one clock: a topic of MCAP, the variables of one dimension, or a 
 times. The caller names its column of times. Nothing in a file is unpickled.
 """
 
+import itertools
 import json
+import operator
+import re
+import struct
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 
-from verifai_jax.core.messages.errors import require
+from verifai_jax.core.messages.errors import MissingExtra, require
+from verifai_jax.core.messages.text import counted, one_line
+from verifai_jax.mtl.stamps import find_clock, unit_in_name
 
 Table: TypeAlias = Any
 """An Arrow table, whose package has no types."""
@@ -48,45 +54,115 @@ def matrix_column(array: np.ndarray) -> Any:
     """Return an array `[time]` or `[time, k]` as a column of numbers or of lists."""
     import pyarrow
 
-    flat = pyarrow.array(np.ascontiguousarray(array).reshape(-1))
+    flat = pyarrow.array(np.ascontiguousarray(array, array.dtype.newbyteorder("=")).reshape(-1))
     wide = array.ndim == 2
     return pyarrow.FixedSizeListArray.from_arrays(flat, array.shape[1]) if wide else flat
 
 
-def read_mcap(path: Path, time: str) -> list[Table]:
-    """Read the topics of an MCAP file, each with the log times of its messages.
+def bag_files(folder: Path) -> list[Path]:
+    """Return the files of a folder that is one bag: those that ROS 2's `metadata.yaml` names.
+
+    Without it, `NAME_0.mcap`, `NAME_1.mcap` and so on are one if their folder is called `NAME`, or
+    if each begins within a second after the one before ends.
+    """
+    files = [file for file in folder.glob("*.mcap") if re.search(r"_\d+$", file.stem)]
+    files.sort(key=lambda file: int(file.stem.rpartition("_")[2]))
+    stems = {file.stem.rpartition("_")[0] for file in files}
+    if len(stems) != 1:
+        return []
+    named = (folder / "metadata.yaml").is_file() or stems == {folder.resolve().name}
+    return files if named or _follow_each_other(files) else []
+
+
+def _follow_each_other(files: Sequence[Path]) -> bool:
+    reader, spans = require("mcap.reader", EXTRA), []
+    for each in files:
+        try:
+            with open(each, "rb") as file:
+                about = reader.make_reader(file).get_summary().statistics
+                spans.append((about.message_start_time, about.message_end_time))
+        except (require("mcap.exceptions", EXTRA).McapError, AttributeError):
+            return False  # A damaged file, or one without a summary.
+    return all(0 <= b[0] - a[1] <= 10**9 for a, b in itertools.pairwise(spans))
+
+
+def _messages(path: Path, notes: dict[str, int]) -> Iterator[tuple[Any, Any, Any]]:
+    """Yield the messages of an MCAP file; of one that is damaged, those before the damage."""
+    reader = require("mcap.reader", EXTRA)
+    fault, count = require("mcap.exceptions", EXTRA).McapError, 0
+    try:
+        with open(path, "rb") as file:
+            for each in reader.make_reader(file).iter_messages():
+                count += 1
+                yield each
+        return
+    except fault as error:
+        if count:
+            raise ValueError(f"{path} cannot be read: {error}") from None
+        damage = error
+    try:
+        with open(path, "rb") as file:
+            for each in reader.NonSeekingReader(file).iter_messages(log_time_order=False):
+                count += 1
+                yield each
+    except (fault, struct.error, EOFError, AttributeError) as error:
+        damage = error
+    if not count:
+        raise ValueError(f"{path} cannot be read: {type(damage).__name__} {damage}")
+    notes[f"{path} is damaged or was cut: only its first {count} messages are read"] = 1
+
+
+def read_mcap(paths: Sequence[Path], time: str, notes: dict[str, int]) -> list[Table]:
+    """Read the topics of MCAP files that are one bag, each with the log times of its messages.
 
     Fields of messages become columns: `/odom` and `twist.linear.x` become `odom.twist.linear.x`.
-    JSON, ROS 2 and Protobuf messages are read; other topics are left out.
+    JSON, ROS 2 and Protobuf messages are read; other topics, and messages that cannot be decoded,
+    are left out.
 
+    **Arguments:**
+    - `notes`: receives a note on each topic, and on the messages of each, that are left out.
     **Raises:** `MissingExtra`; `ValueError` for a file that is damaged or has no such topic.
     """
     import pyarrow
 
     require("mcap", EXTRA)
-    reader = require("mcap.reader", EXTRA)
-    decoders: dict[int, Decoder | None] = {}
-    topics: dict[str, dict[int, dict[str, Any]]] = {}
-    try:
-        with open(path, "rb") as file:
-            for schema, channel, message in reader.make_reader(file).iter_messages():
-                if channel.id not in decoders:
-                    decoders[channel.id] = _decoder(channel.message_encoding, schema)
-                decode = decoders[channel.id]
-                if decode is not None:
-                    topic = channel.topic.strip("/").replace("/", ".")
-                    # Of two messages at one instant the later one counts.
-                    row = topics.setdefault(topic, {}).setdefault(message.log_time, {})
-                    _flatten(topic, decode(message.data), row)
-    except require("mcap.exceptions", EXTRA).McapError as error:
-        raise ValueError(f"{path} cannot be read: {error}") from None
+    decoders: dict[tuple[Path, int], Decoder | None] = {}
+    topics: dict[str, list[tuple[int, dict[str, Any]]]] = {}
+    faults: dict[str, list[Exception]] = {}
+    for path in paths:
+        for schema, channel, message in _messages(path, notes):
+            topic, key = channel.topic.strip("/").replace("/", "."), (path, channel.id)
+            row: dict[str, Any] = {}
+            # Decoders of other packages raise what they like, and one topic is not the others.
+            try:
+                if key not in decoders:
+                    decoders[key] = _decoder(channel.message_encoding, schema)
+                decode = decoders[key]
+                if decode is None:
+                    kind = channel.message_encoding
+                    notes[f"topic {channel.topic} is left out: its messages are {kind!r}"] = 1
+                    continue
+                _flatten(topic, decode(message.data), row)
+            except MissingExtra:
+                raise
+            except Exception as error:
+                faults.setdefault(channel.topic, []).append(error)
+                continue
+            topics.setdefault(topic, []).append((message.log_time, row))
+    for topic, errors in faults.items():
+        notes[
+            f"{counted(len(errors), 'message')} of topic {topic} cannot be decoded, and left out: "
+            f"{one_line(f'{type(errors[0]).__name__}: {errors[0]}')}"
+        ] = len(errors)
     if not topics:
-        raise ValueError(f"{path} has no topic of JSON, ROS 2 or Protobuf messages")
+        said = "".join(f"; {note}" for note in notes)
+        raise ValueError(f"{paths[0]} has no topic of JSON, ROS 2 or Protobuf messages{said}")
     tables = []
     for rows in topics.values():
-        names = dict.fromkeys(name for row in rows.values() for name in row)
-        stamps = pyarrow.array(sorted(rows), pyarrow.timestamp("ns"))
-        columns = {name: _cells([rows[at].get(name) for at in sorted(rows)]) for name in names}
+        rows.sort(key=operator.itemgetter(0))
+        names = dict.fromkeys(name for _, row in rows for name in row)
+        stamps = pyarrow.array([at for at, _ in rows], pyarrow.timestamp("ns"))
+        columns = {name: _cells([row.get(name) for _, row in rows]) for name in names}
         tables.append(table_of({time: stamps, **columns}))
     return tables
 
@@ -139,7 +215,9 @@ def read_dataset(path: Path, time: str) -> list[Table]:
     xarray = require("xarray", EXTRA)
     store = path.suffix.lower() == ".zarr"
     try:
-        with (xarray.open_zarr if store else xarray.open_dataset)(path) as dataset:
+        # Versions of xarray differ in the units of the times that they make.
+        opened = xarray.open_zarr if store else xarray.open_dataset
+        with opened(path, decode_times=False) as dataset:
             return list(_dimensions(dataset, time))
     except (ImportError, ValueError) as error:
         require("netCDF4", EXTRA)
@@ -154,10 +232,12 @@ def _dimensions(dataset: Any, time: str) -> Iterator[Table]:
             tables.setdefault(variable.dims[0], {})[str(name)] = variable.values
             units[str(name)] = str(variable.attrs.get("units", ""))
     for dimension, columns in tables.items():
-        clock = dataset.variables.get(dimension)
-        times = {} if clock is None else {time: matrix_column(clock.values)}
-        own = {name: matrix_column(array) for name, array in columns.items() if name != time}
-        yield table_of({**times, **own}, units)
+        known = {str(n): v for n, v in dataset.variables.items() if v.dims == (dimension,)}
+        name = find_clock(known, time) or (str(dimension) if dimension in known else None)
+        own = {each: matrix_column(array) for each, array in columns.items() if each != name}
+        clock = {} if name is None else {time: matrix_column(known[name].values)}
+        said = {} if name is None else {time: known[name].attrs.get("units") or unit_in_name(name)}
+        yield table_of({**clock, **own}, {**units, **said})
 
 
 def read_hdf5(path: Path, time: str) -> list[Table]:
@@ -173,19 +253,26 @@ def read_hdf5(path: Path, time: str) -> list[Table]:
     def visit(name: str, item: Any) -> None:
         if getattr(item, "ndim", 0) in (1, 2) and item.dtype.kind in "biuf":
             found[name] = item[()]
-            said = item.attrs.get("units", "")
-            units[name.replace("/", ".")] = said.decode() if isinstance(said, bytes) else str(said)
+            said = item.attrs.get("units", item.attrs.get("unit", ""))
+            units[name] = said.decode() if isinstance(said, bytes) else str(said)
 
     with require("h5py", EXTRA).File(path, "r") as file:
         file.visititems(visit)
-    tables: dict[str, dict[str, Any]] = {}
+    groups: dict[str, list[str]] = {}
+    for name in found:
+        group, _, last = name.rpartition("/")
+        groups.setdefault(group, []).append(last)
+    clocks = {group: find_clock(names, time) for group, names in groups.items()}
+    tables: dict[str, tuple[dict[str, Any], dict[str, str]]] = {}
     for name, array in found.items():
         group, _, last = name.rpartition("/")
-        while group and f"{group}/{time}" not in found:
+        own = last == clocks[group]
+        while group and clocks.get(group) is None:
             group = group.rpartition("/")[0]
-        column = time if last == time else name.replace("/", ".")
-        tables.setdefault(group, {})[column] = matrix_column(array)
-    return [table_of(columns, units) for columns in tables.values()]
+        columns, said = tables.setdefault(group, ({}, {}))
+        column = last if own else name.replace("/", ".")
+        columns[column], said[column] = matrix_column(array), units[name]
+    return [table_of(columns, said) for columns, said in tables.values()]
 
 
 def lerobot_files(folder: Path) -> list[Path]:

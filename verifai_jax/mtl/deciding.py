@@ -50,8 +50,9 @@ def deciding_instant(
             setting, signals, _, valid = prepare(formula, trace, hard, end, None)
             signals = jax.lax.stop_gradient(signals)
             evaluator = Evaluator(
-                signals, setting.length, setting.dt, end=end, valid=valid, nudges=own
-            )
+                signals, setting.length, setting.dt, end=end, valid=valid, nudges=own,
+                truths=setting.truths,
+            )  # fmt: skip
             values.append(evaluator.value(setting.formula, 0, 0)[0])
         return jnp.min(jnp.stack(values))
 

@@ -6,239 +6,37 @@
 Ends of intervals may be any times. A value is the supremum or infimum over a closed window, which
 the robustness at the samples alone does not bound.
 
-Values are computed on `Piecewise` functions of time: linear between breakpoints, where they may
-jump. Everything is exact up to rounding: breakpoints are added where two functions cross.
+Values are computed on functions of `piecewise`, exact up to rounding.
 """
 
 import math
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
 
 import numpy as np
-from jaxtyping import Float
 
 from verifai_jax.core.values.trace import Trace
 from verifai_jax.mtl import formula as ast
-from verifai_jax.mtl._parse import parse
 from verifai_jax.mtl.expression import Arithmetic, Component, Duration, Number, Signal
 from verifai_jax.mtl.formula import Formula, Term
 from verifai_jax.mtl.host_values import FUNCTIONS, numbers
 from verifai_jax.mtl.parametric import read_parametric
-from verifai_jax.mtl.resampling import Method
-from verifai_jax.mtl.setting import check_trace
+from verifai_jax.mtl.piecewise import Piecewise, Values, aligned, joined, window, witnessed
+from verifai_jax.mtl.resampling import (
+    Method,
+    check_increasing,
+    gaps,
+    held,
+    hold_note,
+    recorded_samples,
+)
+from verifai_jax.mtl.semantics import alone
+from verifai_jax.mtl.setting import as_formula, check_trace
+from verifai_jax.mtl.stamps import resolution_of
 from verifai_jax.mtl.tree import missing_case, postorder
 
-Values = Float[np.ndarray, " n"]
 SNAP = 1e-9
-"""Share of the shortest distance of samples within which two times are one: sums of decimals are
+"""Share of the usual distance of samples within which two times are one: sums of decimals are
 off by some units in the last place, and times that differ on purpose by far more."""
-
-
-@dataclass(frozen=True)
-class Piecewise:
-    """A function on `[times[0], inf)`.
-
-    - `times`: breakpoints in seconds.
-    - `point`: the value at each breakpoint; `right` and `left`: the limits at the start and at the
-      end of the piece that follows it. The last piece is constant and has no end.
-    - `snap`: times that differ by less than this many seconds are equal.
-    """
-
-    times: Values
-    point: Values
-    right: Values
-    left: Values
-    snap: float = 0.0
-
-    def map(self, function: Callable[..., Values], *others: "Piecewise") -> "Piecewise":
-        """Apply a function to several functions with equal times; it must be linear in pieces."""
-        with np.errstate(all="ignore"):
-            point, right, left = (
-                function(*(getattr(f, part) for f in (self, *others)))
-                for part in ("point", "right", "left")
-            )
-        return Piecewise(self.times, point, right, left, self.snap)
-
-    @property
-    def steps(self) -> bool:
-        """True if every piece is constant."""
-        return bool(np.all((self.right == self.left) | np.isnan(self.right)))
-
-    def index(self, times: Values, after: bool = False) -> np.ndarray:
-        """Count the breakpoints before each time, including those at it if `after`."""
-        return np.searchsorted(self.times, times + (self.snap if after else -self.snap), "right")
-
-    def pieces(self, times: Values, shift: float = 0.0) -> tuple[Values, Values]:
-        """Compute the limits at both ends of each piece between times, shifted by `shift`.
-
-        No breakpoint may lie inside such a piece. Before its start the function is -inf.
-        """
-        gaps = np.append(np.diff(times), 1.0)
-        k = self.index(times + gaps / 2 + shift, after=True) - 1
-        right, left = (self._on_piece(k, at + shift) for at in (times, times + gaps))
-        return np.where(k < 0, -np.inf, right), np.where(k < 0, -np.inf, left)
-
-    def _on_piece(self, k: np.ndarray, at: Values) -> Values:
-        k = np.maximum(k, 0)
-        start, end = self.times[k], np.append(self.times[1:], np.inf)[k]
-        right, left = self.right[k], self.left[k]
-        with np.errstate(invalid="ignore"):
-            share = np.where(np.isfinite(end), (at - start) / (end - start), 0.0)
-            value = np.where(right == left, right, right + (left - right) * share)
-            value = np.where(np.abs(at - start) <= self.snap, right, value)
-            return np.where(np.abs(end - at) <= self.snap, left, value)
-
-    def inside(self, times: Values) -> Values:
-        """Compute the values at times inside pieces."""
-        return self._on_piece(self.index(times, after=True) - 1, times)
-
-    def __call__(self, times: Values) -> Values:
-        """Compute the values at times that are no earlier than the first."""
-        k = self.index(times, after=True) - 1
-        at = np.abs(times - self.times[k]) <= self.snap
-        return np.where(at, self.point[k], self._on_piece(k, times))
-
-    def at(self, times: Values) -> "Piecewise":
-        """Return the same function with more breakpoints, which must include its own."""
-        return Piecewise(times, self(times), *self.pieces(times), self.snap)
-
-
-def merged(times: Sequence[Values], snap: float) -> Values:
-    """Return the times of all functions, each once."""
-    ordered = np.sort(np.concatenate(times))
-    return ordered[np.append(True, np.diff(ordered) > snap)]
-
-
-def aligned(*functions: Piecewise, crossings: bool = False) -> tuple[Piecewise, ...]:
-    """Return the functions on common breakpoints, including those where two of them cross."""
-    snap = functions[0].snap
-    times = merged([f.times for f in functions], snap)
-    made = tuple(f.at(times) for f in functions)
-    found = [
-        _crossing(f, g) for k, f in enumerate(made) for g in made[:k] if crossings
-    ]  # fmt: skip
-    if any(len(each) for each in found):
-        times = merged([times, *found], snap)
-        made = tuple(f.at(times) for f in made)
-    return made
-
-
-def _crossing(f: Piecewise, g: Piecewise) -> Values:
-    with np.errstate(all="ignore"):
-        begin, end = (f.right - g.right)[:-1], (f.left - g.left)[:-1]
-        after = begin / (begin - end) * (gaps := np.diff(f.times))
-        # A crossing next to a breakpoint is that breakpoint.
-        real = (begin * end < 0) & (after > f.snap) & (gaps - after > f.snap)
-    return (f.times[:-1] + after)[real]
-
-
-def joined(functions: Sequence[Piecewise], sign: int) -> Piecewise:
-    """Return the maximum (minimum, for sign -1) of several functions."""
-    best = np.maximum if sign > 0 else np.minimum
-    result, *others = functions
-    for other in others:
-        one, two = aligned(result, other, crossings=True)
-        result = one.map(best, two)
-    return result
-
-
-def window(
-    f: Piecewise, low: float, high: float, sign: int, open_right: bool = False,
-    open_left: bool = False,
-) -> Piecewise:  # fmt: skip
-    """Return the maximum (minimum) of `f` over `[t + low, t + high]`, at every `t`."""
-    if sign < 0:
-        negated = window(f.map(np.negative), low, high, 1, open_right, open_left)
-        return negated.map(np.negative)
-    start, snap = f.times[0], f.snap
-    edges = [f.times - edge for edge in (low, high) if np.isfinite(edge)]
-    times = merged([np.array([start]), *(edge[edge > start + snap] for edge in edges)], snap)
-    before = np.append(-np.inf, f.left[:-1])
-    highest = _Highest(np.maximum(np.maximum(f.point, f.right), before))
-    # At a breakpoint: what is strictly inside, and what each edge sees.
-    one, two = times + low, times + high
-    first, last = f.index(one), f.index(two, after=True) - 1
-    inside_first, inside_last = f.index(one, after=True), f.index(two) - 1
-    point = highest(inside_first, inside_last)
-    at_one, at_two = first < inside_first, last > inside_last
-    begun = two >= start - snap
-    if high > low:
-        own = np.where(at_one, f.right[np.minimum(first, len(f.times) - 1)], f.inside(one))
-        point = np.maximum(point, np.where(one >= start - snap, own, -np.inf))
-        ends = np.where(at_two, f.left[np.maximum(last - 1, 0)], f.inside(two))
-        before = np.where(at_two, last > 0, begun)
-        point = np.maximum(point, np.where(before & begun, ends, -np.inf))
-    for at, where, is_open in ((at_one, first, open_left), (at_two, last, open_right)):
-        if not is_open:
-            own = f.point[np.clip(where, 0, len(f.times) - 1)]
-            point = np.where(at, np.maximum(point, own), point)
-    if high == low:
-        point = np.where(begun, np.where(at_one, point, f.inside(one)), -np.inf)
-    # Between breakpoints: two edges that move along pieces, and what is between them.
-    middle = times + np.append(np.diff(times), 1.0) / 2
-    ends = [f.pieces(times, edge) for edge in (low, high) if np.isfinite(edge)]
-    parts = [Piecewise(times, right, right, left, snap) for right, left in ends]
-    still = highest(f.index(middle + low, after=True), f.index(middle + high) - 1)
-    between = joined([*parts, Piecewise(times, still, still, still, snap)], 1)
-    return _with_points(between, times, point)
-
-
-class _Highest:
-    """The greatest of the values from one index to another, both included; -inf for no values.
-
-    A table of the extremes of 1, 2, 4, 8 ... neighbours.
-    """
-
-    def __init__(self, values: Values) -> None:
-        self.rows = [values]
-        while 2 ** len(self.rows) <= len(values):
-            row, half = self.rows[-1], 2 ** (len(self.rows) - 1)
-            self.rows.append(np.maximum(row[:-half], row[half:]))
-
-    def __call__(self, first: np.ndarray, last: np.ndarray) -> Values:
-        count = len(self.rows[0])
-        first, last = np.clip(first, 0, count), np.clip(last, -1, count - 1)
-        size = np.maximum(last - first + 1, 1)
-        level = np.log2(size).astype(int)
-        out = np.full(len(first), -np.inf)
-        for k, row in enumerate(self.rows):
-            mine = (level == k) & (last >= first)
-            begin, end = first[mine], last[mine] - 2**k + 1
-            out[mine] = np.maximum(row[begin], row[end])
-        return out
-
-
-def witnessed(f: Piecewise, g: Piecewise, ahead: bool) -> Piecewise:
-    """Return `f` until `g` over the whole future (`ahead`), or `f` since `g` over the whole past.
-
-    `f` must hold between now and the witness, but not at the witness.
-    """
-    f, g = aligned(f, g, crossings=True)
-    n = len(f.times)
-    far_g, near_g, near_f = (g.left, g.right, f.right) if ahead else (g.right, g.left, f.left)
-    # The least of f between a time within a piece and its far end, and the best from there on.
-    lowest = np.minimum(f.right, f.left)
-    best, point = np.empty(n), np.empty(n)
-    now = -np.inf
-    for k in range(n - 1, -1, -1) if ahead else range(n):
-        if not ahead:
-            now = point[k] = max(g.point[k], min(f.point[k], now))
-        best[k] = max(far_g[k], now)
-        now = max(min(near_g[k], near_f[k]), min(lowest[k], best[k]))
-        if ahead:
-            now = point[k] = max(g.point[k], min(f.point[k], now))
-    sides = (lowest, f.left) if ahead else (f.right, lowest)
-    kept = Piecewise(f.times, point, *sides, f.snap)
-    far = joined([kept, Piecewise(g.times, best, best, best, g.snap)], -1)
-    return _with_points(joined([g, far], 1), g.times, point)
-
-
-def _with_points(f: Piecewise, times: Values, point: Values) -> Piecewise:
-    values = np.array(f.right)
-    values[np.searchsorted(f.times, times)] = point
-    return Piecewise(f.times, values, f.right, f.left, f.snap)
-
-
 STEP = 1e-6
 """Share of a parameter by which it is moved for a slope: far above rounding, and far below the
 distance of kinks."""
@@ -290,29 +88,130 @@ def dense_signal(formula: Formula | str, trace: Trace, method: Method = "linear"
     **Returns:** a function of the seconds since the first sample, with its breakpoints.
     """
     check_trace(trace)
-    formula = parse(formula) if isinstance(formula, str) else formula
-    trace = trace.trim()
-    if trace.times is None:
-        assert trace.dt is not None
-        times = np.arange(trace.length) * trace.dt
-    else:
-        clock = np.asarray(trace.times, float)
-        times = clock - clock[0]
-    snap = SNAP * float(np.min(np.diff(times), initial=math.inf)) if len(times) > 1 else SNAP
-    values = _Dense(trace, times, method, snap)
-    made: dict[int, Piecewise] = {}
-    for part in postorder(formula):
-        if isinstance(part, Formula):
-            made[id(part)] = values.formula(part, [made[id(p)] for p in part.valued()])
-    return made[id(formula)]
+    values = DenseValues(trace, method)
+    for name, signal in values.trace.signals.items():
+        if gaps(np.asarray(signal)).any() and name in as_formula(formula).signals():
+            raise ValueError(f"no verdict: signal {name!r} is NaN")
+    return values(as_formula(formula))
 
 
-class _Dense:
-    def __init__(self, trace: Trace, times: np.ndarray, method: Method, snap: float) -> None:
-        self.trace = trace
-        self.times = times
+class NotDense(ValueError):
+    """An error for a formula that has no meaning between samples."""
+
+
+class DenseValues:
+    """The values of formulas at every time on one trace, common parts computed once.
+
+    With `method="hold"` a signal keeps its last value in gaps; with `"linear"` values are NaN where
+    they depend on a gap.
+    """
+
+    def __init__(self, trace: Trace, method: Method) -> None:
+        self.trace = trace = recorded_samples(trace)
+        self.clock = np.asarray(trace.clock())
+        check_increasing(self.clock)
+        self.times = self.clock - self.clock[0]
         self.method = method
-        self.snap = snap
+        steps = np.diff(self.times)
+        self.snap = SNAP
+        if len(steps):
+            # Stamps are rounded, the more so the longer ago their clock began.
+            rounding = 0.0 if trace.times is None else 2 * resolution_of(np.asarray(trace.times))
+            near = max(SNAP * float(np.median(steps)), rounding)
+            self.snap = min(near, float(steps.min()) / 4)
+        self._known: dict[tuple[Formula, bool], Piecewise] = {}
+
+    def __call__(self, formula: Formula, boolean: bool = False) -> Piecewise:
+        """Compute the robustness, or above zero where it holds and below where not."""
+        for part in postorder(formula):
+            if isinstance(part, Formula) and (part, boolean) not in self._known:
+                below = [self._known[p, boolean] for p in part.valued()]
+                value = self.formula(part, below)
+                if boolean and isinstance(part, ast.Leaf):
+                    value = self.truth(part, value)
+                self._known[part, boolean] = value
+        return self._known[formula, boolean]
+
+    def truth(self, f: Formula, margin: Piecewise) -> Piecewise:
+        """Return 1 where a predicate holds and -1 where not."""
+        at_zero = f.compared is not None and f.compared[1] in (">=", "<=", "==")
+        margin, _ = aligned(margin, self.constant(0.0), crossings=True)
+
+        def sign(x: Values) -> Values:
+            holds = (x > 0) | (at_zero & (x == 0))
+            return np.where(np.isnan(x), x, np.where(holds, 1.0, -1.0))
+
+        with np.errstate(invalid="ignore"):
+            steady = margin.right == margin.left
+            inside = sign(np.where(steady, margin.right, (margin.right + margin.left) / 2))
+        return Piecewise(margin.times, sign(margin.point), inside, inside, self.snap)
+
+    def first(self, formula: Formula, boolean: bool = False) -> float:
+        """Compute the value at the first sample."""
+        return float(self(formula, boolean)(np.zeros(1))[0])
+
+    def decision(self, formula: Formula) -> tuple[Formula, float, float] | None:
+        """Return the predicate that decides the robustness, its margin then, and the sample time.
+
+        A time between samples is returned where signals are straight. None if none decides.
+        """
+        t = 0.0
+        while not isinstance(formula, ast.Leaf):
+            wanted = float(self(formula)(np.array([t]))[0])
+            wanted = -wanted if isinstance(formula, ast.Not) else wanted
+            options = self._operands(formula, t)
+            if not math.isfinite(wanted) or not options:
+                return None
+            found = [(abs(values - wanted), part, times) for part, times, values in options]
+            away, part, times = min(found, key=lambda each: float(np.nanmin(each[0])))
+            formula, t = part, float(times[int(np.nanargmin(away))])
+        if not formula.is_predicate:
+            return None
+        sample = int(np.searchsorted(self.times, t + self.snap, "right")) - 1
+        now = self.times[sample] if self.method == "hold" else min(t, self.times[-1])
+        # The sample's own time, without a rounding.
+        when = self.clock[sample] + (now - self.times[sample])
+        return formula, float(self(formula)(np.array([now]))[0]), float(when)
+
+    def _operands(self, f: Formula, t: float) -> list[tuple[Formula, Values, Values]]:
+        """Return operands with the times at which one may decide, and what it gives there."""
+        if not isinstance(f, ast.Window | ast.Witness):
+            now = np.array([t])
+            return [(part, now, self(part)(now)) for part in f.valued()]
+        ends = (f.interval.start, f.interval.end)
+        low, high = (t + e for e in ends) if f.side == "ahead" else (t - e for e in ends[::-1])
+        if isinstance(f, ast.Window):
+            times = self._between(low, high, f.operand)
+            return [(f.operand, times, self(f.operand)(times))] if len(times) else []
+        kept, found = f.valued()
+        times = self._between(*((t, high) if f.side == "ahead" else (low, t)), kept, found)
+        times = times if f.side == "ahead" else times[::-1]
+        left, right = self(kept)(times), self(found)(times)
+        # The least of `kept` from now to each time, which does not count itself.
+        so_far = np.minimum.accumulate(np.append(np.inf, left[:-1]))
+        # Within a piece there are times between a time and the end of the piece.
+        so_far[1::2] = np.minimum(so_far, left)[1::2]
+        due = (times >= low - self.snap) & (times <= high + self.snap)
+        if not due.any():
+            return []
+        k = int(np.argmax(np.where(due, np.minimum(right, so_far), -np.inf)))
+        if right[k] <= so_far[k]:
+            return [(found, times[[k]], right[[k]])]
+        return [(kept, times[: k + k % 2], left[: k + k % 2])]
+
+    def _between(self, low: float, high: float, *parts: Formula) -> Values:
+        """Return breakpoints of formulas in a window, its ends, and a time between each two."""
+        last = max(float(self(part).times[-1]) for part in parts) + 1.0
+        low, high = max(low, 0.0), min(high, max(last, low))
+        own = np.concatenate([[low, high], *(self(part).times for part in parts)])
+        own = np.unique(own[(own >= low) & (own <= high)]) if low <= high else own[:0]
+        return np.sort(np.concatenate([own, (own[:-1] + own[1:]) / 2]))
+
+    def held(self, formula: Formula) -> list[str]:
+        """Return notes on signals of a formula whose values are held in gaps."""
+        names = formula.signals() if self.method == "hold" else ()
+        missing = {name: gaps(np.asarray(self.trace.signals[name])) for name in names}
+        return [hold_note(name, rows) for name, rows in missing.items() if rows.any()]
 
     def constant(self, value: float) -> Piecewise:
         one = np.full(1, value)
@@ -337,7 +236,7 @@ class _Dense:
             case ast.Derived():
                 return below[0]
             case ast.Next() | ast.Prev():
-                raise ValueError(
+                raise NotDense(
                     f"{f} counts samples, and between samples there are none: give a time, as in "
                     "eventually[0, 0.1] or once[0, 0.1]"
                 )
@@ -361,7 +260,9 @@ class _Dense:
 
     def leaf(self, f: Formula) -> Piecewise:
         if f.compared is None:
-            return self.expression(f.terms()[0])
+            (e,) = f.terms()
+            truths = set(filter(self.trace.is_truth, e.signals()))
+            return self.expression(e).map(lambda values: alone(values, e, truths))
         left, comparison, right = f.compared
         if comparison in ("<", "<="):
             left, right = right, left
@@ -378,15 +279,13 @@ class _Dense:
                 case Number(value):
                     values[id(part)] = self.constant(value)
                 case Duration():
-                    raise ValueError(
+                    raise NotDense(
                         f"{part} counts samples, and between samples there are none: judge it by "
                         "robustness"
                     )
                 case Signal(name):
-                    own = self.trace[name]
-                    if own.ndim == 1:  # A vector is read by its component or norm.
-                        truth = own.dtype == bool  # It has no values between.
-                        values[id(part)] = self.samples(name, numbers(own), hold=truth)
+                    if self.trace[name].ndim == 1:  # A vector is read by its component or norm.
+                        values[id(part)] = self.samples(name, numbers(self.trace[name]))
                 case Component(Signal(name), index):
                     values[id(part)] = self.samples(name, numbers(self.trace[name])[:, index])
                 case Arithmetic("norm", (Signal(name),)):
@@ -400,9 +299,10 @@ class _Dense:
         return values[id(e)]
 
     def samples(self, name: str, values: np.ndarray, hold: bool = False) -> Piecewise:
-        if np.isnan(values).any():
-            raise ValueError(f"no verdict: signal {name!r} is NaN")
-        after = values if hold or self.method == "hold" else np.append(values[1:], values[-1:])
+        # A truth value has no values between.
+        hold = hold or self.method == "hold" or self.trace.is_truth(name)
+        values = held(values) if hold else values
+        after = values if hold else np.append(values[1:], values[-1:])
         return Piecewise(self.times, values, values, after, self.snap)
 
     def apply(self, name: str, operands: list[Piecewise], whole: Term | Formula) -> Piecewise:
@@ -416,7 +316,7 @@ class _Dense:
         straight = name in ("+", "-", "neg") or (name == "*" and any(held))
         straight = straight or (name == "/" and held[-1])
         if not (straight or all(held)) or (name == "norm" and self.method != "hold"):
-            raise ValueError(
+            raise NotDense(
                 f"{whole} is not straight between samples: judge it with method='hold', or record "
                 "it as a signal of its own"
             )

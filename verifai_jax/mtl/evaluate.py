@@ -19,7 +19,7 @@ from verifai_jax.mtl import formula as ast
 from verifai_jax.mtl import windows
 from verifai_jax.mtl.expression import Arithmetic, Component, Duration, Number, Signal
 from verifai_jax.mtl.formula import Formula, Interval, Term
-from verifai_jax.mtl.semantics import compared
+from verifai_jax.mtl.semantics import alone, compared
 from verifai_jax.mtl.tree import missing_case
 
 End = Literal["hold", "truncate", "strict"]
@@ -90,6 +90,7 @@ class Evaluator:
     valid samples, `[*lanes]` (truncate only; all when None). `lanes` is the number of lane axes;
     `open_right` makes windows half-open, as with `compat="pymtl"`. One period `dt` is `stride`
     samples long (`Trace.finely`), so windows, next and previous are that many times longer.
+    `truths` are the signals of truth values, which are numbers 1 and 0.
     """
 
     signals: Mapping[str, Float[Array, "time ..."]]
@@ -102,6 +103,7 @@ class Evaluator:
     open_right: bool = False
     lanes: int = 0
     stride: int = 1
+    truths: frozenset[str] = frozenset()
     #: Added to the values of leaves, `[time, *lanes]` each; differentiating by it weighs them.
     nudges: Mapping[Formula, Float[Array, "time ..."]] = field(default_factory=dict)
     _memo: dict[Any, Array] = field(default_factory=dict)
@@ -199,7 +201,8 @@ class Evaluator:
                 a, b = (self.expression(e, start, stop) for e in (left, right))
                 value = compared(comparison, a, b, boolean, jnp)
             case ast.Atom(e):
-                value = compared(">", self.expression(e, start, stop), 0.0, boolean, jnp)
+                value = alone(self.expression(e, start, stop), e, self.truths)
+                value = compared(">", value, 0.0, boolean, jnp)
         if f in self.nudges:
             value = value + self.nudges[f][start : stop + 1]
         return self._extended(value, last - first + 1)

@@ -22,7 +22,7 @@ from verifai_jax.mtl import formula as ast
 from verifai_jax.mtl.evaluate import End, check_scalar, check_vector, samples, seconds_held
 from verifai_jax.mtl.expression import Arithmetic, Component, Duration, Number, Signal
 from verifai_jax.mtl.formula import Formula, Interval, Term
-from verifai_jax.mtl.semantics import compared
+from verifai_jax.mtl.semantics import alone, compared
 from verifai_jax.mtl.setting import check_trace, period
 from verifai_jax.mtl.tree import missing_case, postorder
 from verifai_jax.mtl.walk import Walk
@@ -53,6 +53,7 @@ class HostValues:
     - `dt`: sampling period in seconds, which is `stride` samples long.
     - `end`: how the trace continues after the last sample, `"hold"` or `"truncate"`.
     - `lanes`: number of lane axes.
+    - `truths`: names of the signals of truth values, which are numbers 1 and 0.
     - `blend`: share of the sum of all operands that `&` and `|` add to the deciding one, so that a
       search notices when another operand improves. 0 for the robustness.
     """
@@ -63,6 +64,7 @@ class HostValues:
     stride: int = 1
     lanes: int = 0
     blend: float = 0.0
+    truths: frozenset[str] = frozenset()
     _padded: dict[int, dict[str, Values]] = field(default_factory=dict)
     _known: dict[tuple[Formula, bool, int], Values] = field(default_factory=dict)
 
@@ -81,7 +83,8 @@ class HostValues:
                 rows = inner.reshape(trace.length, -1, *own.shape[1:])
                 joined = np.concatenate([own[:, None], rows], axis=1)
                 signals[name] = joined.reshape(-1, *own.shape[1:])
-        return cls(signals, dt, end, trace.stride)
+        truths = frozenset(filter(trace.is_truth, signals))
+        return cls(signals, dt, end, trace.stride, truths=truths)
 
     @property
     def length(self) -> int:
@@ -180,7 +183,8 @@ class HostValues:
             case ast.Predicate(comparison, left, right):
                 return self._compared(comparison, left, right, boolean, pad)
             case ast.Atom(e):
-                return self._compared(">", e, Number(0.0), boolean, pad)
+                value = alone(self._expression(e, pad), e, self.truths)
+                return compared(">", value, np.zeros(1), boolean, np)
             case ast.Not():
                 return -below[0]
             case ast.Join():
@@ -276,9 +280,8 @@ def _look_back(formula: Formula, dt: float, stride: int) -> int:
 
 
 def numbers(signal: object) -> Values:
-    """Return a signal in double precision, with 1 or -1 for truth values."""
-    array = np.asarray(without_wrapping(signal))  # pyright: ignore[reportArgumentType]
-    return np.where(array, 1.0, -1.0) if array.dtype == bool else array.astype(float)
+    """Return a signal in double precision, with 1 or 0 for truth values."""
+    return np.asarray(without_wrapping(signal)).astype(float)  # pyright: ignore[reportArgumentType]
 
 
 def _held(signal: Values, pad: int) -> Values:

@@ -33,7 +33,9 @@ class Row(NamedTuple):
     - `instant`: time of the deciding sample in seconds; NaN if there is none.
     - `explanation`: the predicate that decides at that time, with its margin.
     - `error`: the reason why there is no verdict.
-    - `note`: what the requirement says otherwise than it seems to, of a recording this long.
+    - `note`: what to know of the recording and the verdict: a hole, or what the requirement says
+      otherwise than it seems to, of a recording this long.
+    - `unit`: unit of the robustness as recorded, or else that of the requirement.
     """
 
     file: str
@@ -44,6 +46,7 @@ class Row(NamedTuple):
     explanation: str = ""
     error: str = ""
     note: str = ""
+    unit: str = ""
 
 
 @dataclass(frozen=True)
@@ -89,6 +92,11 @@ class Judgement(InNotebook):
     def of(self, requirement: str) -> list[Row]:
         """Return the rows of a requirement that have a verdict."""
         return [row for row in self.rows if row.requirement == requirement and row.verdict]
+
+    def unit_of(self, requirement: Requirement) -> str:
+        """Return the unit of a requirement's robustness; empty if recordings have several."""
+        units = {row.unit for row in self.of(requirement.id)} or {requirement.unit}
+        return units.pop() if len(units) == 1 else ""
 
     @property
     def tightest(self) -> Row | None:
@@ -183,9 +191,11 @@ class Judgement(InNotebook):
             row = spread.loc[each.id]
             share = f"{int(row['failing'])} of {int(row['verdicts'])}"
             numbers = "".join(f"{row[q]:>z12.4g}" for q in ("0", "0.5") if row["verdicts"])
-            lines.append(f"  {each.id:{width}}  {share:<10}{numbers} {each.unit}".rstrip())
+            unit = self.unit_of(each)
+            lines.append(f"  {each.id:{width}}  {share:<10}{numbers} {unit}".rstrip())
         lines += _listed("Failing, the worst first:", failing)
         lines += _listed("Without a verdict:", _together(missing))
+        lines += _noted(self.rows)
         if (tightest := self.tightest) is not None and not failing:
             lines += ["", f"Tightest: {tightest.requirement} on {tightest.file}"]
             lines += [f"  {tightest.explanation}"] if tightest.explanation else []
@@ -254,6 +264,21 @@ def _listed(title: str, rows: Sequence[Row]) -> list[str]:
         lines.append(f"    {shorten(row.explanation or row.error, 160)}".rstrip())
     if len(rows) > SHOWN:
         lines.append(f"  and {len(rows) - SHOWN} more in the table")
+    return lines
+
+
+def _noted(rows: Sequence[Row]) -> list[str]:
+    """Return each note once, with the recordings that it is about."""
+    found: dict[str, dict[str, None]] = {}
+    for row in rows:
+        for note in filter(None, row.note.split("; ")):
+            found.setdefault(note, {})[row.file] = None
+    lines = ["", "Notes:"] if found else []
+    for note, files in list(found.items())[:SHOWN]:
+        where = next(iter(files)) if len(files) == 1 else counted(len(files), "recording")
+        lines.append(f"  {shorten(note, 160)} ({where})")
+    if len(found) > SHOWN:
+        lines.append(f"  and {len(found) - SHOWN} more in the table")
     return lines
 
 

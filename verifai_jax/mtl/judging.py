@@ -16,16 +16,16 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
 
 from verifai_jax.core.compute.executors import Executor, check_executor, gather
 from verifai_jax.core.display.progress import count_done, shows_progress
-from verifai_jax.core.messages.errors import missing_name
-from verifai_jax.core.messages.text import format_time, one_line
+from verifai_jax.core.messages.text import format_time, listed, one_line
 from verifai_jax.core.user_code.sources import Source, hashed_files
 from verifai_jax.core.values.trace import Trace
 from verifai_jax.mtl._robustness import first_nan
+from verifai_jax.mtl.columns import LeftOut
 from verifai_jax.mtl.containers import Episode
+from verifai_jax.mtl.dense import DenseValues, NotDense
 from verifai_jax.mtl.evaluate import End
 from verifai_jax.mtl.formula import Formula
 from verifai_jax.mtl.host_values import HostValues
@@ -33,11 +33,11 @@ from verifai_jax.mtl.judgement import Judgement, Row
 from verifai_jax.mtl.recorded import Recording, Recordings, named_recordings
 from verifai_jax.mtl.recording import read
 from verifai_jax.mtl.requirements import Requirement, Requirements, requirements_of
-from verifai_jax.mtl.resampling import Method, Missing, resample, without_gaps
-from verifai_jax.mtl.setting import check_horizon
+from verifai_jax.mtl.resampling import Method, Missing, check_holes, resample, without_gaps
+from verifai_jax.mtl.setting import SamplingError, check_horizon, check_reach, check_signals, period
 from verifai_jax.mtl.shortfalls import shortfalls_in
+from verifai_jax.mtl.units import plain_unit, unit_of, units_of
 
-_signals = functools.lru_cache(1024)(Formula.signals)
 _text = functools.lru_cache(1024)(Formula.__str__)
 """A fleet asks the same of a few formulas again and again."""
 
@@ -47,11 +47,22 @@ class Reading(NamedTuple):
 
     time: str
     dt: float | None
+    time_unit: str | None
     resample_to: float | None
     method: Method | None
     missing: Missing | Mapping[str, Missing] | None
+    max_gap: float | None
     end: End
     explain: bool
+
+
+class Found(NamedTuple):
+    """Result of one formula on one recording; see `Row`."""
+
+    robustness: float
+    holds: bool
+    instant: float = math.nan
+    explanation: str = ""
 
 
 @shows_progress("judging", "recordings")
@@ -60,10 +71,12 @@ def judge(
     recordings: Recordings,
     *,
     time: str = "time",
+    time_unit: str | None = None,
     dt: float | None = None,
     resample_to: float | None = None,
     method: Method | None = None,
     missing: Missing | Mapping[str, Missing] | None = None,
+    max_gap: float | None = None,
     end: End = "hold",
     explain: bool = True,
     executor: Executor | None = None,
@@ -75,13 +88,21 @@ def judge(
     Recordings are read one after another, each once, and none is kept in memory. One that cannot be
     read or judged gives a row without a verdict, with the reason.
 
+    The samples of an even clock decide. On an uneven one the recorded times decide, as in
+    `dense_robustness`: each signal keeps its value until its next sample (`method="linear"`: lines
+    join its samples), and windows begin and end at any time. Formulas that count samples, those
+    that are not straight between them, and `end="truncate"` need an even clock; where `resample_to`
+    gives one, a note says by how much times may be off.
+
     **Arguments:**
     - `formulas`: a formula, a sequence of formulas, or a dictionary by identifier;
       `read_requirements` reads them from a file.
     - `recordings`: paths of files, of folders (all recordings in them and their subfolders), traces
       or data frames: one, a sequence, or a dictionary by name; or a problem, which is simulated.
-    - `time`, `dt`, `resample_to`, `method`, `missing`: as in `read`; given traces are resampled and
-      their gaps treated as well.
+    - `time`, `time_unit`, `dt`, `missing`, `max_gap`: as in `read`; the gaps of given traces are
+      treated as well.
+    - `resample_to`, `method`: the even clock for formulas that need one, and what is between
+      samples, `"hold"` or `"linear"`.
     - `end`: as in `robustness`.
     - `explain`: whether to find the deciding predicate and instant.
     - `executor`: anything with the `submit` of `concurrent.futures`, to read and judge in parallel;
@@ -92,11 +113,13 @@ def judge(
     `FileNotFoundError` for a folder or a file that does not exist.
     """
     requirements = requirements_of(formulas)
-    if (resample_to is None) != (method is None):
+    if resample_to is not None and method is None:
         raise ValueError('resampling needs both: resample_to=PERIOD, method="hold" or "linear"')
+    if method not in (None, "hold", "linear"):
+        raise ValueError(f"method is 'hold' or 'linear'; got {method!r}")
     if end not in ("hold", "truncate", "strict"):
         raise ValueError(f"end is 'hold', 'truncate' or 'strict'; got {end!r}")
-    reading = Reading(time, dt, resample_to, method, missing, end, explain)
+    reading = Reading(time, dt, time_unit, resample_to, method, missing, max_gap, end, explain)
     rows: dict[int, Sequence[Row]] = {}
 
     def keep(index: int, found: Sequence[Row]) -> None:
@@ -153,77 +176,117 @@ def judge_recording(
 ) -> list[Row]:
     """Return a row for each requirement on one recording; also called by workers."""
     try:
-        return _judged(requirements, name, _trace(source, reading), reading)
+        return _judged(requirements, name, read_recording(source, reading), reading)
     except (ValueError, TypeError, OSError) as error:
         return [Row(name, each.id, error=one_line(str(error))) for each in requirements]
 
 
-def _trace(source: Recording, reading: Reading) -> Trace:
+def read_recording(source: Recording, reading: Reading) -> Trace:
+    """Return a recording as a trace, not resampled."""
     if not isinstance(source, Trace):
         return read(
-            source, time=reading.time, dt=reading.dt, resample_to=reading.resample_to,
-            method=reading.method, missing=reading.missing,
+            source, time=reading.time, time_unit=reading.time_unit, dt=reading.dt,
+            missing=reading.missing, max_gap=reading.max_gap,
         )  # fmt: skip
-    trace = source if reading.missing is None else without_gaps(source, reading.missing)
-    if reading.resample_to is not None and reading.method is not None:
-        return resample(trace, reading.resample_to, reading.method)
-    return trace
+    trace = check_holes(source.trim(), reading.max_gap)
+    return trace if reading.missing is None else without_gaps(trace, reading.missing)
 
 
 def _judged(
     requirements: Sequence[Requirement], name: str, trace: Trace, reading: Reading
 ) -> list[Row]:
-    trace = trace.trim()
-    truncated = reading.end == "truncate"
-    values = HostValues.of(trace, "truncate" if truncated else "hold")
-    clock = np.asarray(trace.finely().clock())
+    trace, units = trace.trim(), units_of(trace.signals, trace.units)
+    said = [note for note in trace.notes if not isinstance(note, LeftOut)]
+    find = finder(trace, reading)
+    clock = np.asarray(trace.clock())
+    try:
+        dt = period(trace)
+    except SamplingError:
+        dt = 0.0
+    signals = {name: np.asarray(value) for name, value in trace.signals.items()}
     rows = []
     for each in requirements:
         try:
-            rows.append(_row(each, name, trace, values, clock, reading))
+            check_signals(each.formalized, trace, "the recording")
+            found, note = find(each.formalized)
+            unit, other = _unit(each, units)
+            lasts = float(clock[-1] - clock[0])
+            falls = shortfalls_in(signals, each.formalized, dt, lasts, reading.end)
+            notes = "; ".join(filter(None, [*map(str, falls), *said, note, other]))
+            verdict = "holds" if found.holds else "fails"
+            decided = (found.robustness, found.instant, found.explanation)
+            rows.append(Row(name, each.id, verdict, *decided, note=notes, unit=unit))
         except (ValueError, TypeError) as error:
             rows.append(Row(name, each.id, error=one_line(str(error))))
     return rows
 
 
-def _row(
-    requirement: Requirement,
-    name: str,
-    trace: Trace,
-    values: HostValues,
-    clock: Float[np.ndarray, " time"],
-    reading: Reading,
-) -> Row:
-    """Judge one requirement on one recording."""
-    formula = requirement.formalized
-    for signal in _signals(formula):
-        if signal not in trace.signals:
-            raise missing_name("the recording", "signal", signal, trace.signals)
-    if reading.end == "strict":
-        check_horizon(formula, trace, values.dt)
+def finder(trace: Trace, reading: Reading) -> Callable[[Formula], tuple[Found, str]]:
+    """Return a function that decides formulas on one trace, and notes how if that is not exact."""
+
+    @functools.cache
+    def sampled() -> tuple[HostValues, Trace]:
+        own = trace
+        if reading.resample_to is not None and reading.method is not None:
+            own = resample(own, reading.resample_to, reading.method)
+        return HostValues.of(own, "truncate" if reading.end == "truncate" else "hold"), own
+
+    try:
+        period(trace)
+        even = reading.method is None
+    except SamplingError:
+        even = False
+    dense = None
+    if not even and reading.end != "truncate":
+        dense = DenseValues(trace, reading.method or "hold")
+
+    def find(formula: Formula) -> tuple[Found, str]:
+        if dense is not None:
+            if reading.end == "strict":
+                check_reach(formula, float(dense.times[-1]), 0.0)
+            try:
+                return _found(formula, dense, trace, reading), "; ".join(dense.held(formula))
+            except NotDense:
+                if reading.resample_to is None:
+                    period(trace)  # Its error says what to do about an uneven clock.
+        values, own = sampled()
+        if reading.end == "strict":
+            check_horizon(formula, own, values.dt)
+        off = [note for note in own.notes if note not in trace.notes]
+        return _found(formula, values, own, reading), "; ".join(off)
+
+    return find
+
+
+def _found(
+    formula: Formula, values: HostValues | DenseValues, trace: Trace, reading: Reading
+) -> Found:
     robustness = float(values.first(formula))
     if math.isnan(robustness):
-        missing = f"no verdict: {first_nan(formula, trace)}"
-        return Row(name, requirement.id, error=missing)
+        raise ValueError(f"no verdict: {first_nan(formula, trace)}")
     # At a robustness of zero the comparison decides.
     holds = robustness > 0 or (robustness == 0 and float(values.first(formula, boolean=True)) > 0)
-    instant, why = _decision(values, formula, clock) if reading.explain else (math.nan, "")
-    lasts = (values.length // values.stride - 1) * values.dt
-    falls = shortfalls_in(values.signals, formula, values.dt, lasts, reading.end)
-    verdict, note = "holds" if holds else "fails", "; ".join(map(str, falls))
-    return Row(name, requirement.id, verdict, robustness, instant, why, note=note)
-
-
-def _decision(
-    values: HostValues, formula: Formula, clock: Float[np.ndarray, " time"]
-) -> tuple[float, str]:
-    """Return the deciding instant of a formula in seconds, and the deciding predicate as text."""
-    walk = values.walk(formula)
-    found = walk.decision(formula)
+    if not reading.explain:
+        return Found(robustness, holds)
+    found = values.decision(formula) if isinstance(values, DenseValues) else None
+    if isinstance(values, HostValues) and (decided := values.walk(formula).decision(formula)):
+        # Beyond the end a recording repeats its last sample, so that is where to look.
+        instant = np.asarray(trace.finely().clock())[min(decided[1], values.length - 1)]
+        found = decided[0], values.walk(formula).at(*decided), float(instant)
     if found is None:
-        return math.nan, "no sample decides"
-    predicate, sample = found
-    # Beyond the end a recording repeats its last sample, so that is where to look.
-    instant = float(clock[min(sample, len(clock) - 1)])
-    margin = walk.at(predicate, sample)
-    return instant, f"{_text(predicate)} has margin {margin:z.4g} at {format_time(instant)} s"
+        return Found(robustness, holds, explanation="no sample decides")
+    predicate, margin, instant = found
+    why = f"{_text(predicate)} has margin {margin:z.4g} at {format_time(instant)} s"
+    return Found(robustness, holds, instant, why)
+
+
+def _unit(requirement: Requirement, units: Mapping[str, str]) -> tuple[str, str]:
+    """Return the unit of a robustness as recorded, and a note if the requirement has another."""
+    leaves = [part for part in requirement.formalized.subformulas() if part.is_predicate]
+    terms = [term for leaf in leaves for term in leaf.terms()]
+    known = list(dict.fromkeys(unit for term in terms if (unit := unit_of(term, units, []))))
+    wanted = plain_unit(requirement.unit)
+    if not known:
+        return requirement.unit, ""
+    note = f"its robustness is in {listed(known)} as recorded, and the requirement says {wanted}"
+    return known[0] if len(known) == 1 else "", note if wanted and known != [wanted] else ""

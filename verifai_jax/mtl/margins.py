@@ -18,6 +18,9 @@ FEW = 64
 """Powers by a whole number up to this one are products, as in JAX."""
 
 
+ALONE = "\0"
+
+
 class Step(NamedTuple):
     """One operation on earlier results.
 
@@ -34,7 +37,8 @@ class Step(NamedTuple):
 class Margins(NamedTuple):
     """Operations that compute margins.
 
-    - `columns`: the name of each signal, and the index of a component of a vector.
+    - `columns`: the name of each signal, and the index of a component of a vector. With `apart` a
+      signal that is a formula by itself has another column there, with `ALONE` before its name.
     - `leaves`: the index of the result that is each leaf's margin.
     - `counts`: for each duration, the margins of the counted formula, and its columns among these.
     """
@@ -45,25 +49,28 @@ class Margins(NamedTuple):
     counts: tuple[tuple["Margins", tuple[int, ...]], ...]
 
 
-def margins(plan: Plan, sizes: Mapping[str, int]) -> Margins:
+def margins(plan: Plan, sizes: Mapping[str, int], apart: bool = False) -> Margins:
     """Return the signed margins of a plan's leaves; common parts occur once.
 
     **Arguments:**
     - `sizes`: number of components of the signals whose norm is used.
+    - `apart`: whether a signal that is a formula by itself has a column of its own there, as a
+      truth value is 1 or -1 there, and 1 or 0 in expressions.
     **Raises:** `ValueError` for a norm of a signal without a size.
     """
-    made = _Builder(plan, sizes)
+    made = _Builder(plan, sizes, apart)
     leaves = tuple(made.leaf(f, sign, plan.top == 1) for f, sign in plan.leaves)
     counts: list[tuple[Margins, tuple[int, ...]]] = []
     for count in plan.counts:
-        inner = margins(count.plan, sizes)
+        inner = margins(count.plan, sizes, apart)
         counts.append((inner, tuple(made.number_of(*column) for column in inner.columns)))
     return Margins(tuple(made.columns), tuple(made.steps), leaves, tuple(counts))
 
 
 class _Builder:
-    def __init__(self, plan: Plan, sizes: Mapping[str, int]) -> None:
+    def __init__(self, plan: Plan, sizes: Mapping[str, int], apart: bool) -> None:
         self.sizes = sizes
+        self.alone = ALONE if apart else ""
         self.counted = {count.duration: k for k, count in enumerate(plan.counts)}
         self.columns: dict[tuple[str, int | None], int] = {}
         self.steps: dict[Step, int] = {}
@@ -80,7 +87,13 @@ class _Builder:
 
     def leaf(self, f: Formula, sign: int, boolean: bool) -> int:
         left, comparison, right = f.compared or (*f.terms(), ">", None)
-        margin = self.expression(left)
+        match left if right is None else None:
+            case Signal(name):
+                margin = self.column(self.alone + name)
+            case Component(Signal(name), index):
+                margin = self.column(self.alone + name, index)
+            case _:
+                margin = self.expression(left)
         if right is not None:
             sides = (margin, self.expression(right))
             margin = self.step("-", *(sides[::-1] if comparison in ("<", "<=") else sides))

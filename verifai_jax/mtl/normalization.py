@@ -69,7 +69,7 @@ def anneal(
 
 def _spreads(formula: Formula, trace: Trace) -> dict[Formula, float]:
     setting, arrays, _, _ = prepare(formula, trace.trim(), hard, "hold", None)
-    evaluator = Evaluator(arrays, setting.length, setting.dt)
+    evaluator = Evaluator(arrays, setting.length, setting.dt, truths=setting.truths)
     spreads = {}
     for leaf in formula.subformulas():
         if leaf.is_predicate:

@@ -204,7 +204,7 @@ def _strip(axis: Axes, node: Node, clock: np.ndarray) -> float:
 def _predicate(axis: Axes, explanation: Explanation, node: Node, clock: np.ndarray) -> float:
     """Draw the two sides of a predicate; return the height at the deciding instant."""
     setting, signals, _, _ = prepare(node.formula, explanation.trace, hard, "hold", None)
-    evaluator = Evaluator(signals, setting.length, setting.dt)
+    evaluator = Evaluator(signals, setting.length, setting.dt, truths=setting.truths)
     last = setting.length - 1
 
     def side(e: Term) -> np.ndarray:

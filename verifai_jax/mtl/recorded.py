@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Protocol, TypeAlias, Union, runtime_checkable
 
 from verifai_jax.core.display.lazy import lazy_import
 from verifai_jax.core.values.trace import Trace
-from verifai_jax.mtl.containers import Episode, episodes_of, lerobot_files
+from verifai_jax.mtl.containers import Episode, bag_files, episodes_of, lerobot_files
 from verifai_jax.mtl.formula import Formula
 from verifai_jax.mtl.recording import ENDINGS, read
 
@@ -36,6 +36,8 @@ Recordings: TypeAlias = Recording | Iterable[Recording] | Mapping[str, Recording
 
 def named_recordings(source: Recordings) -> Iterator[tuple[str, Recording]]:
     """Yield recordings with their names, unread; files of a folder are sorted by path.
+
+    A folder of one bag in several files is one recording.
 
     **Raises:** `FileNotFoundError` for a file or a folder that does not exist; `ValueError` for a
     folder without a recording.
@@ -66,7 +68,9 @@ def named_recordings(source: Recordings) -> Iterator[tuple[str, Recording]]:
         files = [each for each in sorted(path.rglob("*")) if each.suffix.lower() in ENDINGS]
         if not files:
             raise ValueError(f"there is no recording ({', '.join(ENDINGS)}) in {path}")
-        yield from ((str(file), file) for file in files)
+        bags = {folder: set(bag_files(folder)) for folder in {each.parent for each in files}}
+        whole = dict.fromkeys(f.parent if f in bags[f.parent] else f for f in files)
+        yield from ((str(file), file) for file in whole)
 
 
 def named_traces(source: Recordings) -> dict[str, Trace]:

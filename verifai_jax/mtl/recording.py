@@ -1,14 +1,11 @@
 """Recorded signals as a trace: from files and tables, of one clock or of several.
 
-    read("flight.csv")                                        # a column `time`
-    read(frame, dt=0.02)                                      # a pandas.DataFrame
-    read("drive.mcap", resample_to=0.1, method="hold")        # topics that arrive when they do
-    read(["imu.csv", "gps.csv"], missing={"speed": "hold"}, resample_to=0.1, method="linear")
-
-CSV files may have comments, a row of units, and decimal commas.
+read("flight.csv")                                        # a column `time`
+read(frame, dt=0.02)                                      # a pandas.DataFrame
+read("drive.mcap", resample_to=0.1, method="hold")        # topics that arrive when they do
+read(["imu.csv", "gps.csv"], missing={"speed": "hold"}, resample_to=0.1, method="linear")
 """
 
-import re
 from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -18,16 +15,19 @@ import numpy as np
 from verifai_jax.core.messages.errors import missing_name
 from verifai_jax.core.values.trace import Trace
 from verifai_jax.mtl import containers
-from verifai_jax.mtl.columns import LeftOut, epoch_unit, is_numeric, numbers_of, seconds_of
+from verifai_jax.mtl.columns import LeftOut, numbers_of
 from verifai_jax.mtl.containers import UNIT, Episode, Table
+from verifai_jax.mtl.csv_tables import read_csv
 from verifai_jax.mtl.resampling import (
     Method,
     Missing,
+    check_holes,
     check_increasing,
     joined,
     resample,
     without_gaps,
 )
+from verifai_jax.mtl.stamps import apart, find_clock, seconds_of
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -53,59 +53,75 @@ def read(
     source: "str | Path | Episode | pd.DataFrame | Sequence[str | Path]",
     *,
     time: str | Mapping[str, Sequence[str]] = "time",
+    time_unit: str | None = None,
     dt: float | None = None,
     columns: Sequence[str] | None = None,
     resample_to: float | None = None,
     method: Method | None = None,
     missing: Missing | Mapping[str, Missing] | None = None,
+    max_gap: float | None = None,
     episode: int | None = None,
 ) -> Trace:
     """Read a trace from a file or a table: its columns, topics or variables are signals.
 
     Columns `p[0]`, `p[1]`, ... become one vector signal `p`, and so does a column of lists of equal
     length. Columns without numbers are left out, with a note, unless named in `columns`. An empty
-    cell is a gap (NaN). In a CSV file commas, semicolons or tabs separate the columns, as the first
-    line shows; numbers may have a decimal comma if all of them do. Comment lines (`#`) before the
-    names are skipped, and a row of units may follow the names.
+    cell, `-` or `n/a` is a gap (NaN), and words such as `true` or `ON` are truth values. In a CSV
+    file commas, semicolons or tabs separate the columns, as the first line shows; numbers may have
+    a decimal comma if all of them do. Comment lines (`#`) before the names are skipped, and a row
+    of units may follow the names. A last line that was cut, messages that cannot be decoded and
+    topics of an unknown kind are left out, with a note.
 
     Data with several clocks, such as the topics of an MCAP file, the groups of an HDF5 file or
     several files, become one trace with the instants of all clocks; a signal has a gap where only
-    others have a sample. Resampling with `"hold"` then repeats each signal's own last value.
+    others have a sample. Resampling with `"hold"` then repeats each signal's own last value. Times
+    that differ by rounding alone are one instant. Samples that repeat the time of the one before
+    both count, and a time without a value that is far longer than the period is a note.
 
     **Arguments:**
     - `source`: the path of a `.csv` (first line: names), `.parquet`, `.npz` (each array is a
-      column), `.mcap`, `.nc`, `.h5` or `.hdf5` file, of a `.zarr` store, or of the folder of a
-      LeRobot data set; a `pandas.DataFrame`, whose index is a column if it has a name; or several
-      paths.
-    - `time`: the column of sample times in seconds, of dates (ISO 8601 as text) or of durations.
+      column), `.mcap`, `.nc`, `.h5` or `.hdf5` file, of a `.zarr` store, of the folder of a LeRobot
+      data set, or of a bag in several `.mcap` files; a `pandas.DataFrame`, whose index is a column
+      if it has a name; or several paths.
+    - `time`: the column of sample times: numbers, dates (ISO 8601 as text) or durations. Their unit
+      may follow its name (`time [ms]`, `time_ms`), or stand in a row of units or an attribute.
       Dates and durations become seconds since the first one, and so do numbers that can only be
       milli-, micro- or nanoseconds since 1970, with a note. For several clocks in one table, a
       dictionary from each clock to its columns, `{"t_imu": ["gyro"], "t_gps": ["speed"]}`.
+    - `time_unit`: the unit of the sample times, whatever the recording says: `"ms"`, `"us"`,
+      `"ns"`, `"s"`, `"min"`, `"h"` or `"d"`. Without any, they are in seconds.
     - `dt`: the sampling period, if there is no column of times.
     - `columns`: the signals to read; all when left out.
     - `resample_to`, `method`: a period to resample to, and the method (`"hold"` or `"linear"`).
     - `missing`: how to fill gaps, for all signals or by name: `"hold"`, with the signal's own last
       value; `"interpolate"`, linearly between its neighbours; `"drop"` removes the instants. By
       default gaps remain.
+    - `max_gap`: the longest time in seconds that a signal may be without a value.
     - `episode`: number of an episode of a LeRobot data set.
     **Raises:** `FileNotFoundError`; `MissingExtra` for a kind of file whose package is not
     installed; `ValueError` for another kind of file, no rows, a column that does not exist or
-    contains no numbers, a text among numbers, times that do not increase, or `resample_to` without
-    `method`.
+    contains no numbers, a text among numbers, times that do not increase or are hardly in seconds
+    without a unit, a gap above `max_gap`, or `resample_to` without `method`.
     """
     if (resample_to is None) != (method is None):
         raise ValueError('resampling needs both: resample_to=PERIOD, method="hold" or "linear"')
-    name, tables = _tables(source, "time" if isinstance(time, Mapping) else time, episode)
+    notes: dict[str, int] = {}
+    name, tables = _tables(source, "time" if isinstance(time, Mapping) else time, episode, notes)
+    wanted = [time] * len(tables) if isinstance(time, str) else list(time)
     if isinstance(time, Mapping):
         tables = [_of_clock(name, tables, clock, own) for clock, own in time.items()]
-        time = "time"
     units = {name: unit for _, said in tables for name, unit in said.items()}
-    notes: dict[str, int] = {}
-    parts, clocks = [], []
-    for table, _ in tables:
-        if time not in table and dt is None:
-            raise TimeColumnError(f"{name} has no column {time!r} of sample times", list(table))
-        clocks.append(table.pop(time, None))
+    parts, stamps = [], []
+    for (table, said), each in zip(tables, wanted, strict=True):
+        clock = find_clock(table, each)
+        if clock is None and dt is None:
+            raise TimeColumnError(f"{name} has no column {each!r} of sample times", list(table))
+        column = None if clock is None else table.pop(clock)
+        if column is not None and dt is None:
+            unit = said.get(clock or "", "")
+            seconds, origin, note = seconds_of(name, clock or "", column, unit, time_unit)
+            notes |= {note: 1} if note else {}
+            stamps.append((apart(seconds, notes), origin))
         parts.append(_values(name, table, columns, notes))
     if columns is None and not any(parts):
         raise ValueError(f"{name} has no column of numbers")
@@ -114,18 +130,13 @@ def read(
             raise ValueError(f"{name} has {len(parts)} clocks, so one period dt is not enough")
         times, values = None, parts[0]
     else:
-        stamps = [seconds_of(name, time, clock) for clock in clocks]
-        for clock in clocks:
-            if is_numeric(clock) and (unit := epoch_unit(numbers_of(name, time, clock))) != "s":
-                notes[
-                    f"column {time!r} is read as {unit} since 1970, in seconds from the first"
-                ] = 1
         for seconds, _ in stamps:
             check_increasing(seconds)
         times, values = (stamps[0][0], parts[0]) if len(parts) == 1 else joined(stamps, parts)
     signals = _signals(name, values, columns)
     units = {each: unit for each in signals if (unit := units.get(each) or units.get(f"{each}[0]"))}
     trace = Trace(signals, dt=dt, times=times, notes=notes, units=units)
+    trace = check_holes(trace, max_gap)
     if missing is not None:
         trace = without_gaps(trace, missing)
     if resample_to is not None and method is not None:
@@ -140,6 +151,7 @@ def _tables(
     source: "str | Path | Episode | pd.DataFrame | Sequence[str | Path]",
     time: str,
     episode: int | None,
+    notes: dict[str, int],
 ) -> tuple[str, list[tuple[Columns, dict[str, str]]]]:
     """Return how a recording is called, and the columns of each of its clocks with their units."""
     if isinstance(source, Episode):
@@ -150,13 +162,15 @@ def _tables(
             raise FileNotFoundError(f"there is no recording {path}")
         if files := containers.lerobot_files(path):
             path = _file_of_episode(path, files, episode)
-        return str(path), [_columns(path, table) for table in _file_tables(path, time, episode)]
+        tables = _file_tables(path, time, episode, notes)
+        return str(path), [_columns(path, table) for table in tables]
     if isinstance(source, Sequence) and all(isinstance(each, str | Path) for each in source):
-        found = [_tables(each, time, episode) for each in source]
+        found = [_tables(each, time, episode, notes) for each in source]
         if not found:
             raise ValueError("there is no recording: the list of files is empty")
         tables = [table for _, several in found for table in several]
-        _refuse_repeated("the files", [name for own, _ in tables for name in own if name != time])
+        names = [name for own, _ in tables for name in own if name != find_clock(own, time)]
+        _refuse_repeated("the files", names)
         return " and ".join(name for name, _ in found), tables
     return "the data frame", [(_frame_columns(source), {})]  # pyright: ignore[reportArgumentType]
 
@@ -178,22 +192,22 @@ def _columns(path: Path, table: Table) -> tuple[Columns, dict[str, str]]:
     if table.num_rows == 0:
         raise ValueError(f"{path} has no rows")
     _refuse_repeated(str(path), names)
-    said = {field.name: (field.metadata or {}).get(UNIT, b"").decode() for field in table.schema}
+    about = [(field.name, field.metadata or {}) for field in table.schema]
+    said = {name: (each.get(UNIT) or each.get(b"units") or b"").decode() for name, each in about}
     return {name: table.column(name) for name in names}, {n: u for n, u in said.items() if u}
 
 
 def _of_clock(
     source: str, tables: list[tuple[Columns, dict[str, str]]], clock: str, names: Sequence[str]
 ) -> tuple[Columns, dict[str, str]]:
-    """Return the columns of one of several clocks of a table, its times as `time`."""
+    """Return the columns of one of several clocks of a table."""
     columns = {name: column for table, _ in tables for name, column in table.items()}
     for name in (clock, *names):
         if name not in columns:
             raise missing_name(source, "column", name, columns)
     given = columns[clock].is_valid()
     units = {name: unit for _, said in tables for name, unit in said.items()}
-    found = {"time": clock} | {name: name for name in names}
-    return {name: columns[column].filter(given) for name, column in found.items()}, units
+    return {name: columns[name].filter(given) for name in (clock, *names)}, units
 
 
 def _frame_columns(frame: "pd.DataFrame") -> dict[str, Any]:
@@ -235,21 +249,23 @@ def _refuse_repeated(source: str, names: Sequence[str]) -> None:
         raise ValueError(f"{source} has more than one column {', '.join(map(repr, repeated))}")
 
 
-def _file_tables(path: Path, time: str, episode: int | None) -> list[Table]:
+def _file_tables(path: Path, time: str, episode: int | None, notes: dict[str, int]) -> list[Table]:
     """Read the Arrow tables of a file, one for each of its clocks."""
     import pyarrow
 
     readers = {
-        ".csv": lambda: [read_csv(path)],
+        ".csv": lambda: [read_csv(path, notes)],
         ".parquet": lambda: containers.read_parquet(path, time, episode),
         ".npz": lambda: [_read_arrays(path)],
-        ".mcap": lambda: containers.read_mcap(path, time),
+        ".mcap": lambda: containers.read_mcap([path], time, notes),
         ".nc": lambda: containers.read_dataset(path, time),
         ".zarr": lambda: containers.read_dataset(path, time),
         ".h5": lambda: containers.read_hdf5(path, time),
         ".hdf5": lambda: containers.read_hdf5(path, time),
     }
     ending = path.suffix.lower()
+    if bag := containers.bag_files(path):
+        return containers.read_mcap(bag, time, notes)
     if ending not in readers:
         known = f"{', '.join(ENDINGS[:-1])} or {ENDINGS[-1]}"
         raise ValueError(f"a recording is a {known} file; got {path.name}")
@@ -313,7 +329,7 @@ def _signals(
     signals = {}
     for name in wanted:
         if name in vectors:
-            signals[name] = np.stack([values[part] for part in vectors[name]], axis=1)
+            signals[name] = np.ma.stack([values[part] for part in vectors[name]], axis=1)
         elif name in values:
             signals[name] = values[name]
         else:
@@ -333,85 +349,3 @@ def vector_columns(names: Collection[str]) -> dict[str, list[str]]:
         for stem, parts in vectors.items()
         if sorted(parts) == list(range(len(parts))) and stem not in names
     }
-
-
-NUMBER = re.compile(r'^\s*"?[-+]?[.,]?\d')
-"""The beginning of a number, or of a date."""
-DECIMAL_COMMAS = r"^\s*[-+]?\d*(,\d*)?([eE][-+]?\d+)?\s*$"
-"""Numbers with a decimal comma, `1,5`, and those without decimals."""
-THOUSANDS = r"^\s*[-+]?(\d{1,3}|[1-9]\d{0,2},\d{3})\s*$"
-"""Numbers in which a comma, where there is one, may stand between thousands, `1,500`."""
-
-
-def read_csv(path: Path) -> Table:
-    """Read a CSV file as an Arrow table with any separator of columns and decimals."""
-    from pyarrow import csv
-
-    with open(path, encoding="utf-8", errors="replace") as file:
-        comments, first = 0, file.readline()
-        while first.startswith("#"):
-            comments, first = comments + 1, file.readline()
-        second, third = file.readline(), file.readline()
-    separator = max((",", ";", "\t"), key=first.count)
-    below = [line.rstrip("\n").split(separator) for line in (second, third)]
-    units = _are_units(*below)
-    parsed = csv.ParseOptions(delimiter=separator)
-    skipped = csv.ReadOptions(skip_rows=comments, skip_rows_after_names=int(units))
-    table = csv.read_csv(path, parse_options=parsed, read_options=skipped)
-    named = list(zip(table.column_names, table.columns, strict=True))
-    commas = [name for name, column in named if _all_match(column, DECIMAL_COMMAS)]
-    if not commas:
-        return _with_units(table, below[0]) if units else table
-    # Semicolons between the columns are there because commas are those of decimals.
-    unclear = [name for name in commas if _all_match(table.column(name), THOUSANDS)]
-    if unclear and separator != ";":
-        cell = next(cell for cell in table.column(unclear[0]).to_pylist() if cell and "," in cell)
-        raise ValueError(
-            f"{path} has {cell.strip()!r} in column {unclear[0]!r}, whose comma may be a decimal "
-            "comma or separate thousands: write it without a comma, or separate the columns by "
-            "semicolons"
-        )
-    again = csv.read_csv(
-        path,
-        parse_options=parsed,
-        read_options=skipped,
-        convert_options=csv.ConvertOptions(decimal_point=","),
-    )
-    for (name, before), after in zip(named, again.columns, strict=True):
-        if is_numeric(before) and not is_numeric(after):
-            raise ValueError(
-                f"{path} has decimal commas in column {commas[0]!r} and decimal points in column "
-                f"{name!r}: use the same for all numbers"
-            )
-    return _with_units(again, below[0]) if units else again
-
-
-def _are_units(second: list[str], third: list[str]) -> bool:
-    """Return whether the row below the names has texts alone, and the next one numbers."""
-    named = [cell.strip().strip('"') for cell in second]
-    constants = {"nan", "null", "na", "true", "false"}
-    values = any(NUMBER.match(cell) or cell.lower() in constants for cell in named)
-    if values or len(named) != len(third):
-        return False
-    return any(cell and NUMBER.match(below) for cell, below in zip(named, third, strict=True))
-
-
-def _with_units(table: Table, units: Sequence[str]) -> Table:
-    """Return an Arrow table with the units of its columns."""
-    import pyarrow
-
-    if len(units) != table.num_columns:
-        return table
-    pairs = zip(table.schema, units, strict=True)
-    fields = [field.with_metadata({UNIT: unit.strip(' "[]()')}) for field, unit in pairs]
-    return pyarrow.Table.from_arrays(table.columns, schema=pyarrow.schema(fields))
-
-
-def _all_match(column: Table, number: str) -> bool:
-    """Return whether a column of text holds numbers of a form, and nothing else."""
-    from pyarrow import compute, types
-
-    if not types.is_string(column.type) or column.null_count == len(column):
-        return False
-    fits = compute.match_substring_regex(column, number)  # pyright: ignore[reportAttributeAccessIssue]
-    return bool(compute.all(fits, skip_nulls=True).as_py())  # pyright: ignore[reportAttributeAccessIssue]

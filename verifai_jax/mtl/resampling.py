@@ -12,12 +12,15 @@ from fractions import Fraction
 from typing import Literal
 
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Float, Int
 
 from verifai_jax.core.messages.errors import check_names
 from verifai_jax.core.messages.text import format_seconds, format_time
+from verifai_jax.core.values.gaps import has_truths
 from verifai_jax.core.values.trace import Trace, check_period
 from verifai_jax.mtl.setting import since_first
+from verifai_jax.mtl.stamps import merged, resolution_of
 
 Method = Literal["hold", "linear"]
 Missing = Literal["hold", "drop", "interpolate"]
@@ -29,7 +32,9 @@ def resample(trace: Trace, dt: float, method: Method) -> Trace:
     """Resample signals on an even clock, from the first sample time to the last.
 
     Verdicts on the result use both the new samples and the recorded ones: those recorded between
-    new samples are kept in `between`. A missing value (NaN) is not a sample of its signal, as in a
+    new samples are kept in `between`. But windows are counted in periods of the clock, so each end
+    of one may be off by less than a period, as a note says; `judge` and `dense_robustness` decide
+    at the recorded times. A missing value (NaN) is not a sample of its signal, as in a
     log of topics that arrive at different times: `"hold"` keeps the signal's last value, with a
     note; `"linear"` leaves a gap.
 
@@ -43,7 +48,7 @@ def resample(trace: Trace, dt: float, method: Method) -> Trace:
     if method not in ("hold", "linear"):
         raise ValueError(f"method is 'hold' or 'linear'; got {method!r}")
     check_period(dt)
-    trace = _recorded(trace)
+    trace = check_holes(recorded_samples(trace), None)
     check_increasing(np.asarray(trace.clock() if trace.times is None else trace.times))
     elapsed, resolution = np.asarray(trace.clock()), 0.0
     if trace.times is not None:
@@ -64,15 +69,18 @@ def resample(trace: Trace, dt: float, method: Method) -> Trace:
     on_clock = np.abs(clock[cell] - elapsed) <= tolerance
     passed = np.flatnonzero(~((index[cell] == np.arange(len(elapsed))) & on_clock))
     signals, inner, notes = {}, {}, dict(trace.notes)
+    if len(passed):
+        late = float(np.max(elapsed[passed] - clock[cell[passed]]))
+        notes[
+            f"samples are up to {format_seconds(late, 4)} later than the clock of "
+            f"{format_seconds(dt)}: by so much each end of a window may be off"
+        ] = len(passed)
     for name, recorded in trace.signals.items():
         values = np.asarray(recorded)
-        if values.dtype == bool or method == "hold":
+        if trace.is_truth(name) or method == "hold":
             missing = gaps(values)
             if missing.any():
-                notes[
-                    f"signal {name!r} has no value in {missing.sum()} of {len(missing)} rows: "
-                    "its last one is held there"
-                ] = int(missing.sum())
+                notes[hold_note(name, missing)] = int(missing.sum())
             values = held(values)
             signals[name], inner[name] = values[index], values[passed]
         else:
@@ -86,11 +94,11 @@ def resample(trace: Trace, dt: float, method: Method) -> Trace:
             {name: np.concatenate([signals[name], inner[name]])[positions] for name in signals},
             times=times,
         )
-    about = {"status": trace.status, "notes": notes, "units": trace.units}
+    about = {"status": trace.status, "notes": notes, "units": trace.units, "truths": trace.truths}
     return Trace(signals, dt=float(dt), between=between, **about)
 
 
-def _recorded(trace: Trace) -> Trace:
+def recorded_samples(trace: Trace) -> Trace:
     """Return the samples that count, each once, those between others among them."""
     trace = trace.trim()
     if trace.between is None:
@@ -127,6 +135,12 @@ def gaps(values: np.ndarray) -> np.ndarray:
     if values.dtype.kind != "f":
         return np.zeros(len(values), bool)
     return np.asarray(np.any(np.isnan(values).reshape(len(values), -1), axis=1))
+
+
+def hold_note(name: str, missing: np.ndarray) -> str:
+    """Return the note on a signal whose value is missing in some rows, and held there."""
+    rows = f"{missing.sum()} of {len(missing)} rows"
+    return f"signal {name!r} has no value in {rows}: its last one is held there"
 
 
 def held(values: np.ndarray) -> np.ndarray:
@@ -180,15 +194,18 @@ def joined(
     - `stamps`: times of each clock in seconds, and their origin.
     """
     origin = min(start for _, start in stamps)
-    clocks = [seconds + float(start - origin) for seconds, start in stamps]
+    rounded = [resolution_of(seconds) for seconds, _ in stamps]
+    since = [np.asarray(seconds, float) + float(start - origin) for seconds, start in stamps]
+    clocks = merged(since, rounded)
     union = np.unique(np.concatenate(clocks))
     values = {}
     for clock, part in zip(clocks, parts, strict=True):
         rows = np.searchsorted(union, clock)
         for name, column in part.items():
-            numbers = np.where(column, 1.0, -1.0) if column.dtype == bool else column
-            values[name] = np.full((len(union), *column.shape[1:]), np.nan)
-            values[name][rows] = numbers
+            shape = (len(union), *column.shape[1:])
+            truths = np.ma.masked_all(shape, bool)
+            values[name] = truths if has_truths(column) else np.full(shape, np.nan)
+            values[name][rows] = column
     return union, values
 
 
@@ -203,6 +220,8 @@ def without_gaps(trace: Trace, missing: Missing | Mapping[str, Missing]) -> Trac
         gap = gaps(signals[name])
         if not gap.any():
             continue
+        # A truth value has no values between.
+        way = "hold" if way == "interpolate" and trace.is_truth(name) else way
         done = {"hold": "its last one is held", "interpolate": "it is interpolated"}
         said = done.get(way, "these are left out")
         notes[f"signal {name!r} has no value in {gap.sum()} of {len(gap)} rows: {said} there"] = 1
@@ -222,6 +241,37 @@ def without_gaps(trace: Trace, missing: Missing | Mapping[str, Missing]) -> Trac
     return replace(trace, signals=signals, notes=notes, times=clock, dt=None)
 
 
+HOLE = 10.0
+"""Usual steps of a signal beyond which a step is a hole."""
+
+
+def check_holes(trace: Trace, max_gap: float | None) -> Trace:
+    """Return a trace with notes on times without a value of a signal, far longer than its period.
+
+    **Raises:** `ValueError` for one longer than `max_gap` seconds.
+    """
+    if isinstance(trace.times, Tracer):
+        return trace
+    times, notes, seen = np.asarray(trace.clock()), dict(trace.notes), set[bytes]()
+    for name, signal in trace.signals.items():
+        known = ~gaps(np.asarray(signal))
+        steps, own = np.diff(times[known]), times[known]
+        if not len(steps) or known.tobytes() in seen:
+            continue
+        seen.add(known.tobytes())
+        k, usual = int(np.argmax(steps)), float(np.median(steps))
+        what = f"signal {name!r} has no value from {format_time(own[k])} s to "
+        what += f"{format_time(own[k + 1])} s, {format_seconds(float(steps[k]))}"
+        if max_gap is not None and steps[k] > max_gap:
+            raise ValueError(f"{what}: more than max_gap, which is {format_seconds(max_gap)}")
+        if steps[k] > HOLE * usual:
+            hour = " (an hour is skipped where local times change to summer time)"
+            summer = hour if abs(steps[k] - 3600) <= 2 * usual else ""
+            note = f"{what}, where {format_seconds(usual)} is usual{summer}"
+            notes[note] = int(np.sum(steps > HOLE * usual))
+    return replace(trace, notes=notes)
+
+
 def check_increasing(times: np.ndarray) -> None:
     """Raise `ValueError` that names a row whose time is not finite, or not after its predecessor.
 
@@ -235,6 +285,8 @@ def check_increasing(times: np.ndarray) -> None:
     if not np.all(rises):
         k = int(np.argmin(rises))
         first, second = (format_time(float(t)) for t in times[k : k + 2])
+        hour = "; an hour comes twice where local times change from summer time"
         raise ValueError(
             f"sample times must increase; row {k + 1} has {first} s and row {k + 2} {second} s"
+            f"{hour if 3000 < float(times[k]) - float(times[k + 1]) <= 3600 else ''}"
         )

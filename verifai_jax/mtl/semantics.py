@@ -8,6 +8,7 @@
 A `Semantics` is a pytree whose only leaf is the temperature, so annealing does not recompile.
 """
 
+from collections.abc import Collection
 from dataclasses import dataclass
 from functools import partial
 from types import ModuleType
@@ -16,6 +17,9 @@ from typing import Any, Literal
 import jax
 import numpy as np
 from jaxtyping import Array, Float
+
+from verifai_jax.mtl.expression import Component, Signal
+from verifai_jax.mtl.formula import Term
 
 Kind = Literal["hard", "boolean", "smooth"]
 Bound = Literal["none", "lower", "upper"]
@@ -95,3 +99,13 @@ def compared(comparison: str, left: Any, right: Any, boolean: bool, xp: ModuleTy
     holds = margin >= 0 if comparison in (">=", "<=", "==") else margin > 0
     verdict = xp.where(holds, 1.0, -1.0).astype(margin.dtype)
     return xp.where(xp.isnan(margin), margin, verdict)
+
+
+def alone(value: Any, e: Term, truths: Collection[str]) -> Any:
+    """Return the value of an expression as a formula: a truth value is 1 or -1 there, not 1 or 0.
+
+    **Arguments:**
+    - `truths`: names of the signals of truth values.
+    """
+    signal = e.vector if isinstance(e, Component) else e
+    return 2 * value - 1 if isinstance(signal, Signal) and signal.name in truths else value

@@ -50,7 +50,7 @@ class Setting(NamedTuple):
     """All static settings of one evaluation.
 
     `length` counts samples. One period `dt` is `stride` samples long: more than one if values were
-    recorded between the samples.
+    recorded between the samples. `truths` are the signals of truth values.
     """
 
     formula: Formula
@@ -62,6 +62,7 @@ class Setting(NamedTuple):
     end: End
     compat: str | None
     stride: int = 1
+    truths: frozenset[str] = frozenset()
 
 
 def as_formula(formula: Formula | str) -> Formula:
@@ -102,9 +103,7 @@ def prepare(
         raise ValueError(f"compat is None or 'pymtl'; got {compat!r}")
     if not isinstance(semantics, Semantics):
         raise TypeError(f"semantics is hard, boolean or smooth(tau); got {semantics!r}")
-    for name in formula.signals():
-        if name not in trace.signals:
-            raise _missing_signal(name, trace)
+    check_signals(formula, trace, "the trace")
     dt, stride = period(trace), trace.stride
     if end == "strict":
         check_horizon(formula, trace, dt)
@@ -117,7 +116,7 @@ def prepare(
     signals = numbers_of_signals({name: trace.signals[name] for name in formula.signals()})
     setting = Setting(
         formula, trace.length, dt, semantics.kind, semantics.error, semantics.bound, end, compat,
-        stride,
+        stride, frozenset(name for name in formula.signals() if trace.is_truth(name)),
     )  # fmt: skip
     tau = None
     if semantics.kind == "smooth" and semantics.error is None:
@@ -126,22 +125,21 @@ def prepare(
     return setting, signals, tau, valid
 
 
-def _missing_signal(name: str, trace: Trace) -> Exception:
-    """Return the error for a signal that a trace lacks, with the note of its recording on it."""
-    error = missing_name("the trace", "signal", name, trace.signals)
-    said = [note for note in trace.notes if isinstance(note, LeftOut) and note.column == name]
-    return type(error)(f"{error}; {said[0]}") if said else error
+def check_signals(formula: Formula, trace: Trace, source: str) -> None:
+    """Refuse a signal that a trace lacks, with the note of its recording on it."""
+    for name in formula.signals():
+        if name not in trace.signals:
+            error = missing_name(source, "signal", name, trace.signals)
+            said = [n for n in trace.notes if isinstance(n, LeftOut) and n.column == name]
+            raise type(error)(f"{str(error).rstrip('.')}; {said[0]}") if said else error
 
 
 def numbers_of_signals(signals: dict[str, Samples]) -> dict[str, Array]:
-    """Return the signals as arrays of one floating type, with +1 for true and -1 for false."""
+    """Return the signals as arrays of one floating type, with 1 for true and 0 for false."""
     arrays = {name: as_array(value) for name, value in signals.items()}
     floats = [a.dtype for a in arrays.values() if jnp.issubdtype(a.dtype, jnp.floating)]
     dtype = jnp.result_type(*floats) if floats else jnp.result_type(float)
-    return {
-        name: (jnp.where(a, 1.0, -1.0) if a.dtype == bool else a).astype(dtype)
-        for name, a in arrays.items()
-    }
+    return {name: array.astype(dtype) for name, array in arrays.items()}
 
 
 def period(trace: Trace) -> float:
@@ -238,11 +236,15 @@ def _at(trace: Trace, k: int) -> str:
 
 def check_horizon(formula: Formula, trace: Trace, dt: float) -> None:
     """Raise `HorizonError` for a formula that looks beyond the end of a trace."""
-    horizon = formula.horizon(dt)
     length = trace.length
     if trace.valid is not None and not isinstance(trace.valid, Tracer):
         length = int(np.min(np.asarray(trace.valid)))
-    duration = (length - 1) * dt
+    check_reach(formula, (length - 1) * dt, dt)
+
+
+def check_reach(formula: Formula, duration: float, dt: float) -> None:
+    """Raise `HorizonError` for a formula that looks beyond a duration in seconds."""
+    horizon = formula.horizon(dt)
     if horizon > duration * (1 + 1e-9) + 1e-9 * dt:
         what = "has no end" if math.isinf(horizon) else f"looks {format_seconds(horizon)} ahead"
         lasts = format_seconds(duration)
@@ -267,4 +269,5 @@ def evaluator_of(
         setting.compat == "pymtl",
         lanes,
         stride=setting.stride,
+        truths=setting.truths,
     )

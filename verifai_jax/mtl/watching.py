@@ -21,10 +21,10 @@ from jaxtyping import Float
 
 from verifai_jax.core.compute.machine_code import Unavailable, compiler, library_file
 from verifai_jax.core.messages.errors import missing_name
-from verifai_jax.core.values.gaps import with_gaps
+from verifai_jax.core.values.gaps import has_truths, with_gaps
 from verifai_jax.mtl.c_monitor import HEAD, HELPERS, monitor_code
 from verifai_jax.mtl.formula import Formula
-from verifai_jax.mtl.margins import Margins, margins
+from verifai_jax.mtl.margins import ALONE, Margins, margins
 from verifai_jax.mtl.python_machine import PythonMachine
 from verifai_jax.mtl.semantics import Semantics, hard
 from verifai_jax.mtl.streams import Plan, streams
@@ -141,7 +141,7 @@ class Watch(Generic[R]):
         """
         try:
             numbers = self._read(sample)
-            # A false value is -1, and Python takes it for 0.
+            # A false value may be -1, and Python takes it for 0.
             self._step(self._numbers(sample) if False in numbers else numbers)
         except KeyError:
             raise self._missing(sample) from None
@@ -156,13 +156,13 @@ class Watch(Generic[R]):
         **Raises:** `UnknownNameError` for a missing signal; `ValueError` for different lengths.
         """
         arrays: dict[str, np.ndarray] = {}
-        for name, _ in self._columns:
+        for column, _ in self._columns:
+            name = column.removeprefix(ALONE)
             if name not in signals:
                 raise self._missing(signals)
-            array = np.asarray(with_gaps(name, signals[name]))
-            arrays[name] = (
-                np.where(array, 1.0, -1.0) if array.dtype == bool else array.astype(float)
-            )
+            array = np.asarray(with_gaps(name, signals[name])).astype(float)
+            alone = column != name and has_truths(signals[name])
+            arrays[column] = 2 * array - 1 if alone else array
         lengths = {name: len(array) for name, array in arrays.items()}
         if len(set(lengths.values())) > 1:
             raise ValueError(f"signals have one length; got {lengths}")
@@ -204,10 +204,11 @@ class Watch(Generic[R]):
         return [float(out[wait - 1, k]) if wait else now[k] for k, wait in enumerate(self._waits)]
 
     def _numbers(self, sample: Mapping[str, Any]) -> list[float]:
-        return [_number(name, sample[name], index) for name, index in self._columns]
+        return [_number(name, sample, index) for name, index in self._columns]
 
     def _missing(self, sample: Mapping[str, Any]) -> Exception:
-        name = next(name for name, _ in self._columns if name not in sample)
+        names = (name.removeprefix(ALONE) for name, _ in self._columns)
+        name = next(name for name in names if name not in sample)
         return missing_name("the sample", "signal", name, sample)
 
 
@@ -215,16 +216,20 @@ def _reader(
     columns: Sequence[tuple[str, int | None]],
 ) -> Callable[[Mapping[str, Any]], Sequence[float]]:
     """Return what takes the numbers of a sample, as fast as Python can."""
-    names = [name for name, index in columns if index is None]
+    sources = [(name.removeprefix(ALONE), index) for name, index in columns]
+    names = [name for name, index in sources if index is None]
     if len(names) > 1 and len(names) == len(columns):
         return operator.itemgetter(*names)
-    return lambda sample: [sample[n] if i is None else sample[n][i] for n, i in columns]
+    return lambda sample: [sample[n] if i is None else sample[n][i] for n, i in sources]
 
 
-def _number(name: str, value: Any, index: int | None) -> float:
-    value = value if index is None else value[index]
+def _number(column: str, sample: Mapping[str, Any], index: int | None) -> float:
+    name = column.removeprefix(ALONE)
+    value = sample[name] if index is None else sample[name][index]
     value = with_gaps(name, [None if value is np.ma.masked else value])[0]
-    return (1.0 if value else -1.0) if isinstance(value, bool | np.bool_) else float(value)
+    # A truth value that is a formula by itself.
+    alone = column != name and value.dtype == bool
+    return 2 * float(value) - 1 if alone else float(value)
 
 
 @overload
@@ -261,7 +266,7 @@ def watch(
     norm without a size.
     """
     plan = streams(formulas, dt, semantics, every)
-    front = margins(plan, sizes or {})
+    front = margins(plan, sizes or {}, apart=True)
     if not isinstance(formulas, Mapping):
         return Watch(plan, front, lambda out: out[0])
     names = tuple(formulas)

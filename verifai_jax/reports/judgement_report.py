@@ -121,13 +121,12 @@ def _found(judgement: Judgement) -> Section:
 
 def _rows(judgement: Judgement, rows: tuple[Row, ...]) -> Markup:
     heads = ["recording", "requirement", "verdict", "robustness", "at", "why"]
-    units = {each.id: each.unit for each in judgement.requirements}
     listed = []
     for row in rows[:MAX_ROWS]:
-        unit = f" {units[row.requirement]}" if units[row.requirement] else ""
+        unit = f" {row.unit}" if row.unit else ""
         at = "" if math.isnan(row.instant) else f"{format_time(row.instant)} s"
         rho = "" if math.isnan(row.robustness) else f"{row.robustness:z.4g}{unit}"
-        why = row.explanation or row.error
+        why = "; ".join(filter(None, (row.explanation or row.error, row.note)))
         listed.append((row.file, row.requirement, row.verdict or "none", rho, at, why))
     left = len(rows) - len(listed)
     more = f"; {left:,} more are in the table" if left else ""

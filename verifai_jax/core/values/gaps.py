@@ -28,14 +28,24 @@ def with_gaps(name: str, signal: Any) -> Any:
     if isinstance(signal, np.ma.MaskedArray):
         if not np.ma.getmaskarray(signal).any():
             return np.asarray(signal.data)
-        numbers = np.asarray(signal.data)
-        numbers = np.where(numbers, 1.0, -1.0) if numbers.dtype == bool else numbers.astype(float)
-        return np.where(np.ma.getmaskarray(signal), np.nan, numbers)
+        return np.where(np.ma.getmaskarray(signal), np.nan, np.asarray(signal.data).astype(float))
     if getattr(signal, "dtype", None) is None:
         return signal
     if np.asarray(signal).dtype != object:
         return _real(name, signal)
     return _numbers_of_objects(name, np.asarray(signal))
+
+
+def has_truths(signal: Any) -> bool:
+    """Return whether the samples of a signal that are not missing are truth values."""
+    if isinstance(signal, list | tuple):
+        entries = np.ravel(np.array(signal, object)).tolist() if len(signal) else []
+    elif getattr(getattr(signal, "dtype", None), "kind", "") != "O":
+        return getattr(getattr(signal, "dtype", None), "kind", "") == "b"
+    else:
+        entries = np.ravel(np.asarray(signal)).tolist()
+    known = [entry for entry in entries if not _is_missing(entry)]
+    return bool(known) and all(isinstance(entry, bool | np.bool_) for entry in known)
 
 
 def _listed(name: str, rows: list[Any] | tuple[Any, ...]) -> Any:
@@ -77,9 +87,7 @@ def _numbers_of_objects(name: str, values: np.ndarray) -> np.ndarray:
     for index, value in np.ndenumerate(values):
         if _is_missing(value):
             continue
-        if isinstance(value, bool | np.bool_):
-            numbers[index] = 1.0 if value else -1.0
-        elif isinstance(value, int | float | np.number):
+        if isinstance(value, bool | np.bool_ | int | float | np.number):
             numbers[index] = value
         else:
             raise TypeError(

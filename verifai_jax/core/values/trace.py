@@ -25,7 +25,7 @@ from verifai_jax.core.display.lazy import lazy_import
 from verifai_jax.core.display.notebook import InNotebook
 from verifai_jax.core.messages.checks import check_count, check_name, is_number
 from verifai_jax.core.messages.text import format_seconds
-from verifai_jax.core.values.gaps import known_times, with_gaps
+from verifai_jax.core.values.gaps import has_truths, known_times, with_gaps
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -33,7 +33,7 @@ Samples: TypeAlias = (
     Real[Array | np.ndarray | jax.ShapeDtypeStruct, "time *k"]
     | Bool[Array | np.ndarray | jax.ShapeDtypeStruct, "time *k"]
 )
-"""A signal or its form, one row a sample; truth values count as +1 and -1."""
+"""A signal or its form, one row a sample; a truth value is the number 1 or 0."""
 Leaf: TypeAlias = Array | np.ndarray | jax.ShapeDtypeStruct | np.integer | int | None
 """A part of a trace."""
 
@@ -68,6 +68,7 @@ class Trace(InNotebook):
     - `notes`: messages of the producer on this simulation or recording, each with the number of its
       occurrences, `{"the solver fell back to Euler": 3}`. A run adds them up in its notes.
     - `units`: units of signals by name, from the recording.
+    - `truths`: names of the signals of numbers 1, 0 and NaN that are truth values with gaps.
 
     Notes and units stay on the host: JAX's transformations drop them.
 
@@ -84,7 +85,7 @@ class Trace(InNotebook):
     """
 
     _internal = frozenset((
-        "between", "between_until", "finite", "held", "hold", "stride",
+        "between", "between_until", "finite", "held", "hold", "is_truth", "stride", "truths",
     ))  # fmt: skip
     signals: Mapping[str, Samples]
     dt: float | None = None
@@ -96,6 +97,7 @@ class Trace(InNotebook):
     between: "Trace | None" = None
     notes: Mapping[str, int] = field(default_factory=dict)
     units: Mapping[str, str] = field(default_factory=dict)
+    truths: frozenset[str] = frozenset()
 
     def __post_init__(self) -> None:
         if not isinstance(self.signals, Mapping):
@@ -108,6 +110,12 @@ class Trace(InNotebook):
             check_name("the name of a signal", name, lines=True)
         _check_notes(self.notes)
         signals = {name: with_gaps(name, signal) for name, signal in self.signals.items()}
+        truths = set(self.truths & signals.keys())
+        for name, given in self.signals.items():
+            changed = isinstance(signals[name], np.ndarray) and signals[name] is not given
+            if changed and signals[name].dtype.kind == "f" and has_truths(given):
+                truths.add(name)
+        object.__setattr__(self, "truths", frozenset(truths))
         object.__setattr__(self, "signals", signals)
         lengths = {}
         for name, signal in signals.items():
@@ -161,7 +169,11 @@ class Trace(InNotebook):
 
     @classmethod
     def from_dataframe(
-        cls, frame: "pd.DataFrame", time: str = "time", dt: float | None = None
+        cls,
+        frame: "pd.DataFrame",
+        time: str = "time",
+        dt: float | None = None,
+        time_unit: str | None = None,
     ) -> "Trace":
         """Make a trace from a `pandas.DataFrame` with a column for each signal.
 
@@ -172,15 +184,21 @@ class Trace(InNotebook):
         - `time`: the column of sample times in seconds, or the name of the index; dates and
           durations become seconds since the first one.
         - `dt`: the sampling period in seconds, if there is no column of times.
+        - `time_unit`: the unit of the sample times, if their name does not end with it.
         **Raises:** `ValueError` for a frame without rows, numbers or sample times, and for times
         that do not increase.
         """
-        return lazy_import("verifai_jax.mtl.recording", "read")(frame, time=time, dt=dt)
+        read = lazy_import("verifai_jax.mtl.recording", "read")
+        return read(frame, time=time, dt=dt, time_unit=time_unit)
 
     @property
     def length(self) -> int:
         """Number of samples stored (valid or not)."""
         return np.shape(next(iter(self.signals.values())))[0]
+
+    def is_truth(self, name: str) -> bool:
+        """Return whether a signal consists of truth values, which may have gaps."""
+        return name in self.truths or has_truths(self.signals[name])
 
     def clock(self) -> Real[Array | np.ndarray, " time"]:
         """Return the sample times `[time]` in seconds, in double precision if they are concrete.
@@ -419,16 +437,17 @@ def _flatten(trace: Trace) -> tuple[list[tuple[Any, Any]], Any]:
     names = tuple(trace.signals)
     keys = [(jax.tree_util.DictKey(name), trace.signals[name]) for name in names]
     keys += [(jax.tree_util.GetAttrKey(name), getattr(trace, name)) for name in _CHILDREN]
-    return keys, (names, trace.dt, trace.held, trace.finite)
+    return keys, (names, trace.dt, trace.held, trace.finite, trace.truths)
 
 
 def _unflatten(static: Any, children: Any) -> Trace:
     # JAX unflattens with placeholders (and with batched leaves), which the checks would refuse.
     trace = object.__new__(Trace)
-    names, dt, held, finite = static
+    names, dt, held, finite, truths = static
     values = tuple(children)
     fields = {"signals": dict(zip(names, values, strict=False))}
     fields |= {"dt": dt, "held": held, "finite": finite, "notes": {}, "units": {}}
+    fields["truths"] = truths
     fields |= dict(zip(_CHILDREN, values[len(names) :], strict=True))
     for name, value in fields.items():
         object.__setattr__(trace, name, value)

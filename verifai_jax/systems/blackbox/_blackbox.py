@@ -20,7 +20,7 @@ from jaxtyping import Array, Key
 
 from verifai_jax.core.messages.errors import suggests_options
 from verifai_jax.core.user_code.forks import returning_once
-from verifai_jax.core.values.gaps import with_gaps
+from verifai_jax.core.values.gaps import has_truths, with_gaps
 from verifai_jax.core.values.trace import Status, Trace, check_code
 from verifai_jax.features.domain import Domain
 from verifai_jax.systems.base import (
@@ -349,6 +349,7 @@ def stack_traces(
     **Returns:** a `Trace` whose leaves have a leading axis `[n]`.
     **Raises:** the errors of `Trace` for the first invalid one.
     """
+    truths = frozenset(name for name, signal in signals.items() if has_truths(signal))
     signals = {name: with_gaps(name, signal) for name, signal in signals.items()}
     first = None if times is None else np.asarray(times)[0]
     for name, value in (("valid", valid), ("status", status)):
@@ -356,7 +357,8 @@ def stack_traces(
         check_code(name, known, "a whole number for each row")
     Trace({name: np.asarray(signal)[0] for name, signal in signals.items()}, dt, first)
     # A Trace is checked as one; unflattening is how JAX makes a batch of them.
-    whole = Trace({name: np.zeros(1) for name in signals}, 1.0, held=held, finite=finite)
+    zeros = {name: np.zeros(1) for name in signals}
+    whole = Trace(zeros, 1.0, held=held, finite=finite, truths=truths)
     trace = jax.tree.unflatten(jax.tree.structure(whole), list(signals.values()))
     for name, value in (("dt", dt), ("times", times), ("valid", valid), ("status", status)):
         object.__setattr__(trace, name, value)
