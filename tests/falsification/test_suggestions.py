@@ -11,9 +11,9 @@ import pytest
 
 import verifai_jax as vj
 from verifai_jax import search
+from verifai_jax.addons.reports.commands import run_python
 from verifai_jax.core.values.cube import Cube
 from verifai_jax.falsification.suggestions import row_of
-from verifai_jax.reports.commands import run_python
 from verifai_jax.search.suggested import Absent
 
 SPACE = {

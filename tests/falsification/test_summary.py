@@ -8,8 +8,8 @@ import pytest
 
 import verifai_jax as vj
 from verifai_jax.evaluation.confirmations import UNDECIDED, VERDICTS
-from verifai_jax.reports.plotting.robustness_history import plot_robustness_history
-from verifai_jax.reports.plotting.scatter import plot_features
+from verifai_jax.pictures.robustness_history import plot_robustness_history
+from verifai_jax.pictures.scatter import plot_features
 
 SPACE = {"a": vj.Box(0.0, 1.0), "b": vj.Box(-1.0, 1.0)}
 

@@ -175,7 +175,9 @@ class Trace(InNotebook):
         **Raises:** `ValueError` for a frame without rows, numbers or sample times, and for times
         that do not increase.
         """
-        return lazy_import("verifai_jax.mtl.recording", "read")(frame, time=time, dt=dt)
+        return lazy_import("verifai_jax.addons.monitoring.recording", "read")(
+            frame, time=time, dt=dt
+        )
 
     @property
     def length(self) -> int:

@@ -1,0 +1,133 @@
+"""The margins of a formula's leaves as operations on the numbers of a sample, in C or in Python.
+
+front = margins(plan, sizes={"p": 3})
+front.columns                   # (("x", None), ("p", 0), ...): what the numbers of a sample are
+front.steps                     # Step("-", (0, 1)), ..., each of results before it
+front.leaves                    # the results that are the margins
+"""
+
+from collections.abc import Callable, Mapping
+from typing import NamedTuple
+
+from verifai_jax.addons.monitoring.streams import Plan
+from verifai_jax.mtl.expression import Arithmetic, Component, Duration, Number, Signal
+from verifai_jax.mtl.formula import Formula, Term
+from verifai_jax.mtl.tree import missing_case, postorder
+
+FEW = 64
+"""Powers by a whole number up to this one are products, as in JAX."""
+
+
+class Step(NamedTuple):
+    """One operation on earlier results.
+
+    - `kind`: a kind of `Arithmetic`, or one of these: `column` and `count` (number `number` of the
+      sample, or of the counted durations), `number`, `power` (with the integer `number`), `truth`
+      (1 or -1 by the sign; `number` is 1 if zero counts as true).
+    """
+
+    kind: str
+    inputs: tuple[int, ...] = ()
+    number: float = 0.0
+
+
+class Margins(NamedTuple):
+    """Operations that compute margins.
+
+    - `columns`: the name of each signal, and the index of a component of a vector.
+    - `leaves`: the index of the result that is each leaf's margin.
+    - `counts`: for each duration, the margins of the counted formula, and its columns among these.
+    """
+
+    columns: tuple[tuple[str, int | None], ...]
+    steps: tuple[Step, ...]
+    leaves: tuple[int, ...]
+    counts: tuple[tuple["Margins", tuple[int, ...]], ...]
+
+
+def margins(plan: Plan, sizes: Mapping[str, int]) -> Margins:
+    """Return the signed margins of a plan's leaves; common parts occur once.
+
+    **Arguments:**
+    - `sizes`: number of components of the signals whose norm is used.
+    **Raises:** `ValueError` for a norm of a signal without a size.
+    """
+    made = _Builder(plan, sizes)
+    leaves = tuple(made.leaf(f, sign, plan.top == 1) for f, sign in plan.leaves)
+    counts: list[tuple[Margins, tuple[int, ...]]] = []
+    for count in plan.counts:
+        inner = margins(count.plan, sizes)
+        counts.append((inner, tuple(made.number_of(*column) for column in inner.columns)))
+    return Margins(tuple(made.columns), tuple(made.steps), leaves, tuple(counts))
+
+
+class _Builder:
+    def __init__(self, plan: Plan, sizes: Mapping[str, int]) -> None:
+        self.sizes = sizes
+        self.counted = {count.duration: k for k, count in enumerate(plan.counts)}
+        self.columns: dict[tuple[str, int | None], int] = {}
+        self.steps: dict[Step, int] = {}
+
+    def step(self, kind: str, *inputs: int, number: float = 0.0) -> int:
+        """Return the number of the operation's result, one for all that need it."""
+        return self.steps.setdefault(Step(kind, inputs, number), len(self.steps))
+
+    def number_of(self, name: str, index: int | None = None) -> int:
+        return self.columns.setdefault((name, index), len(self.columns))
+
+    def column(self, name: str, index: int | None = None) -> int:
+        return self.step("column", number=self.number_of(name, index))
+
+    def leaf(self, f: Formula, sign: int, boolean: bool) -> int:
+        left, comparison, right = f.compared or (*f.terms(), ">", None)
+        margin = self.expression(left)
+        if right is not None:
+            sides = (margin, self.expression(right))
+            margin = self.step("-", *(sides[::-1] if comparison in ("<", "<=") else sides))
+        if comparison in ("==", "!="):
+            margin = self.step("abs", margin)
+        if comparison == "==":
+            margin = self.step("neg", margin)
+        if boolean:
+            margin = self.step("truth", margin, number=float(comparison in (">=", "<=", "==")))
+        return margin if sign > 0 else self.step("neg", margin)
+
+    def expression(self, e: Term) -> int:
+        results: dict[int, int] = {}
+
+        def result(part: Term) -> int:
+            if isinstance(part, Duration):
+                return self.step("count", number=self.counted[part])
+            # A signal is a number here, and a vector within its component or norm.
+            return self.column(part.name) if isinstance(part, Signal) else results[id(part)]
+
+        for part in postorder(e):
+            if not isinstance(part, Signal):
+                results[id(part)] = self.part(part, result)
+        return result(e)
+
+    def part(self, part: Term, result: Callable[[Term], int]) -> int:
+        match part:
+            case Number(value):
+                return self.step("number", number=value)
+            case Component(Signal(name), index):
+                return self.column(name, index)
+            case Arithmetic("norm", (Signal(name),)):
+                return self.step("norm", *(self.column(name, k) for k in range(self.size(name))))
+            case Arithmetic("norm", (argument,)):
+                raise TypeError(f"norm takes a vector signal; got norm({argument})")
+            case Arithmetic("**", (base, Number(power))) if (
+                power.is_integer() and abs(power) <= FEW
+            ):
+                return self.step("power", result(base), number=power)
+            case Arithmetic(name, arguments):
+                return self.step(name, *map(result, arguments))
+        raise missing_case("the margin", part)
+
+    def size(self, name: str) -> int:
+        if name not in self.sizes:
+            raise ValueError(
+                f"norm({name}) needs the number of components of {name}: give it, as in "
+                f'sizes={{"{name}": 3}}'
+            )
+        return self.sizes[name]
