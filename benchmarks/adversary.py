@@ -19,7 +19,7 @@ import numpy as np
 
 import verifai_jax as vj
 from envs import lane_keeping as lane
-from verifai_jax.rl import PPO, Continuous
+from verifai_jax.addons.rl import PPO, Continuous
 from verifai_jax.systems.ode import ode
 from verifai_jax.systems.ode.closed_loop import substep
 

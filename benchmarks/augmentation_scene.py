@@ -13,7 +13,17 @@ import optax
 
 import verifai_jax as vj
 from verifai_jax import augmentation
-from verifai_jax.perception import Box, Camera, Conditions, Cone, Ground, Line, Scene, Sky, Sun
+from verifai_jax.addons.perception import (
+    Box,
+    Camera,
+    Conditions,
+    Cone,
+    Ground,
+    Line,
+    Scene,
+    Sky,
+    Sun,
+)
 
 CAMERA = Camera(24, 48, field_of_view=0.62, position=(0.0, 0.0, 1.3))
 HUES = jnp.asarray(

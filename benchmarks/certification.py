@@ -17,8 +17,8 @@ import time
 
 import numpy as np
 
-from verifai_jax.estimation.certification import certify, race
-from verifai_jax.estimation.certification.allocation import Allocation
+from verifai_jax.addons.estimation.certification import certify, race
+from verifai_jax.addons.estimation.certification.allocation import Allocation
 from verifai_jax.statistics.confidence_sequences import simultaneous_interval, verdict
 
 PROFILES = {
@@ -122,7 +122,7 @@ def count_wrong(name, rates, runs, p, draw_of=bernoulli):
 def trained(configurations):
     """Train policies of PPO with many learning rates, discounts and seeds."""
     from envs.cartpole import CartPoleTask
-    from verifai_jax.rl import PPO, BatchedTraining, Configuration
+    from verifai_jax.addons.rl import PPO, BatchedTraining, Configuration
 
     random = np.random.default_rng(0)
     made = [
@@ -145,7 +145,7 @@ def trained(configurations):
 
 def policies(configurations, runs, heavy):
     from specs.cartpole import balance_with
-    from verifai_jax.estimation.certification.blocks import Blocks
+    from verifai_jax.addons.estimation.certification.blocks import Blocks
 
     some = trained(configurations)
     for kind in ("first", "again"):

@@ -2,7 +2,7 @@
 
     ControlTask = Pendulum | Acrobot | MountainCar
 
-Each equals Gymnasium's step for step, which `tests/rl/test_learning_curves.py` checks.
+Each equals Gymnasium's step for step, which `tests/addons/rl/test_learning_curves.py` checks.
 """
 
 from dataclasses import dataclass
@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Key
 
-from verifai_jax.rl import Continuous, Discrete
+from verifai_jax.addons.rl import Continuous, Discrete
 
 Scalar = Float[Array, ""]
 Stepped = tuple["Angles", Scalar, Bool[Array, ""]]

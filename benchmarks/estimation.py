@@ -20,7 +20,7 @@ import numpy as np
 from scipy.stats import chi2, ncx2, norm
 
 import verifai_jax as vj
-from verifai_jax.estimation import estimate
+from verifai_jax.addons.estimation import estimate
 
 # The probability that AT6b fails, by Monte Carlo: failures and simulations of `--truth`.
 AT6B = (1_059, 1_302_528)

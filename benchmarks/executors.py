@@ -22,7 +22,7 @@ import numpy as np
 
 import verifai_jax as vj
 from specs import cartpole
-from verifai_jax.evaluation.clusters import RayExecutor
+from verifai_jax.addons.clusters import RayExecutor
 from verifai_jax.evaluation.evaluator import Evaluator
 
 TARGET = "specs/cartpole.py:balance"

@@ -10,7 +10,7 @@ from pathlib import Path
 import verifai_jax as vj
 from specs.cartpole import balance
 from specs.hopper import upright
-from verifai_jax import faults
+from verifai_jax.addons import faults
 
 PAGE = Path(__file__).parents[1] / "docs" / "own_equations.md"
 

@@ -22,7 +22,7 @@ import numpy as np
 from fmpy import extract, instantiate_fmu, read_model_description, simulate_fmu
 
 import verifai_jax as vj
-from verifai_jax.systems.fmu.exchange import TOLERANCE
+from verifai_jax.addons.simulators.fmu.exchange import TOLERANCE
 
 SECONDS = 0.1
 """CPU time of one turn, so that the clock's resolution does not matter."""

@@ -156,8 +156,8 @@ def frames(tiny):
 def training(tiny):
     """Measure PPO on the cart-pole, many learning rates side by side."""
     from envs.cartpole import CartPoleTask
-    from verifai_jax.rl import PPO
-    from verifai_jax.rl.batched_training import BatchedTraining, Configuration
+    from verifai_jax.addons.rl import PPO
+    from verifai_jax.addons.rl.batched_training import BatchedTraining, Configuration
 
     for count, steps in ((2, 1024),) if tiny else ((64, 32_768), (256, 32_768)):
 

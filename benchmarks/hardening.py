@@ -31,7 +31,7 @@ from specs.hopper import bodies, upright
 from specs.lane_keeping import learned
 from specs.mountain_car import climb_with, safe_training
 from specs.reacher import reach_with
-from verifai_jax.rl import PPO
+from verifai_jax.addons.rl import PPO
 from verifai_jax.statistics.paired import paired_difference
 
 WIDE = {

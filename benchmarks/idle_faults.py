@@ -12,8 +12,8 @@ import numpy as np
 
 import verifai_jax as vj
 from specs.cartpole import balance
-from verifai_jax import faults
-from verifai_jax.analysis.counterexamples.nominal import Nominal
+from verifai_jax.addons import faults
+from verifai_jax.counterexamples.nominal import Nominal
 from verifai_jax.evaluation.evaluator import Evaluator
 
 WINDOW = {"onset": vj.Box(0, 4), "duration": vj.Box(0, 4)}

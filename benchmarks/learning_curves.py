@@ -21,11 +21,11 @@ import numpy as np
 from benchmarks.control_tasks import Acrobot, Pendulum
 from envs.cartpole import CartPoleTask
 from envs.mountain_car import ContinuousMountainCarTask, MountainCarTask
-from verifai_jax.rl import PPO, evaluate
-from verifai_jax.rl.batched_training import BatchedTraining, Configuration
-from verifai_jax.rl.pqn import PQN
-from verifai_jax.rl.sac import SAC
-from verifai_jax.rl.task.task import Task
+from verifai_jax.addons.rl import PPO, evaluate
+from verifai_jax.addons.rl.batched_training import BatchedTraining, Configuration
+from verifai_jax.addons.rl.pqn import PQN
+from verifai_jax.addons.rl.sac import SAC
+from verifai_jax.addons.rl.task.task import Task
 
 
 @dataclass(frozen=True)

@@ -23,9 +23,9 @@ from throughput import GAINS, PERIOD, RANGES, STEPS, THETA_LIMIT, X_LIMIT
 
 import verifai_jax as vj
 from envs import cartpole
+from verifai_jax.addons.native.native_engine import FIRST, NativeEngine
 from verifai_jax.core.compute.keys import run_keys
 from verifai_jax.evaluation.engine import engine_for
-from verifai_jax.evaluation.native_engine import FIRST, NativeEngine
 
 KEY = run_keys(0)[1]
 HERE = Path(__file__).parent

@@ -32,7 +32,7 @@ def main() -> None:
     """Measure, and print a line for each way."""
     import verifai_jax as vj
     from verifai_jax import remote_client
-    from verifai_jax.systems.remote import remote
+    from verifai_jax.addons.simulators.remote import remote
 
     parser = argparse.ArgumentParser()
     parser.add_argument("--clients", type=int, default=2)

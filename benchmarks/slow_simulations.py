@@ -18,19 +18,19 @@ import numpy as np
 from scipy.special import ndtr, ndtri
 from scipy.stats import chi2, norm
 
-from verifai_jax.estimation import gaussian_surrogate, surrogate
-from verifai_jax.estimation.answers import (
+from verifai_jax.addons.estimation import gaussian_surrogate, surrogate
+from verifai_jax.addons.estimation.answers import (
     Plan,
     chains_for,
     estimate_by_monte_carlo,
     estimate_by_splitting,
 )
-from verifai_jax.estimation.methods import (
+from verifai_jax.addons.estimation.methods import (
     SHARE_OF_LEVEL,
     estimate_automatically,
     estimate_by_importance_sampling,
 )
-from verifai_jax.estimation.normal_space import LimitState
+from verifai_jax.addons.estimation.normal_space import LimitState
 
 ROOT = np.sqrt(2)
 

@@ -31,7 +31,7 @@ Training = Callable[[int], tuple[float, float]]
 def ours(task_name: str) -> Training:
     """Return our training by seed, which gives CPU seconds and the mean return of its policy."""
     from envs.cartpole import CartPoleTask
-    from verifai_jax.rl import PPO, evaluate, train
+    from verifai_jax.addons.rl import PPO, evaluate, train
 
     if task_name == "cartpole":
         task: Any = CartPoleTask()

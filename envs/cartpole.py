@@ -27,10 +27,10 @@ from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Int, Key
 
 from envs.randomisation import check_ranges, factor
+from verifai_jax.addons.rl import Discrete, Policy, load_policy
+from verifai_jax.addons.rl.algorithm import Number
+from verifai_jax.addons.rl.policy import Layers, scalar_network
 from verifai_jax.core.messages.errors import unknown_name
-from verifai_jax.rl import Discrete, Policy, load_policy
-from verifai_jax.rl.algorithm import Number
-from verifai_jax.rl.policy import Layers, scalar_network
 from verifai_jax.systems.ode import Ode, ode, sin_cos
 from verifai_jax.systems.ode.integrators import euler
 

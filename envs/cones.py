@@ -22,12 +22,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Key
 
-from verifai_jax.core.messages.errors import unknown_name
-from verifai_jax.core.values.trace import Trace
-from verifai_jax.features import Array as ArrayOf
-from verifai_jax.features import Box, Categorical
-from verifai_jax.perception import Box as BoxSolid
-from verifai_jax.perception import (
+from verifai_jax.addons.perception import Box as BoxSolid
+from verifai_jax.addons.perception import (
     Camera,
     Conditions,
     Cone,
@@ -39,6 +35,10 @@ from verifai_jax.perception import (
     hsv,
     load_detector,
 )
+from verifai_jax.core.messages.errors import unknown_name
+from verifai_jax.core.values.trace import Trace
+from verifai_jax.features import Array as ArrayOf
+from verifai_jax.features import Box, Categorical
 from verifai_jax.systems.base import System
 
 Features = Mapping[str, Any]

@@ -19,10 +19,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Key
 
+from verifai_jax.addons.rl import Continuous, Policy, load_policy
+from verifai_jax.addons.simulators.mujoco.bindings import Scaled
+from verifai_jax.addons.simulators.mujoco.system import MuJoCo, mujoco
 from verifai_jax.core.messages.errors import check_names, require
-from verifai_jax.rl import Continuous, Policy, load_policy
-from verifai_jax.systems.mujoco.bindings import Scaled
-from verifai_jax.systems.mujoco.system import MuJoCo, mujoco
 
 Scalar = Float[Array, ""]
 Controller = Callable[..., Float[Array, "3"]]

@@ -30,8 +30,8 @@ from jaxtyping import Array, Bool, Float, Int, Key
 
 from envs.arch.stepped import Stepped, real, value
 from envs.randomisation import check_ranges, factor
-from verifai_jax.rl import Continuous, Discrete, Policy, load_policy
-from verifai_jax.rl.algorithm import Number
+from verifai_jax.addons.rl import Continuous, Discrete, Policy, load_policy
+from verifai_jax.addons.rl.algorithm import Number
 from verifai_jax.systems.ode import sin_cos
 
 Features = Mapping[str, Any]

@@ -16,9 +16,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool
 
 from envs import cartpole as analytic
+from verifai_jax.addons.simulators.mujoco.loop import State
+from verifai_jax.addons.simulators.mujoco.system import MuJoCo, mujoco
 from verifai_jax.core.messages.errors import check_names
-from verifai_jax.systems.mujoco.loop import State
-from verifai_jax.systems.mujoco.system import MuJoCo, mujoco
 
 MODEL = Path(__file__).with_name("mujoco_cartpole.xml")
 

@@ -15,11 +15,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Key
 
+from verifai_jax.addons.rl import Continuous, Policy, load_policy
+from verifai_jax.addons.rl.task.mjx import MjxState, MjxTask, mjx_task
+from verifai_jax.addons.simulators.mujoco.bindings import Scaled
+from verifai_jax.addons.simulators.mujoco.system import MuJoCo, mujoco
 from verifai_jax.core.messages.errors import check_names
-from verifai_jax.rl import Continuous, Policy, load_policy
-from verifai_jax.rl.task.mjx import MjxState, MjxTask, mjx_task
-from verifai_jax.systems.mujoco.bindings import Scaled
-from verifai_jax.systems.mujoco.system import MuJoCo, mujoco
 
 Controller = Callable[..., Float[Array, "2"]]
 

@@ -10,7 +10,7 @@ import sys
 
 from envs.cartpole import POLICY_FILE, CartPoleTask
 from envs.training import Training
-from verifai_jax.rl import PPO
+from verifai_jax.addons.rl import PPO
 
 HYPER_PARAMETERS = PPO(
     learning_rate=5e-4,

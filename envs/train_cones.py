@@ -30,8 +30,8 @@ from envs.cones import (
     distance_of_nearest,
     render,
 )
+from verifai_jax.addons.perception import Detector, Labels, Score, score, train_detector
 from verifai_jax.features import Box, Categorical, FeatureSpace
-from verifai_jax.perception import Detector, Labels, Score, score, train_detector
 
 ROAD = {
     "ahead": Box(3.0, 36.0),
@@ -89,7 +89,7 @@ def quality(network: Detector, space: str, count: int = 3000, seed: int = 1) -> 
 
 def main(arguments: list[str] | None = None) -> int:
     """Train, test, write the weights, and return the exit status."""
-    from verifai_jax.perception import save_detector
+    from verifai_jax.addons.perception import save_detector
 
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawTextHelpFormatter

@@ -11,7 +11,7 @@ import sys
 
 from envs.hopper import POLICY_FILE, HopperTask
 from envs.training import Training
-from verifai_jax.rl import PPO
+from verifai_jax.addons.rl import PPO
 
 HYPER_PARAMETERS = PPO(
     learning_rate=5e-4,

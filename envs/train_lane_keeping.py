@@ -10,7 +10,7 @@ import sys
 
 from envs.lane_keeping import POLICY_FILE, LaneKeepingTask
 from envs.training import Training
-from verifai_jax.rl import PPO
+from verifai_jax.addons.rl import PPO
 
 HYPER_PARAMETERS = PPO(
     learning_rate=1e-3,

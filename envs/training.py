@@ -8,7 +8,7 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 
-from verifai_jax.rl import PPO, Task, evaluate, save_policy, train
+from verifai_jax.addons.rl import PPO, Task, evaluate, save_policy, train
 
 
 @dataclass(frozen=True)

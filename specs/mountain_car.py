@@ -12,7 +12,7 @@ gravity that differ from those the controller was made for. A step of the car co
 import verifai_jax as vj
 from envs.mountain_car import Controller, MountainCarTask, along, mountain_car, neural
 from envs.mountain_car_drawing import draw
-from verifai_jax.rl import PPO, PQN, Continuous, Policy
+from verifai_jax.addons.rl import PPO, PQN, Continuous, Policy
 
 NOMINAL = {"position0": -0.5, "velocity0": 0.0, "gravity": 0.0025, "velocity_bias": 0.0}
 starts = {"position0": vj.Box(-1.0, 0.2), "velocity0": vj.Box(-0.03, 0.03)}

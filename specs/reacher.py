@@ -5,7 +5,7 @@ verifai-jax falsify specs/reacher.py:reach
 
 import verifai_jax as vj
 from envs.reacher import NOMINAL, TOLERANCE, Controller, neural, reacher
-from verifai_jax.rl import Policy
+from verifai_jax.addons.rl import Policy
 
 space = vj.FeatureSpace(
     {

@@ -87,7 +87,7 @@ def paths_for(files: Iterable[str]) -> list[str]:
             if (ROOT / path).exists():
                 chosen.add(name if path.name.startswith("test_") else str(path.parent))
         elif path.parts[0] in ("envs", "specs"):
-            chosen |= {"tests/envs", "tests/rl"}
+            chosen |= {"tests/envs", "tests/addons/rl"}
         elif path.parts[0] == "docs" or path.suffix == ".md":
             chosen.add("tests/test_documents.py")
         elif path.parts[0] == "notebooks":

@@ -1,7 +1,7 @@
 """The type checker of the tests: beartype, which takes NumPy's numbers for Python's.
 
 check_first_calls()
-install_import_hook("verifai_jax.estimation", "checked_types.check")
+install_import_hook("verifai_jax.addons.estimation", "checked_types.check")
 with unchecked():
     estimate("no problem")          # the function's own message, not the checker's
 """

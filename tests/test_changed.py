@@ -7,8 +7,13 @@ LAWS = ["tests/test_architecture.py", "tests/test_language.py", "tests/test_publ
 
 
 def test_a_file_calls_for_its_room_and_for_those_that_import_it():
-    found = paths_for(["verifai_jax/reports/plotting/replay.py"])
-    assert found == ["tests/cli", "tests/reports", *LAWS, "tests/testing/traceability"]
+    found = paths_for(["verifai_jax/pictures/replay.py"])
+    assert found == [
+        "tests/cli",
+        "tests/addons/reports",
+        *LAWS,
+        "tests/addons/assurance/traceability",
+    ]
 
 
 def test_importers_go_through_others():
@@ -18,8 +23,8 @@ def test_importers_go_through_others():
 
 
 def test_a_file_that_is_gone_calls_for_all_that_its_room_does():
-    gone = set(paths_for(["verifai_jax/estimation/comparison/gone.py"]))
-    assert {"tests/estimation/comparison", "tests/cli"} <= gone
+    gone = set(paths_for(["verifai_jax/addons/estimation/comparison/gone.py"]))
+    assert {"tests/addons/estimation/comparison", "tests/cli"} <= gone
     assert "tests/mtl" not in gone
 
 
@@ -33,8 +38,8 @@ def test_a_file_that_is_gone_calls_for_all_that_its_room_does():
         ("pyproject.toml", ["tests"]),
         ("docs/formulas.md", ["tests/test_documents.py"]),
         ("README.md", ["tests/test_documents.py"]),
-        ("specs/cartpole.py", ["tests/envs", "tests/rl"]),
-        ("verifai_jax/remote_client.py", ["tests/systems/remote", *LAWS]),
+        ("specs/cartpole.py", ["tests/envs", "tests/addons/rl"]),
+        ("verifai_jax/remote_client.py", ["tests/addons/simulators/remote", *LAWS]),
         ("LICENSE", []),
     ],
 )

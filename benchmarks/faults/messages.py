@@ -20,8 +20,8 @@ import numpy as np
 
 from benchmarks.faults.cases import Broken, chance
 from verifai_jax import remote_client
+from verifai_jax.addons.simulators.remote._remote import Remote, remote
 from verifai_jax.core.values.trace import Status
-from verifai_jax.systems.remote._remote import Remote, remote
 
 TOKEN = "a secret of the fuzzer"
 CLIENTS = 4

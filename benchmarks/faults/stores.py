@@ -14,8 +14,8 @@ import pandas as pd
 import verifai_jax as vj
 from benchmarks.faults.cases import Broken, chance
 from benchmarks.faults.folders import NAMED, check_described, damage
-from tests.training.sweeps.drifting import drifting
-from verifai_jax.training.sweeps.study import Study
+from tests.addons.training.sweeps.drifting import drifting
+from verifai_jax.addons.training.sweeps.study import Study
 
 CONFIGURATIONS, SAMPLES = 3, 32
 

@@ -199,7 +199,7 @@ def test_another_model_has_no_finished_work(tmp_path, monkeypatch):
     monkeypatch.setenv("COUNTER", str(tmp_path / "counter"))
     (tmp_path / "spec.py").write_text(MODEL)
     words = ["estimate", "spec.py:old", "--method", "monte_carlo", "--budget", "200"]
-    from verifai_jax.cli import estimate
+    from verifai_jax.addons.estimation.commands import estimate
 
     real, ends = estimate.show_result, [KeyboardInterrupt]
 

@@ -15,13 +15,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import verifai_jax as vj
+from verifai_jax.addons.rl import batched_training
 from verifai_jax.core.compute.precision import in_precision
 from verifai_jax.evaluation.engine import Engine
 from verifai_jax.evaluation.evaluator import Evaluator
 from verifai_jax.evaluation.layout import chunks_and_lanes
 from verifai_jax.mtl import _robustness as lane_chunks
 from verifai_jax.mtl import parallel, sequential, windows
-from verifai_jax.rl import batched_training
 
 ROOT = Path(__file__).parents[2]
 
@@ -84,7 +84,7 @@ def test_an_accelerator_trains_many_at_a_time():
 
 CODE = """
 import json, sys, zlib
-sys.path[:0] = ["tests/core", "tests/training/sweeps"]
+sys.path[:0] = ["tests/core", "tests/addons/training/sweeps"]
 import jax, numpy as np
 import verifai_jax as vj
 from test_machines import LINE

@@ -58,17 +58,17 @@ def test_results_show_themselves(problem, run):
 
 
 def test_results_of_every_verb_show_themselves():
-    from verifai_jax import analysis, synthesis
-    from verifai_jax.analysis import counterexamples
+    from verifai_jax import counterexamples
+    from verifai_jax.addons import analysis, synthesis
+    from verifai_jax.addons.estimation.certification.result import Certificate
+    from verifai_jax.addons.estimation.comparison.result import Transfer
+    from verifai_jax.addons.estimation.sequence_result import SequenceEstimate
+    from verifai_jax.addons.faults.failure_table.result import FailureTable
+    from verifai_jax.addons.perception.training import Score
+    from verifai_jax.addons.training.hardening.result import Hardening
+    from verifai_jax.addons.training.sweeps.importance import HyperparameterImportance
     from verifai_jax.core.display.notebook import InNotebook
-    from verifai_jax.estimation.certification.result import Certificate
-    from verifai_jax.estimation.comparison.result import Transfer
-    from verifai_jax.estimation.sequence_result import SequenceEstimate
-    from verifai_jax.faults.failure_table.result import FailureTable
-    from verifai_jax.perception.training import Score
     from verifai_jax.testing.checking.check import CheckOutcome
-    from verifai_jax.training.hardening.result import Hardening
-    from verifai_jax.training.sweeps.importance import HyperparameterImportance
 
     verbs = [vj.Estimate, vj.Modes, vj.Comparison, vj.Certificates, vj.Augmentation]
     verbs += [vj.Synthesis, vj.Repair, vj.Confirmation, vj.Confirmations, vj.FuzzRun]

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 import verifai_jax as vj
+from verifai_jax.addons.rl import Continuous, Policy
 from verifai_jax.core.store.atomic_files import append, replacing, unwritable
-from verifai_jax.reports.plotting.style import new_figure, show_or_save
-from verifai_jax.rl import Continuous, Policy
+from verifai_jax.pictures.style import new_figure, show_or_save
 
 
 def test_a_file_is_replaced_once_it_is_whole(tmp_path):

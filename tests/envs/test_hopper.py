@@ -12,9 +12,9 @@ import verifai_jax as vj
 from envs import hopper as h
 from envs import train_hopper, training
 from specs import hopper as specs
+from verifai_jax.addons.rl import Discrete, Training, evaluate, load_policy, policy_notes
 from verifai_jax.core.messages.errors import UnknownNameError
 from verifai_jax.evaluation.replay import replay
-from verifai_jax.rl import Discrete, Training, evaluate, load_policy, policy_notes
 
 KEY = jax.random.key(0)
 PROBLEMS = ("upright", "gusts", "advances")  # that of "familiar" is that of "upright"

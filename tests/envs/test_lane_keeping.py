@@ -9,10 +9,10 @@ import verifai_jax as vj
 from envs import lane_keeping as lk
 from envs.lane_keeping_drawing import draw
 from specs import lane_keeping as specs
+from verifai_jax.addons.rl import Continuous, Discrete, Policy, evaluate, load_policy, policy_notes
+from verifai_jax.addons.rl.policy import new_layers
 from verifai_jax.core.values.waveform import Waveform
-from verifai_jax.reports.plotting.style import new_figure
-from verifai_jax.rl import Continuous, Discrete, Policy, evaluate, load_policy, policy_notes
-from verifai_jax.rl.policy import new_layers
+from verifai_jax.pictures.style import new_figure
 from verifai_jax.search import PointList
 
 KEY = jax.random.key(0)

@@ -9,8 +9,8 @@ from gymnasium.envs.classic_control import continuous_mountain_car
 
 from envs import mountain_car as mc
 from specs.mountain_car import climb, climb_continuous, climb_with
+from verifai_jax.addons.rl import Continuous, Discrete, Policy, evaluate
 from verifai_jax.evaluation.verdicts import trace_verdict
-from verifai_jax.rl import Continuous, Discrete, Policy, evaluate
 
 KEY = jax.random.key(0)
 STEPS = 400

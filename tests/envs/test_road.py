@@ -14,7 +14,7 @@ from envs import road
 from envs.road import scenarios
 from specs import road as specs
 from verifai_jax.core.values.waveform import Waveform
-from verifai_jax.reports.plotting.style import new_figure
+from verifai_jax.pictures.style import new_figure
 from verifai_jax.search import PointList
 
 KEY = jax.random.key(0)

@@ -12,7 +12,7 @@ import verifai_jax as vj
 from envs.road import CAR
 from envs.road import tempe as model
 from specs import tempe as specs
-from verifai_jax.reports.plotting.style import new_figure
+from verifai_jax.pictures.style import new_figure
 
 KEY = jax.random.key(0)
 NAMES = tuple(specs.space.domains)

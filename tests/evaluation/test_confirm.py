@@ -12,10 +12,10 @@ from checked_types import unchecked
 from click.testing import CliRunner
 
 import verifai_jax as vj
-from verifai_jax.analysis.counterexamples._confirm import confirm
 from verifai_jax.core.compute.keys import run_keys
 from verifai_jax.core.messages.errors import UnknownNameError
 from verifai_jax.core.values.trace import Trace
+from verifai_jax.counterexamples._confirm import confirm
 from verifai_jax.evaluation.confirmations import VERDICTS, Confirmations
 from verifai_jax.evaluation.confirmer import Confirmer
 from verifai_jax.evaluation.replay import replay

@@ -7,14 +7,14 @@ import numpy as np
 import pytest
 
 import verifai_jax as vj
-from verifai_jax.analysis.counterexamples.selection import select_row
+from verifai_jax.addons.reports.run_findings import number_rows
+from verifai_jax.addons.reports.view import view_data
 from verifai_jax.cli.json_output import describe_run
+from verifai_jax.counterexamples.selection import select_row
 from verifai_jax.evaluation import confirmer
 from verifai_jax.evaluation.confirmations import UNDECIDED, VERDICTS
-from verifai_jax.reports.plotting.robustness_history import plot_robustness_history
-from verifai_jax.reports.plotting.scatter import plot_features
-from verifai_jax.reports.run_findings import number_rows
-from verifai_jax.reports.view import view_data
+from verifai_jax.pictures.robustness_history import plot_robustness_history
+from verifai_jax.pictures.scatter import plot_features
 from verifai_jax.systems.base import System
 
 SPACE = {"a": vj.Box(0.0, 1.0), "b": vj.Box(-1.0, 1.0)}

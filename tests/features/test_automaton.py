@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from checked_types import unchecked
 
-from verifai_jax.analysis.data.columns import feature_columns
+from verifai_jax.addons.analysis.data.columns import feature_columns
 from verifai_jax.features import Array, Box, Categorical, DiscreteBox, FeatureSpace, Signal
 from verifai_jax.features.events import Automaton, Events, Past
 from verifai_jax.testing import check_domain

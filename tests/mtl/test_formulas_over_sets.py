@@ -7,8 +7,8 @@ from hypothesis import strategies as st
 from mtl_oracle import formulas
 
 import verifai_jax as vj
+from verifai_jax.addons.verification.enclosure import Enclosure
 from verifai_jax.evaluation.evaluator import Evaluator
-from verifai_jax.verification.enclosure import Enclosure
 
 
 def recorded(f, key):

@@ -186,7 +186,7 @@ def on_cluster(address: str | None) -> "Iterator[Executor | None]":
     if address is None:
         yield None
         return
-    from verifai_jax.evaluation.clusters import connect
+    from verifai_jax.addons.clusters import connect
 
     try:
         held = contextlib.ExitStack()

@@ -194,7 +194,7 @@ def print_run(
         click.echo(f"  resume       {again}")
     click.echo(f"  table        {run.table_path}")
     if pictures and run.simulations:
-        from verifai_jax.reports.plotting import write_run_pictures
+        from verifai_jax.pictures import write_run_pictures
 
         for path in write_run_pictures(run, run.folder):
             click.echo(f"  picture      {path}")

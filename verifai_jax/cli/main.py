@@ -18,35 +18,35 @@ from typing import Any
 import click
 
 from verifai_jax._version import __version__
-from verifai_jax.cli.analyze import analyze
-from verifai_jax.cli.compare import compare
+from verifai_jax.addons.agents.mcp import mcp
+from verifai_jax.addons.analysis.command import analyze
+from verifai_jax.addons.assurance.commands.qualify import qualify
+from verifai_jax.addons.assurance.commands.trace import trace
+from verifai_jax.addons.estimation.commands.compare import compare
+from verifai_jax.addons.estimation.commands.estimate import estimate
+from verifai_jax.addons.estimation.commands.modes import modes
+from verifai_jax.addons.estimation.commands.trials import trials
+from verifai_jax.addons.faults.command import fmea
+from verifai_jax.addons.fuzzing.command import fuzz
+from verifai_jax.addons.monitoring.commands.formula import formula
+from verifai_jax.addons.monitoring.commands.monitor import monitor
+from verifai_jax.addons.reports.command import report
+from verifai_jax.addons.synthesis.commands.repair import repair
+from verifai_jax.addons.synthesis.commands.synthesize import synthesize
+from verifai_jax.addons.training.commands.harden import harden
+from verifai_jax.addons.training.commands.sweep import sweep
+from verifai_jax.addons.verification.command import verify
 from verifai_jax.cli.confirm import confirm
 from verifai_jax.cli.counterexamples import replay_counterexamples, save_counterexamples
 from verifai_jax.cli.doctor import doctor
-from verifai_jax.cli.estimate import estimate
 from verifai_jax.cli.exit_codes import CLOSED_PIPE, EPILOG, INTERRUPTED, CommandError, command_error
 from verifai_jax.cli.explain import explain
 from verifai_jax.cli.falsify import falsify
-from verifai_jax.cli.fmea import fmea
-from verifai_jax.cli.formula import formula
-from verifai_jax.cli.fuzz import fuzz
 from verifai_jax.cli.going_on import WORDS
-from verifai_jax.cli.harden import harden
 from verifai_jax.cli.list import list_targets
-from verifai_jax.cli.mcp import mcp
-from verifai_jax.cli.modes import modes
-from verifai_jax.cli.monitor import monitor
 from verifai_jax.cli.new import new
-from verifai_jax.cli.qualify import qualify
-from verifai_jax.cli.repair import repair
 from verifai_jax.cli.replay import replay
-from verifai_jax.cli.report import report
 from verifai_jax.cli.shrink import shrink
-from verifai_jax.cli.sweep import sweep
-from verifai_jax.cli.synthesize import synthesize
-from verifai_jax.cli.trace import trace
-from verifai_jax.cli.trials import trials
-from verifai_jax.cli.verify import verify
 from verifai_jax.core.messages.errors import unknown_name
 
 COMMANDS = (

@@ -36,7 +36,7 @@ def replay(
 ) -> None:
     """Simulate a ROW (by default the worst) of the run in RUN again, and draw it."""
     from verifai_jax.core.messages.text import one_line, printable
-    from verifai_jax.reports.plotting import write_replay_pictures
+    from verifai_jax.pictures import write_replay_pictures
 
     run = (arguments.load_judged_run if row is None else arguments.load_run)(folder, target)
     number = int(run.best.name) if row is None else row  # pyright: ignore[reportArgumentType]

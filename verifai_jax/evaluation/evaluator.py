@@ -26,11 +26,11 @@ from verifai_jax.evaluation.verdicts import Verdicts
 from verifai_jax.problem.problem import Problem
 
 if TYPE_CHECKING:
+    from verifai_jax.addons.native.native_engine import NativeEngine
     from verifai_jax.core.compute.executors import Executor
     from verifai_jax.evaluation.executor_engine import ExecutorEngine, Pending
     from verifai_jax.evaluation.host_engine import HostEngine
     from verifai_jax.evaluation.journal import Journal
-    from verifai_jax.evaluation.native_engine import NativeEngine
     from verifai_jax.evaluation.unfinished import Part
 NOT_NATIVE = (
     "simulated without native code, which supports only systems that JAX traces, in single "
@@ -115,7 +115,7 @@ class Evaluator:
             )
             wanted = engine == "native" or (engine == "auto" and budget > FIRST)
             if wanted and precision == "float32" and keep_traces is False:
-                from verifai_jax.evaluation import native_engine
+                from verifai_jax.addons.native import native_engine
 
                 self.engine = self._native = native_engine.NativeEngine(compiled, engine, budget)
         self._not_native = ()

@@ -123,9 +123,7 @@ class Replay(InNotebook):
         - `signals`: signals, and features that are Signals, to draw; by default a selection.
         **Raises:** `UnknownNameError` for a signal that does not exist.
         """
-        return lazy_import("verifai_jax.reports.plotting.replay", "plot_replay")(
-            self, path, signals
-        )
+        return lazy_import("verifai_jax.pictures.replay", "plot_replay")(self, path, signals)
 
     def animate(
         self,
@@ -146,7 +144,7 @@ class Replay(InNotebook):
         **Raises:** `ValueError` for a problem without `draw`, without a MuJoCo model and without a
         Gymnasium environment; `UnknownNameError` for a camera that the model lacks.
         """
-        draw = lazy_import("verifai_jax.reports.plotting.animation", "animate")
+        draw = lazy_import("verifai_jax.pictures.animation", "animate")
         return draw(self, path, camera=camera, size=size, fps=fps)
 
 

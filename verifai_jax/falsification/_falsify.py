@@ -57,10 +57,10 @@ from verifai_jax.search import Search
 if TYPE_CHECKING:
     import pandas as pd
 
+    from verifai_jax.addons.verification import Verification
     from verifai_jax.core.compute.executors import Executor
     from verifai_jax.features.given import Rows
     from verifai_jax.statistics.stopping import StoppingRule
-    from verifai_jax.verification import Verification
 
 
 @suggests_options
@@ -169,7 +169,7 @@ def falsify(
     ends = Ending(started, budget, max_seconds, stop_after, stop_when)
     of_rest: tuple[str, ...] = ()
     if proved is not None:
-        from verifai_jax.verification.result import as_verification
+        from verifai_jax.addons.verification.result import as_verification
 
         proved = as_verification(proved)
         problem, of_rest = proved.rest(problem, precision), (proved.note,)

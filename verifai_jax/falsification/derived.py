@@ -26,9 +26,7 @@ def as_simulated(problem: Problem, record: Mapping[str, Any]) -> Problem:
     if derived is None or problem.system.derived is not None:
         return problem
     try:
-        return lazy_import("verifai_jax.falsification.fuzzing.implicit", "as_recorded")(
-            problem, derived
-        )
+        return lazy_import("verifai_jax.addons.fuzzing.implicit", "as_recorded")(problem, derived)
     except (TypeError, ValueError, AttributeError, KeyError):
         return problem  # What differs is said where the two are compared.
 

@@ -314,7 +314,7 @@ class Run(InNotebook):
 
     def analyze(self, **options: Any) -> Any:
         """Analyse the table: rules, importance, clusters, coverage; see `analysis.analyze`."""
-        return lazy_import("verifai_jax.analysis", "analyze")(self, **options)
+        return lazy_import("verifai_jax.addons.analysis", "analyze")(self, **options)
 
     def replay(
         self, row: "int | np.integer | pd.Series | Mapping[str, Any]", precision: str | None = None
@@ -397,7 +397,7 @@ class Run(InNotebook):
           `budget`.
         **Raises:** `ValueError` for a run without its problem or without a counterexample.
         """
-        return lazy_import("verifai_jax.analysis.counterexamples", "save_counterexamples")(
+        return lazy_import("verifai_jax.counterexamples", "save_counterexamples")(
             self, folder, **options
         )
 
@@ -407,7 +407,7 @@ class Run(InNotebook):
 
     def plot(self, path: str | Path | None = None) -> Any:
         """Draw the feature space with safe and failing samples; returns the figure."""
-        return lazy_import("verifai_jax.reports.plotting.scatter", "plot_features")(self, path)
+        return lazy_import("verifai_jax.pictures.scatter", "plot_features")(self, path)
 
     def report(self, path: str | Path, **options: Any) -> Path:
         """Write the evidence report of the run: an HTML file, with its claims as JSON next to it.
@@ -418,7 +418,7 @@ class Run(InNotebook):
           `traces`, `studies`, `modes`, `odd`, `assessment`.
         **Returns:** the path.
         """
-        return lazy_import("verifai_jax.reports", "write_report")(self, path, **options)
+        return lazy_import("verifai_jax.addons.reports", "write_report")(self, path, **options)
 
     def explore(self) -> Any:
         """Return a view of the table for a notebook: scatter, parallel coordinates, traces.
@@ -426,7 +426,7 @@ class Run(InNotebook):
         Hovering over a row shows its values; clicking on it simulates it again. It needs anywidget
         (extra `widget`); without it the result is the picture of `plot`.
         """
-        return lazy_import("verifai_jax.reports", "explore")(self)
+        return lazy_import("verifai_jax.addons.reports", "explore")(self)
 
     def save(self, path: str | Path) -> Path:
         """Write the run to a folder: its record, table and state; returns the folder.

@@ -147,7 +147,7 @@ def as_made(run: Run) -> Run:
     return (
         run
         if run.derived is None
-        else lazy_import("verifai_jax.falsification.fuzzing.run", "as_fuzz_run")(run)
+        else lazy_import("verifai_jax.addons.fuzzing.run", "as_fuzz_run")(run)
     )
 
 

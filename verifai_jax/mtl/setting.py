@@ -10,11 +10,11 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float, Real
 
+from verifai_jax.addons.monitoring.columns import LeftOut
 from verifai_jax.core.messages.errors import missing_name
 from verifai_jax.core.messages.text import format_seconds, format_time
 from verifai_jax.core.values.trace import Samples, Trace, as_array, check_period
 from verifai_jax.mtl._parse import parse
-from verifai_jax.mtl.columns import LeftOut
 from verifai_jax.mtl.evaluate import End, Evaluator
 from verifai_jax.mtl.expression import durations_in
 from verifai_jax.mtl.formula import Formula

@@ -247,7 +247,7 @@ class Problem(InNotebook):
         one; `ValueError` for a name that exists already, a fault that a channel cannot have, and a
         system whose loop is not known.
         """
-        function = lazy_import("verifai_jax.faults.injection", "with_faults")
+        function = lazy_import("verifai_jax.addons.faults.injection", "with_faults")
         return function(self, faults, by_simulator)
 
     def objective(

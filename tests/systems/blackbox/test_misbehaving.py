@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 import verifai_jax as vj
+from verifai_jax.addons.simulators.remote import wire
 from verifai_jax.core.values.trace import Status, Trace
 from verifai_jax.remote_client import answer
 from verifai_jax.systems.base import Outcome, outcome_of
 from verifai_jax.systems.blackbox import blackbox, workers
-from verifai_jax.systems.remote import wire
 
 SPACE = {"a": vj.Box(0, 2)}
 

@@ -21,7 +21,7 @@ else:
 class Drawn:
     """A result that has a picture.
 
-    - `_picture`: a module of `verifai_jax.reports.plotting`, and its drawing function.
+    - `_picture`: a module of `verifai_jax.pictures`, and its drawing function.
     """
 
     _picture: ClassVar[tuple[str, str]]
@@ -34,7 +34,7 @@ class Drawn:
         **Returns:** the Matplotlib figure.
         """
         module, function = self._picture
-        return lazy_import(f"verifai_jax.reports.plotting.{module}", function)(self, path)
+        return lazy_import(f"verifai_jax.pictures.{module}", function)(self, path)
 
 
 class Reported:
@@ -52,7 +52,7 @@ class Reported:
           comparison also `errors`.
         **Returns:** the path of the HTML file.
         """
-        return lazy_import("verifai_jax.reports", "write_report")(self, path, **options)
+        return lazy_import("verifai_jax.addons.reports", "write_report")(self, path, **options)
 
 
 def new_figure(**options: Any) -> Figure:

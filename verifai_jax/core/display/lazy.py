@@ -1,6 +1,6 @@
 """Late binding: names that are imported when they are first used.
 
-    plot_replay = lazy_import("verifai_jax.reports.plotting.replay", "plot_replay")
+    plot_replay = lazy_import("verifai_jax.pictures.replay", "plot_replay")
     plot_replay(replay, path)                           # the module is imported now, not before
 
 Results are in a lower room than their pictures and analyses. Their methods use these through

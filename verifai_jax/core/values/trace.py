@@ -188,7 +188,7 @@ class Trace(InNotebook):
         **Raises:** `ValueError` for a frame without rows, numbers or sample times, and for times
         that do not increase.
         """
-        read = lazy_import("verifai_jax.mtl.recording", "read")
+        read = lazy_import("verifai_jax.addons.monitoring.recording", "read")
         return read(frame, time=time, dt=dt, time_unit=time_unit)
 
     @property

@@ -1,0 +1,90 @@
+"""Functions that train, of any framework: each call in a process of its own."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from drifting import Point
+from numpy_training import study, sweep, train, train_anew
+
+import verifai_jax as vj
+from verifai_jax.addons.training.sweeps import StudyError
+from verifai_jax.addons.training.sweeps.function_runs import FunctionRuns
+
+HERE = Path(__file__).parent
+
+
+def numbers(found):
+    return {n: c.astype(str) for n, c in found.record.columns.items() if n != "training_seconds"}
+
+
+def check_same_tables(one, other):
+    for name, column in numbers(one).items():
+        np.testing.assert_array_equal(column, numbers(other)[name], err_msg=name)
+
+
+def test_what_is_wrong_is_said_before_anything_trains():
+    with pytest.raises(StudyError, match=r"train is a training function: give example="):
+        vj.Trainer(train, steps=8)
+    with pytest.raises(StudyError, match=r"must be train\(key, hyperparameters, steps=\.\.\."):
+        vj.Trainer(lambda key, values: None, steps=8, example=lambda o: o)
+    with pytest.raises(StudyError, match="example belongs to a function that trains"):
+        vj.Trainer(Point(), example=lambda o: o)
+
+    def inner(key, hyperparameters, steps):
+        return None
+
+    trainer = vj.Trainer(inner, steps=8, example=lambda o: o[:1])
+    with pytest.raises(StudyError, match="inner runs in processes of its own"):
+        trainer.check(study(train).space)
+    study(train).check()
+    assert "trains: train, 8 steps" in str(study(train))
+
+
+def test_a_policy_of_another_form_than_the_examples():
+    trained = vj.policy(HERE.parents[2] / "rl" / "policies" / "files" / "mlp.onnx")
+    for size, words in ((2, None), (3, "actions of shape [2], and example= of the trainer, with")):
+        trainer = vj.Trainer(train, steps=8, example=lambda o, size=size: jnp.zeros(size))
+        why = FunctionRuns._why_not_of_the_form(SimpleNamespace(_trainer=trainer), trained)
+        assert why is None if words is None else words in why
+
+
+@pytest.mark.slow
+def test_killed_and_resumed_it_is_the_undisturbed_table(tmp_path):
+    # Three sweeps of four processes each.
+    undisturbed = sweep(train)
+    assert undisturbed.record.complete
+    assert len(undisturbed.table) == 4
+    assert set(undisturbed.table["verdict"]) <= {"safe@0.01", "unsafe", "undecided"}
+    assert undisturbed.table["nominal_return"].notna().all()
+    environment = {**os.environ, "PYTHONPATH": f"{HERE.parents[3]}:{HERE}", "KILL_ONCE": "once"}
+    script = HERE / "numpy_training.py"
+    killed = subprocess.run([sys.executable, script], cwd=tmp_path, env=environment, check=False)
+    assert killed.returncode == -9
+    resumed = sweep(train, tmp_path / "killed")
+    assert resumed.reuse["train"] == (2, 4)
+    check_same_tables(undisturbed, resumed)
+    assert not list((tmp_path / "killed" / "trainings").glob("*"))
+    # Stored, loaded again, and drawn as all sweeps are.
+    resumed.save(tmp_path / "stored")
+    loaded = vj.load_sweep(tmp_path / "stored")
+    observation = jnp.array([0.3, 1.0])
+    for row in range(len(loaded.table)):
+        one, other = (each.policy(row).act(observation) for each in (resumed, loaded))
+        np.testing.assert_array_equal(one, other)
+    assert "best" in str(loaded)
+    assert loaded.plot() is not None
+
+
+@pytest.mark.slow
+def test_one_that_cannot_resume_trains_anew_and_one_that_raises_is_a_row(caplog):
+    found = sweep(train_anew)
+    assert "train_anew has no argument resume: it trains anew up to each checkpoint" in caplog.text
+    wrong = found.table[found.table["rate"] == 0.5]
+    assert all("the rate is too great" in status for status in wrong["status"])
+    assert (found.table.loc[found.table["rate"] < 0.5, "status"] == "trained").all()

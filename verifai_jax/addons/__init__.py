@@ -1,0 +1,1 @@
+"""Add-ons: each a small house that uses the core as a stranger would."""

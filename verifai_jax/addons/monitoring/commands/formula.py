@@ -1,0 +1,176 @@
+"""`verifai-jax formula lint "always speed < 30" logs/`: checks for mistakes in a formula."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+import click
+
+from verifai_jax.addons.monitoring.commands.monitor_fleet import load_requirements
+from verifai_jax.cli import arguments
+from verifai_jax.cli.arguments import PATH, option
+from verifai_jax.cli.gates import Gate, check_gate, fail_on
+from verifai_jax.cli.json_output import command, give_result, show_result
+
+if TYPE_CHECKING:
+    from verifai_jax import Formula
+End = Literal["hold", "truncate"]
+FILES = click.argument("recordings", metavar="[RECORDING]...", nargs=-1, type=PATH)
+"""Recordings: files, or folders of them."""
+ASKED = arguments.all_of(
+    option("--problem", metavar="FILE.py:NAME", help="A problem, instead of recordings."),
+    option(
+        "--end",
+        type=click.Choice(["hold", "truncate"]),
+        default="hold",
+        help="How a trace continues after the last sample.",
+    ),
+    arguments.NAMES,
+)
+"""Where signals are from besides recordings, and the names that a formula may use."""
+
+
+@click.group()
+def formula() -> None:
+    """Check formulas for mistakes, and find formulas to start from."""
+
+
+@command()
+@click.argument("formula")
+@FILES
+@option("--unit", "units", multiple=True, metavar="SIGNAL=UNIT", help="Unit of a signal.")
+@ASKED
+@fail_on(finding="if anything is suspicious")
+def lint(
+    formula: str,
+    recordings: tuple[Path, ...],
+    units: tuple[str, ...],
+    problem: str | None,
+    end: End,
+    constants: tuple[str, ...],
+    definitions: tuple[str, ...],
+    fail_on: Gate | None,
+) -> None:
+    """Find what is suspicious about FORMULA, or a file of requirements: parts that never hold, are
+    never near, or have no effect, units that do not go together, windows beyond the recordings.
+    """
+    from verifai_jax import mtl
+
+    requirements = load_requirements(formula, *arguments.read_names(constants, definitions))
+    named = dict(arguments.split_pairs("--unit", units))
+    found = mtl.lint(requirements, _signals(recordings, problem), units=named, end=end)
+    show_result(found, None, "recordings", "unread")
+    give_result(findings=[finding._asdict() for finding in found])
+    check_gate(fail_on, {"finding": bool(found)})
+
+
+@command()
+@click.argument("formula")
+@FILES
+@ASKED
+@arguments.SEED
+@fail_on(survivor="if a mutant survives")
+def mutants(
+    formula: str,
+    recordings: tuple[Path, ...],
+    problem: str | None,
+    end: End,
+    constants: tuple[str, ...],
+    definitions: tuple[str, ...],
+    seed: int,
+    fail_on: Gate | None,
+) -> None:
+    """Change FORMULA in one point at a time, and see which changes no recording notices."""
+    from verifai_jax import mtl
+
+    parsed = _parsed(formula, constants, definitions)
+    found = mtl.mutants(parsed, _signals(recordings, problem), end=end, seed=seed)
+    show_result(found, None, "recordings", "table")
+    check_gate(fail_on, {"survivor": bool(found.surviving)})
+
+
+@command()
+@click.argument("one")
+@click.argument("other")
+@FILES
+@ASKED
+@option("--budget", default=2000, help="Maximum simulations of a problem.")
+@arguments.SEED
+@arguments.PLOT
+@fail_on(apart="if a trace tells the formulas apart")
+def distinguish(
+    one: str,
+    other: str,
+    recordings: tuple[Path, ...],
+    problem: str | None,
+    constants: tuple[str, ...],
+    definitions: tuple[str, ...],
+    plot: Path | None,
+    fail_on: Gate | None,
+    **options: Any,
+) -> None:
+    """Find a trace on which one of the formulas ONE and OTHER holds, and the other does not."""
+    from verifai_jax import mtl
+
+    first, second = (_parsed(text, constants, definitions) for text in (one, other))
+    found = mtl.distinguish(first, second, _signals(recordings, problem), **options)
+    show_result(found, plot if found else None, "source", "holds", "robustness", "tried")
+    check_gate(fail_on, {"apart": bool(found)})
+
+
+@command()
+@click.argument("formula")
+@FILES
+@ASKED
+@option("--dt", type=float, help="Sampling period of the traces in seconds.")
+@option("--duration", type=float, help="Duration of the traces in seconds.")
+@arguments.SEED
+@arguments.PLOT
+def examples(
+    formula: str,
+    recordings: tuple[Path, ...],
+    problem: str | None,
+    constants: tuple[str, ...],
+    definitions: tuple[str, ...],
+    plot: Path | None,
+    **options: Any,
+) -> None:
+    """Find a trace that satisfies FORMULA, one that barely does, and one that breaks it.
+
+    Their signals move in the range of the recordings, if any are given.
+    """
+    from verifai_jax import mtl
+
+    parsed = _parsed(formula, constants, definitions)
+    found = mtl.examples(parsed, _signals(recordings, problem), **options)
+    show_result(found, plot, "robustness")
+
+
+@command()
+@click.argument("words", nargs=-1)
+@option("--domain", help="Domain, such as driving, flight, medical or power.")
+def templates(words: tuple[str, ...], domain: str | None) -> None:
+    """Print the requirements of the library that have all WORDS, with their sources and units."""
+    from verifai_jax import mtl
+
+    found = mtl.templates(" ".join(words), domain)
+    click.echo("\n\n".join(map(str, found)) or "no template has all of these words")
+    give_result(templates=found)
+
+
+for _command in (lint, mutants, distinguish, examples, templates):
+    formula.add_command(_command)
+
+
+def _parsed(text: str, constants: tuple[str, ...], definitions: tuple[str, ...]) -> "Formula":
+    from verifai_jax import mtl
+
+    return mtl.parse(text, *arguments.read_names(constants, definitions))
+
+
+def _signals(recordings: tuple[Path, ...], problem: str | None) -> Any:
+    """Return the source of signals: recordings, a problem, or neither."""
+    if problem is not None:
+        if recordings:
+            raise click.UsageError("give either recordings or --problem, and not both")
+        return arguments.load_problem(problem)
+    return recordings or None

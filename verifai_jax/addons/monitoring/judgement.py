@@ -1,0 +1,290 @@
+"""The verdicts of many requirements on many recordings, and statistics over the fleet."""
+
+import functools
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+from xml.etree import ElementTree
+
+import numpy as np
+
+from verifai_jax.core.display.lazy import lazy_import
+from verifai_jax.core.display.notebook import InNotebook, frame_html
+from verifai_jax.core.messages.text import counted, printable, shorten
+from verifai_jax.core.store.atomic_files import replacing
+from verifai_jax.core.user_code.sources import Source
+from verifai_jax.mtl.requirements import Requirement
+
+if TYPE_CHECKING:
+    import pandas as pd
+SHARES = (0.0, 0.05, 0.25, 0.5, 0.75, 0.95, 1.0)
+SHOWN = 10
+"""Rows of each kind that the summary lists."""
+MIN_RECORDINGS = 5
+"""Recordings that outliers are sought among, at least."""
+
+
+class Row(NamedTuple):
+    """One requirement on one recording.
+
+    - `verdict`: `"holds"`, `"fails"`, or empty without a verdict.
+    - `instant`: time of the deciding sample in seconds; NaN if there is none.
+    - `explanation`: the predicate that decides at that time, with its margin.
+    - `error`: the reason why there is no verdict.
+    - `note`: what to know of the recording and the verdict: a hole, or what the requirement says
+      otherwise than it seems to, of a recording this long.
+    - `unit`: unit of the robustness as recorded, or else that of the requirement.
+    """
+
+    file: str
+    requirement: str
+    verdict: str = ""
+    robustness: float = math.nan
+    instant: float = math.nan
+    explanation: str = ""
+    error: str = ""
+    note: str = ""
+    unit: str = ""
+
+
+@dataclass(frozen=True)
+class Judgement(InNotebook):
+    """The verdicts of requirements on recordings; `str()` writes the summary.
+
+    **Fields:** `requirements`; `rows`, one for each recording and requirement; `inputs`, the files
+    of recordings and requirements with their hashes as they were read.
+    """
+
+    requirements: tuple[Requirement, ...]
+    rows: tuple[Row, ...] = field(repr=False)
+    inputs: tuple[Source, ...] = field(default=(), repr=False)
+
+    @functools.cached_property
+    def table(self) -> "pd.DataFrame":
+        """A row for each recording and requirement; its columns are the fields of `Row`."""
+        import pandas as pd
+
+        return pd.DataFrame(list(self.rows), columns=list(Row._fields))
+
+    @property
+    def files(self) -> tuple[str, ...]:
+        """The names of the recordings."""
+        return tuple(dict.fromkeys(row.file for row in self.rows))
+
+    @property
+    def failing(self) -> tuple[Row, ...]:
+        """The rows whose requirement fails, by increasing robustness."""
+        rows = [row for row in self.rows if row.verdict == "fails"]
+        return tuple(sorted(rows, key=lambda row: row.robustness))
+
+    @property
+    def without_verdict(self) -> tuple[Row, ...]:
+        """The rows without a verdict."""
+        return tuple(row for row in self.rows if not row.verdict)
+
+    @property
+    def all_hold(self) -> bool:
+        """True if every requirement has a verdict on every recording and holds."""
+        return not self.failing and not self.without_verdict
+
+    def of(self, requirement: str) -> list[Row]:
+        """Return the rows of a requirement that have a verdict."""
+        return [row for row in self.rows if row.requirement == requirement and row.verdict]
+
+    def unit_of(self, requirement: Requirement) -> str:
+        """Return the unit of a requirement's robustness; empty if recordings have several."""
+        units = {row.unit for row in self.of(requirement.id)} or {requirement.unit}
+        return units.pop() if len(units) == 1 else ""
+
+    @property
+    def tightest(self) -> Row | None:
+        """The row nearest to the limit of its requirement, or farthest beyond it.
+
+        Requirements have different units, so each robustness is divided by the median absolute
+        robustness of its requirement over the fleet. None if no robustness is finite.
+        """
+        best, lowest = None, math.inf
+        for each in self.requirements:
+            rows = [row for row in self.of(each.id) if math.isfinite(row.robustness)]
+            if not rows:
+                continue
+            usual = float(np.median([abs(row.robustness) for row in rows])) or 1.0
+            row = min(rows, key=lambda row: row.robustness)
+            if row.robustness / usual < lowest:
+                best, lowest = row, row.robustness / usual
+        return best
+
+    def quantiles(self, shares: Sequence[float] = SHARES) -> "pd.DataFrame":
+        """Return quantiles of the robustness of each requirement over the recordings.
+
+        **Arguments:**
+        - `shares`: quantile levels, from 0 (the minimum) to 1 (the maximum).
+        **Returns:** a row for each requirement: how many recordings have a verdict, how many fail,
+        how many have none, and a column for each level with the robustness of the recording at that
+        rank.
+        """
+        import pandas as pd
+
+        table = {}
+        for each in self.requirements:
+            rows = self.of(each.id)
+            values = np.array([row.robustness for row in rows])
+            fails = sum(row.verdict == "fails" for row in rows)
+            entry: dict[str, Any] = {
+                "verdicts": len(rows),
+                "failing": fails,
+                "without verdict": sum(r.requirement == each.id for r in self.without_verdict),
+            }
+            for share in shares:
+                # No interpolation: the values of two recordings may be infinite.
+                found = np.quantile(values, share, method="inverted_cdf") if rows else math.nan
+                entry[f"{share:z.3g}"] = float(found)
+            table[each.id] = entry
+        return pd.DataFrame.from_dict(table, orient="index").rename_axis("requirement")
+
+    def outliers(self, distance: float = 3.5) -> "pd.DataFrame":
+        """Return the rows whose robustness differs much from that of the other recordings.
+
+        The distance is the difference from the median of the requirement over the fleet, divided by
+        the median absolute deviation times 1.4826, which is one standard deviation for normal
+        values. At least five recordings are needed.
+
+        **Arguments:**
+        - `distance`: minimum distance of an outlier.
+        **Returns:** rows of the table with their `distance`, in decreasing order.
+
+        Source: B. Iglewicz, D. Hoaglin, "How to Detect and Handle Outliers", ASQC 1993.
+        """
+        import pandas as pd
+
+        found = []
+        for each in self.requirements:
+            rows = [row for row in self.of(each.id) if math.isfinite(row.robustness)]
+            if len(rows) < MIN_RECORDINGS:
+                continue
+            values = np.array([row.robustness for row in rows])
+            away = values - np.median(values)
+            spread = 1.4826 * float(np.median(np.abs(away)))
+            # Where most are alike, whatever differs is unlike them.
+            far = np.where(away == 0, 0.0, np.abs(away) / (spread or 1e-300))
+            found += [(*row, d) for row, d in zip(rows, far, strict=True) if d > distance]
+        table = pd.DataFrame(found, columns=[*Row._fields, "distance"])
+        return table.sort_values("distance", ascending=False, ignore_index=True)
+
+    def summary(self) -> str:
+        """Return the summary as text: failures, missing verdicts, and the margins of the others."""
+        failing, missing = self.failing, self.without_verdict
+        asked = (
+            f"{counted(len(self.requirements), 'requirement')} on "
+            f"{counted(len(self.files), 'recording')}"
+        )
+        verdicts = len(self.rows) - len(missing)
+        lines = [f"{asked}: {len(failing)} of {verdicts} verdicts fail"]
+        if missing:
+            lines[0] += f", and {len(missing)} could not be given"
+        width = max(len(each.id) for each in self.requirements)
+        lines += ["", f"  {'':{width}}  {'failing':<12}{'least':>10}{'median':>12}"]
+        spread = self.quantiles((0.0, 0.5))
+        for each in self.requirements:
+            row = spread.loc[each.id]
+            share = f"{int(row['failing'])} of {int(row['verdicts'])}"
+            numbers = "".join(f"{row[q]:>z12.4g}" for q in ("0", "0.5") if row["verdicts"])
+            unit = self.unit_of(each)
+            lines.append(f"  {each.id:{width}}  {share:<10}{numbers} {unit}".rstrip())
+        lines += _listed("Failing, the worst first:", failing)
+        lines += _listed("Without a verdict:", _together(missing))
+        lines += _noted(self.rows)
+        if (tightest := self.tightest) is not None and not failing:
+            lines += ["", f"Tightest: {tightest.requirement} on {tightest.file}"]
+            lines += [f"  {tightest.explanation}"] if tightest.explanation else []
+        noted = {(row.requirement, row.note): row.file for row in reversed(self.rows) if row.note}
+        for (requirement, note), file in reversed(noted.items()):
+            lines += ["", f"Note on {requirement}, as on {file}:", f"  {note}"]
+        return "\n".join(lines)
+
+    def __str__(self) -> str:
+        return self.summary()
+
+    def _notebook_parts(self) -> Iterable[str]:
+        yield frame_html(self.quantiles())
+
+    def report(self, path: str | Path) -> Path:
+        """Write the report as one HTML file, and its claims as JSON next to it.
+
+        **Returns:** the path of the HTML file.
+        """
+        return lazy_import("verifai_jax.addons.reports", "write_report")(self, path)
+
+    def junit(self, path: str | Path) -> Path:
+        """Write the verdicts as JUnit XML: a suite for each requirement, a case for each recording.
+
+        A requirement that fails is a failure; one without a verdict is an error.
+
+        **Returns:** the path.
+        """
+        path = Path(path)
+        root = ElementTree.Element("testsuites", name="requirements")
+        for each in self.requirements:
+            rows = [row for row in self.rows if row.requirement == each.id]
+            suite = ElementTree.SubElement(
+                root,
+                "testsuite",
+                name=printable(each.id),
+                tests=str(len(rows)),
+                failures=str(sum(row.verdict == "fails" for row in rows)),
+                errors=str(sum(not row.verdict for row in rows)),
+            )
+            for row in rows:
+                _case(suite, each, row)
+        with replacing(path) as partial:
+            ElementTree.ElementTree(root).write(partial, encoding="utf-8", xml_declaration=True)
+        return path
+
+
+def _case(suite: ElementTree.Element, requirement: Requirement, row: Row) -> None:
+    case = ElementTree.SubElement(
+        suite, "testcase", name=printable(row.file), classname=printable(requirement.id)
+    )
+    if row.verdict == "holds":
+        return
+    said = row.error or f"robustness {row.robustness:z.6g}; {row.explanation}"
+    fault = ElementTree.SubElement(
+        case, "failure" if row.verdict else "error", message=printable(said)
+    )
+    about = (requirement.text, str(requirement.formula), requirement.source)
+    fault.text = printable("\n".join(line for line in about if line))
+
+
+def _listed(title: str, rows: Sequence[Row]) -> list[str]:
+    lines = ["", title] if rows else []
+    for row in rows[:SHOWN]:
+        lines.append(f"  {row.requirement} on {row.file}")
+        lines.append(f"    {shorten(row.explanation or row.error, 160)}".rstrip())
+    if len(rows) > SHOWN:
+        lines.append(f"  and {len(rows) - SHOWN} more in the table")
+    return lines
+
+
+def _noted(rows: Sequence[Row]) -> list[str]:
+    """Return each note once, with the recordings that it is about."""
+    found: dict[str, dict[str, None]] = {}
+    for row in rows:
+        for note in filter(None, row.note.split("; ")):
+            found.setdefault(note, {})[row.file] = None
+    lines = ["", "Notes:"] if found else []
+    for note, files in list(found.items())[:SHOWN]:
+        where = next(iter(files)) if len(files) == 1 else counted(len(files), "recording")
+        lines.append(f"  {shorten(note, 160)} ({where})")
+    if len(found) > SHOWN:
+        lines.append(f"  and {len(found) - SHOWN} more in the table")
+    return lines
+
+
+def _together(rows: Sequence[Row]) -> list[Row]:
+    """Return rows of a recording with one error as one row, which names the requirements."""
+    found: dict[tuple[str, str], list[str]] = {}
+    for row in rows:
+        found.setdefault((row.file, row.error), []).append(row.requirement)
+    return [Row(file, ", ".join(names), error=error) for (file, error), names in found.items()]

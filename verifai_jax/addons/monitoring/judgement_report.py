@@ -1,0 +1,133 @@
+"""The report on a judgement: which requirements fail on which recordings."""
+
+import math
+
+from verifai_jax.addons.monitoring.judgement import Judgement, Row
+from verifai_jax.addons.reports.claims import Claim, claims_json
+from verifai_jax.addons.reports.markup import Child, Markup, bullets, element, table
+from verifai_jax.addons.reports.page import Page, Section
+from verifai_jax.addons.reports.provenance import chained, versions
+from verifai_jax.addons.reports.sections import (
+    answers_section,
+    chain_table,
+    chain_words,
+    claims_section,
+)
+from verifai_jax.core.messages.text import counted, format_time
+
+MAX_ROWS = 2000
+"""Verdicts that the report lists at most; those that fail are all among the first."""
+RECORDED = "The recordings are of the system that the requirements are about, and their clocks run."
+"""Assumption of every claim."""
+
+
+def judgement_page(judgement: Judgement) -> Page:
+    """Make the report on a judgement."""
+    failing, missing = judgement.failing, judgement.without_verdict
+    verdicts = len(judgement.rows) - len(missing)
+    fleet = counted(len(judgement.files), "recording")
+    headline = (
+        f"{len(failing):,} of {verdicts:,} verdicts fail: "
+        f"{counted(len(judgement.requirements), 'requirement')} on {fleet}."
+    )
+    if missing:
+        headline += f" {len(missing):,} verdicts could not be given."
+    tone = "fails" if failing else "open" if missing or not verdicts else "holds"
+    claims = []
+    for index, each in enumerate(judgement.requirements, 1):
+        rows = judgement.of(each.id)
+        fails = sum(row.verdict == "fails" for row in rows)
+        words = f"{each.id} fails on {fails:,} of {len(rows):,} recordings with a verdict."
+        claims.append(Claim(f"C{index}", words, (f"{each.formula}",), (RECORDED,)))
+    tightest = judgement.tightest
+    near = "none has a finite robustness"
+    if tightest is not None:
+        near = f"{tightest.requirement} on {tightest.file}: {tightest.explanation}"
+    links = tuple(chained(judgement.inputs))
+    chain = links[-1].chain if links else ""
+    sections = (
+        answers_section(
+            [
+                ("What was found?", headline, "found"),
+                ("Which requirement is the tightest?", near, "found"),
+                ("How many verdicts are missing?", f"{len(missing):,}", "limits"),
+            ]
+        ),
+        _asked(judgement),
+        _found(judgement),
+        Section(
+            "limits",
+            "What was not shown",
+            (
+                bullets([RECORDED, "A recording shows what happened, not what may happen."]),
+                *([_rows(judgement, missing)] if missing else []),
+            ),
+        ),
+        claims_section(claims),
+        Section(
+            "reproduce",
+            "Versions and inputs",
+            (
+                table(["package", "version"], versions()),
+                element("h3", "Inputs"),
+                chain_table(links),
+                chain_words(chain),
+            ),
+        ),
+    )
+    return Page(
+        title=f"Requirements on {fleet}",
+        headline=headline,
+        tone=tone,
+        sections=sections,
+        claims=claims_json("requirements", claims, chain),
+    )
+
+
+def _asked(judgement: Judgement) -> Section:
+    rows: list[tuple[Child, ...]] = [
+        (each.id, each.text, element("code", str(each.formula)), each.unit, each.source)
+        for each in judgement.requirements
+    ]
+    heads = ["requirement", "text", "formula", "unit", "source"]
+    return Section("asked", "What was required", (table(heads, rows),))
+
+
+def _found(judgement: Judgement) -> Section:
+    spread = judgement.quantiles()
+    heads = ["requirement", *map(str, spread.columns)]
+    numbers = [
+        (str(name), *(f"{value:z.4g}" for value in values))
+        for name, values in zip(spread.index, spread.to_numpy(float), strict=True)
+    ]
+    content = [table(heads, numbers, "Robustness, by share of the recordings")]
+    outliers = judgement.outliers()
+    if len(outliers):
+        found = [
+            (
+                row["requirement"],
+                row["file"],
+                f"{row['robustness']:z.4g}",
+                f"{row['distance']:z.3g}",
+            )
+            for row in outliers.to_dict("records")
+        ]
+        heads = ["requirement", "recording", "robustness", "distance"]
+        content.append(table(heads, found[:MAX_ROWS], "Recordings unlike the others"))
+    held = [row for row in judgement.rows if row.verdict == "holds"]
+    content.append(_rows(judgement, (*judgement.failing, *held)))
+    return Section("found", "What was found", tuple(content))
+
+
+def _rows(judgement: Judgement, rows: tuple[Row, ...]) -> Markup:
+    heads = ["recording", "requirement", "verdict", "robustness", "at", "why"]
+    listed = []
+    for row in rows[:MAX_ROWS]:
+        unit = f" {row.unit}" if row.unit else ""
+        at = "" if math.isnan(row.instant) else f"{format_time(row.instant)} s"
+        rho = "" if math.isnan(row.robustness) else f"{row.robustness:z.4g}{unit}"
+        why = "; ".join(filter(None, (row.explanation or row.error, row.note)))
+        listed.append((row.file, row.requirement, row.verdict or "none", rho, at, why))
+    left = len(rows) - len(listed)
+    more = f"; {left:,} more are in the table" if left else ""
+    return table(heads, listed, f"Verdicts, those that fail first{more}")

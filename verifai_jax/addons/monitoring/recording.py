@@ -1,0 +1,351 @@
+"""Recorded signals as a trace: from files and tables, of one clock or of several.
+
+read("flight.csv")                                        # a column `time`
+read(frame, dt=0.02)                                      # a pandas.DataFrame
+read("drive.mcap", resample_to=0.1, method="hold")        # topics that arrive when they do
+read(["imu.csv", "gps.csv"], missing={"speed": "hold"}, resample_to=0.1, method="linear")
+"""
+
+from collections.abc import Collection, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from verifai_jax.addons.monitoring import containers
+from verifai_jax.addons.monitoring.columns import LeftOut, numbers_of
+from verifai_jax.addons.monitoring.containers import UNIT, Episode, Table
+from verifai_jax.addons.monitoring.csv_tables import read_csv
+from verifai_jax.addons.monitoring.resampling import (
+    Method,
+    Missing,
+    check_holes,
+    check_increasing,
+    joined,
+    resample,
+    without_gaps,
+)
+from verifai_jax.addons.monitoring.stamps import apart, find_clock, seconds_of
+from verifai_jax.core.messages.errors import missing_name
+from verifai_jax.core.values.trace import Trace
+
+if TYPE_CHECKING:
+    import pandas as pd
+ENDINGS = (".csv", ".parquet", ".npz", ".mcap", ".nc", ".zarr", ".h5", ".hdf5")
+"""Endings of files that are recordings."""
+
+
+class TimeColumnError(ValueError):
+    """An error for a recording without the column of its sample times.
+
+    `fact` is the message without its advice; `columns` are the existing columns.
+    """
+
+    def __init__(self, fact: str, columns: Sequence[str]) -> None:
+        self.fact, self.columns = fact, tuple(columns)
+        super().__init__(
+            f"{fact}: give the sampling period dt, or the name of the column. "
+            f"It has: {', '.join(columns)}"
+        )
+
+
+def read(
+    source: "str | Path | Episode | pd.DataFrame | Sequence[str | Path]",
+    *,
+    time: str | Mapping[str, Sequence[str]] = "time",
+    time_unit: str | None = None,
+    dt: float | None = None,
+    columns: Sequence[str] | None = None,
+    resample_to: float | None = None,
+    method: Method | None = None,
+    missing: Missing | Mapping[str, Missing] | None = None,
+    max_gap: float | None = None,
+    episode: int | None = None,
+) -> Trace:
+    """Read a trace from a file or a table: its columns, topics or variables are signals.
+
+    Columns `p[0]`, `p[1]`, ... become one vector signal `p`, and so does a column of lists of equal
+    length. Columns without numbers are left out, with a note, unless named in `columns`. An empty
+    cell, `-` or `n/a` is a gap (NaN), and words such as `true` or `ON` are truth values. In a CSV
+    file commas, semicolons or tabs separate the columns, as the first line shows; numbers may have
+    a decimal comma if all of them do. Comment lines (`#`) before the names are skipped, and a row
+    of units may follow the names. A last line that was cut, messages that cannot be decoded and
+    topics of an unknown kind are left out, with a note.
+
+    Data with several clocks, such as the topics of an MCAP file, the groups of an HDF5 file or
+    several files, become one trace with the instants of all clocks; a signal has a gap where only
+    others have a sample. Resampling with `"hold"` then repeats each signal's own last value. Times
+    that differ by rounding alone are one instant. Samples that repeat the time of the one before
+    both count, and a time without a value that is far longer than the period is a note.
+
+    **Arguments:**
+    - `source`: the path of a `.csv` (first line: names), `.parquet`, `.npz` (each array is a
+      column), `.mcap`, `.nc`, `.h5` or `.hdf5` file, of a `.zarr` store, of the folder of a LeRobot
+      data set, or of a bag in several `.mcap` files; a `pandas.DataFrame`, whose index is a column
+      if it has a name; or several paths.
+    - `time`: the column of sample times: numbers, dates (ISO 8601 as text) or durations. Their unit
+      may follow its name (`time [ms]`, `time_ms`), or stand in a row of units or an attribute.
+      Dates and durations become seconds since the first one, and so do numbers that can only be
+      milli-, micro- or nanoseconds since 1970, with a note. For several clocks in one table, a
+      dictionary from each clock to its columns, `{"t_imu": ["gyro"], "t_gps": ["speed"]}`.
+    - `time_unit`: the unit of the sample times, whatever the recording says: `"ms"`, `"us"`,
+      `"ns"`, `"s"`, `"min"`, `"h"` or `"d"`. Without any, they are in seconds.
+    - `dt`: the sampling period, if there is no column of times.
+    - `columns`: the signals to read; all when left out.
+    - `resample_to`, `method`: a period to resample to, and the method (`"hold"` or `"linear"`).
+    - `missing`: how to fill gaps, for all signals or by name: `"hold"`, with the signal's own last
+      value; `"interpolate"`, linearly between its neighbours; `"drop"` removes the instants. By
+      default gaps remain.
+    - `max_gap`: the longest time in seconds that a signal may be without a value.
+    - `episode`: number of an episode of a LeRobot data set.
+    **Raises:** `FileNotFoundError`; `MissingExtra` for a kind of file whose package is not
+    installed; `ValueError` for another kind of file, no rows, a column that does not exist or
+    contains no numbers, a text among numbers, times that do not increase or are hardly in seconds
+    without a unit, a gap above `max_gap`, or `resample_to` without `method`.
+    """
+    if (resample_to is None) != (method is None):
+        raise ValueError('resampling needs both: resample_to=PERIOD, method="hold" or "linear"')
+    notes: dict[str, int] = {}
+    name, tables = _tables(source, "time" if isinstance(time, Mapping) else time, episode, notes)
+    wanted = [time] * len(tables) if isinstance(time, str) else list(time)
+    if isinstance(time, Mapping):
+        tables = [_of_clock(name, tables, clock, own) for clock, own in time.items()]
+    units = {name: unit for _, said in tables for name, unit in said.items()}
+    parts, stamps = [], []
+    for (table, said), each in zip(tables, wanted, strict=True):
+        clock = find_clock(table, each)
+        if clock is None and dt is None:
+            raise TimeColumnError(f"{name} has no column {each!r} of sample times", list(table))
+        column = None if clock is None else table.pop(clock)
+        if column is not None and dt is None:
+            unit = said.get(clock or "", "")
+            seconds, origin, note = seconds_of(name, clock or "", column, unit, time_unit)
+            notes |= {note: 1} if note else {}
+            stamps.append((apart(seconds, notes), origin))
+        parts.append(_values(name, table, columns, notes))
+    if columns is None and not any(parts):
+        raise ValueError(f"{name} has no column of numbers")
+    if dt is not None:
+        if len(parts) > 1:
+            raise ValueError(f"{name} has {len(parts)} clocks, so one period dt is not enough")
+        times, values = None, parts[0]
+    else:
+        for seconds, _ in stamps:
+            check_increasing(seconds)
+        times, values = (stamps[0][0], parts[0]) if len(parts) == 1 else joined(stamps, parts)
+    signals = _signals(name, values, columns)
+    units = {each: unit for each in signals if (unit := units.get(each) or units.get(f"{each}[0]"))}
+    trace = Trace(signals, dt=dt, times=times, notes=notes, units=units)
+    trace = check_holes(trace, max_gap)
+    if missing is not None:
+        trace = without_gaps(trace, missing)
+    if resample_to is not None and method is not None:
+        return resample(trace, resample_to, method)
+    return trace
+
+
+Columns = dict[str, Any]
+
+
+def _tables(
+    source: "str | Path | Episode | pd.DataFrame | Sequence[str | Path]",
+    time: str,
+    episode: int | None,
+    notes: dict[str, int],
+) -> tuple[str, list[tuple[Columns, dict[str, str]]]]:
+    """Return how a recording is called, and the columns of each of its clocks with their units."""
+    if isinstance(source, Episode):
+        source, episode = source.path, source.number
+    if isinstance(source, str | Path):
+        path = Path(source)
+        if not path.exists():
+            raise FileNotFoundError(f"there is no recording {path}")
+        if files := containers.lerobot_files(path):
+            path = _file_of_episode(path, files, episode)
+        tables = _file_tables(path, time, episode, notes)
+        return str(path), [_columns(path, table) for table in tables]
+    if isinstance(source, Sequence) and all(isinstance(each, str | Path) for each in source):
+        found = [_tables(each, time, episode, notes) for each in source]
+        if not found:
+            raise ValueError("there is no recording: the list of files is empty")
+        tables = [table for _, several in found for table in several]
+        names = [name for own, _ in tables for name in own if name != find_clock(own, time)]
+        _refuse_repeated("the files", names)
+        return " and ".join(name for name, _ in found), tables
+    return "the data frame", [(_frame_columns(source), {})]  # pyright: ignore[reportArgumentType]
+
+
+def _file_of_episode(folder: Path, files: Sequence[Path], episode: int | None) -> Path:
+    known = list(containers.episodes_of(files))
+    if episode is None and len(known) == 1:
+        return known[0].path
+    named = [each.path for each in known if each.number == episode]
+    if not named:
+        last = known[-1].number if known else -1
+        wanted = "name one of its episodes" if episode is None else f"it has no episode {episode}"
+        raise ValueError(f"{folder} is a LeRobot data set: {wanted}, episode=0 to {last}")
+    return named[0]
+
+
+def _columns(path: Path, table: Table) -> tuple[Columns, dict[str, str]]:
+    names = table.column_names
+    if table.num_rows == 0:
+        raise ValueError(f"{path} has no rows")
+    _refuse_repeated(str(path), names)
+    about = [(field.name, field.metadata or {}) for field in table.schema]
+    said = {name: (each.get(UNIT) or each.get(b"units") or b"").decode() for name, each in about}
+    return {name: table.column(name) for name in names}, {n: u for n, u in said.items() if u}
+
+
+def _of_clock(
+    source: str, tables: list[tuple[Columns, dict[str, str]]], clock: str, names: Sequence[str]
+) -> tuple[Columns, dict[str, str]]:
+    """Return the columns of one of several clocks of a table."""
+    columns = {name: column for table, _ in tables for name, column in table.items()}
+    for name in (clock, *names):
+        if name not in columns:
+            raise missing_name(source, "column", name, columns)
+    given = columns[clock].is_valid()
+    units = {name: unit for _, said in tables for name, unit in said.items()}
+    return {name: columns[name].filter(given) for name in (clock, *names)}, units
+
+
+def _frame_columns(frame: "pd.DataFrame") -> dict[str, Any]:
+    """Return the columns of a data frame by name, as Arrow arrays."""
+    import pandas as pd
+    import pyarrow
+
+    if not isinstance(frame, pd.DataFrame):
+        raise TypeError(
+            f"a recording is the path of a file or a pandas.DataFrame; got a {type(frame).__name__}"
+        )
+    if frame.index.name is not None:
+        frame = frame.reset_index()
+    if not len(frame):
+        raise ValueError("the data frame has no rows")
+    names = [str(name) for name in frame.columns]
+    _refuse_repeated("the data frame", names)
+    table = {}
+    for position, name in enumerate(names):
+        column = frame.iloc[:, position]
+        if column.dtype == object:
+            column = list(column)  # Cells may be lists, or numbers with None among them.
+        try:
+            table[name] = pyarrow.array(column, from_pandas=True)
+        except (pyarrow.ArrowInvalid, pyarrow.ArrowTypeError, pyarrow.ArrowNotImplementedError):
+            texts = [None if _is_missing(cell) else str(cell) for cell in column]
+            table[name] = pyarrow.array(texts, pyarrow.string())
+    return table
+
+
+def _is_missing(cell: object) -> bool:
+    gap = isinstance(cell, float) and cell != cell
+    return cell is None or gap or type(cell).__name__ in ("NAType", "NaTType")
+
+
+def _refuse_repeated(source: str, names: Sequence[str]) -> None:
+    repeated = sorted({name for name in names if names.count(name) > 1})
+    if repeated:
+        raise ValueError(f"{source} has more than one column {', '.join(map(repr, repeated))}")
+
+
+def _file_tables(path: Path, time: str, episode: int | None, notes: dict[str, int]) -> list[Table]:
+    """Read the Arrow tables of a file, one for each of its clocks."""
+    import pyarrow
+
+    readers = {
+        ".csv": lambda: [read_csv(path, notes)],
+        ".parquet": lambda: containers.read_parquet(path, time, episode),
+        ".npz": lambda: [_read_arrays(path)],
+        ".mcap": lambda: containers.read_mcap([path], time, notes),
+        ".nc": lambda: containers.read_dataset(path, time),
+        ".zarr": lambda: containers.read_dataset(path, time),
+        ".h5": lambda: containers.read_hdf5(path, time),
+        ".hdf5": lambda: containers.read_hdf5(path, time),
+    }
+    ending = path.suffix.lower()
+    if bag := containers.bag_files(path):
+        return containers.read_mcap(bag, time, notes)
+    if ending not in readers:
+        known = f"{', '.join(ENDINGS[:-1])} or {ENDINGS[-1]}"
+        raise ValueError(f"a recording is a {known} file; got {path.name}")
+    if episode is not None and ending != ".parquet":
+        raise ValueError(f"episodes are those of a LeRobot data set; {path.name} has none")
+    try:
+        return readers[ending]()
+    except UnicodeDecodeError as error:
+        raise ValueError(
+            f"{path} cannot be read: the names of its columns are not UTF-8 ({error}); save it as "
+            "UTF-8"
+        ) from None
+    except (pyarrow.ArrowInvalid, OSError) as error:
+        # A row with more cells than the first line has names is often one of decimal commas.
+        advice = ". Decimal commas need semicolons between the columns"
+        advice = advice if "Expected" in str(error) else ""
+        raise ValueError(f"{path} cannot be read: {error}{advice}") from None
+
+
+def _read_arrays(path: Path) -> Any:
+    """Read the arrays of an `.npz` file as an Arrow table; nothing in it is unpickled."""
+    import pyarrow
+
+    columns = {}
+    with np.load(path, allow_pickle=False) as arrays:
+        for name in arrays.files:
+            array = arrays[name]
+            if array.ndim not in (1, 2):
+                raise ValueError(
+                    f"array {name!r} of {path} must have shape [time] or [time, k]; "
+                    f"got {list(array.shape)}"
+                )
+            columns[name] = containers.matrix_column(array)
+    return pyarrow.table(columns)
+
+
+def _values(
+    source: str, table: Columns, columns: Sequence[str] | None, notes: dict[str, int]
+) -> dict[str, np.ndarray]:
+    """Return columns as numbers, and put a note on each that is left out."""
+    values: dict[str, np.ndarray] = {}
+    for name, column in table.items():
+        try:
+            values[name] = numbers_of(source, name, column)
+        except ValueError as error:
+            if columns is not None and name in columns:
+                raise
+            why = str(error).replace(f" of {source}", "", 1)
+            notes[LeftOut(f"{why}: it is left out", name)] = 1
+    return values
+
+
+def _signals(
+    source: str, values: dict[str, np.ndarray], columns: Sequence[str] | None
+) -> dict[str, np.ndarray]:
+    """Return the signals of columns by name: scalars, and vectors of several columns."""
+    vectors = vector_columns([name for name in values if values[name].ndim == 1])
+    in_vectors = {name for parts in vectors.values() for name in parts}
+    scalars = [name for name in values if name not in in_vectors]
+    wanted = [*scalars, *vectors] if columns is None else list(columns)
+    signals = {}
+    for name in wanted:
+        if name in vectors:
+            signals[name] = np.ma.stack([values[part] for part in vectors[name]], axis=1)
+        elif name in values:
+            signals[name] = values[name]
+        else:
+            raise missing_name(source, "column", name, [*scalars, *vectors])
+    return signals
+
+
+def vector_columns(names: Collection[str]) -> dict[str, list[str]]:
+    """Return the vector signals among columns, `{"p": ["p[0]", "p[1]"]}`, in order."""
+    vectors: dict[str, dict[int, str]] = {}
+    for name in names:
+        stem, bracket, index = name.partition("[")
+        if bracket and index.endswith("]") and index[:-1].isdecimal():
+            vectors.setdefault(stem, {})[int(index[:-1])] = name
+    return {
+        stem: [parts[i] for i in range(len(parts))]
+        for stem, parts in vectors.items()
+        if sorted(parts) == list(range(len(parts))) and stem not in names
+    }

@@ -1,0 +1,161 @@
+"""Reports as files: one HTML file, and its claims as JSON next to it.
+
+write_report(run, "balance.html")               # balance.html and balance.claims.json
+write_report(sweep, "sweep.html")               # a sweep, an estimate, a comparison
+"""
+
+import json
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+from verifai_jax.addons.analysis import OperationalDomain
+from verifai_jax.addons.estimation.comparison.result import Comparison, Transfer
+from verifai_jax.addons.estimation.error_budgets.result import ErrorBudget
+from verifai_jax.addons.estimation.report.comparison_report import comparison_page
+from verifai_jax.addons.estimation.report.estimate_report import estimate_page
+from verifai_jax.addons.estimation.report.transfer_report import transfer_page
+from verifai_jax.addons.estimation.result import Estimate
+from verifai_jax.addons.faults.failure_table.report import failure_table_page
+from verifai_jax.addons.faults.failure_table.result import FailureTable
+from verifai_jax.addons.monitoring.judgement_report import judgement_page
+from verifai_jax.addons.reports.assessment import with_assessment
+from verifai_jax.addons.reports.claims import PAGE, sealed
+from verifai_jax.addons.reports.optional_sections import with_errors, with_files, with_odd
+from verifai_jax.addons.reports.page import write_page
+from verifai_jax.addons.reports.run_question import About
+from verifai_jax.addons.reports.run_report import run_page
+from verifai_jax.addons.training.sweep_report import sweep_page
+from verifai_jax.addons.training.sweeps.result import Sweep
+from verifai_jax.addons.verification.report import verification_page
+from verifai_jax.addons.verification.result import Verification
+from verifai_jax.core.display.progress import shows_progress
+from verifai_jax.core.messages.checks import check_count
+from verifai_jax.core.messages.errors import check_names
+from verifai_jax.core.store.atomic_files import replacing
+from verifai_jax.core.user_code.sources import file_hash, hashed_files
+from verifai_jax.falsification.run import Run
+from verifai_jax.features import FeatureSpace
+from verifai_jax.mtl import Judgement
+from verifai_jax.problem.problem import Problem
+
+
+@shows_progress("writing the report on")
+def write_report(
+    result: Any,
+    path: str | Path,
+    *,
+    units: Mapping[str, str] | None = None,
+    reasons: Mapping[str, str] | None = None,
+    traces: int | None = None,
+    studies: bool | None = None,
+    modes: int | None = None,
+    problem: Problem | None = None,
+    errors: ErrorBudget | None = None,
+    odd: OperationalDomain | None = None,
+    assessment: bool = False,
+    files: Sequence[str | Path] = (),
+    progress: bool | None = None,
+) -> Path:
+    """Write the evidence report on a result as one HTML file, and its claims as JSON next to it.
+
+    **Arguments:**
+    - `result`: a run, a sweep, an estimate, a verification, a comparison, a transfer, a failure
+      table or a judgement. The failures of a run with its problem are simulated again.
+    - `path`: the path of the HTML file; the claims go to the same name with the ending
+      `.claims.json`.
+    - `units`: the units of features, by name.
+    - `reasons`: the reasons for the ranges of features, by name.
+    - `traces`: maximum number of rows of a run that are simulated for the report; 24 by default, 5
+      for a slow black box.
+    - `studies`: whether to explain and shrink the worst failure of a run; by default unless the
+      system is a slow black box.
+    - `modes`: number of simulations for the modes of failure of a run and their probabilities, as
+      in `vj.modes`; none when left out.
+    - `problem`: the problem of an estimate, of a verification, or of a failure table without a
+      failure, or the baseline of a comparison; the report shows its property and prior.
+    - `errors`: a result of `vj.error_budget`, for a section and a claim on the error of the number.
+    - `odd`: the operational design domain, from `vj.read_odd`; adds a section on the part of it
+      that a run covers. Features without their own units and reasons take those of the domain.
+    - `assessment`: whether to add sections for an assessor: the claims as a tree, the nine steps of
+      credibility with boxes to fill in, and a page to sign.
+    - `files`: further files that the report rests on; it lists them with their hashes, as it does
+      those of `odd`.
+    - `progress`: whether to show one line of progress; see `core.display.progress` for the default.
+    **Raises:** `UnknownNameError` for a unit or a reason of a feature that does not exist;
+    `ValueError` for an invalid number of simulations, and for a run whose rows have changed since
+    they were written; `TypeError` for an object that is not a result.
+    """
+    path = Path(path)
+    about = About(
+        {**(odd.units if odd else {}), **(units or {})},
+        {**(odd.reasons if odd else {}), **(reasons or {})},
+    )
+    if modes is not None:
+        check_count("modes", modes)
+    match result:
+        case Run():
+            if result.table.changed:
+                raise ValueError(
+                    f"no report can be written on the run of {result.name!r}, because its rows "
+                    f"are the evidence: {result.damage}"
+                )
+            space = result.problem.space if result.problem else None
+            _check(about, space, result.table.features)
+            apart = errors is not None or odd is not None
+            words = None if apart else " --assessment" * assessment
+            page = run_page(result, about, traces, studies, modes, words)
+        case Sweep():
+            _check(about, result.space, result.hyperparameters)
+            page = sweep_page(result, about)
+        case Estimate():
+            _check(about, None if problem is None else problem.space, ())
+            page = estimate_page(result, about, problem)
+        case Verification():
+            _check(about, None, result.features)
+            page = verification_page(result, about, problem)
+        case Comparison():
+            _check(about, result.candidates[0].space, ())
+            page = comparison_page(result, about, problem)
+        case Transfer():
+            _check(about, result.space, ())
+            page = transfer_page(result, about)
+        case FailureTable():
+            problem = problem if result.run is None else result.run.problem
+            _check(about, None if problem is None else problem.space, ())
+            page = failure_table_page(result, about, problem)
+        case Judgement():
+            _check(about, None, ())
+            page = judgement_page(result)
+        case _:
+            kind = type(result).__name__
+            raise TypeError(
+                "a report is on a run, a sweep, an estimate, a verification, a comparison, a "
+                f"transfer, a failure table or a judgement; got {kind}"
+            )
+    if errors is not None:
+        page = with_errors(page, errors)
+    if odd is not None:
+        if not isinstance(result, Run):
+            raise TypeError(f"odd= is for a report on a run; got {type(result).__name__}")
+        page = with_odd(page, odd.coverage(result))
+    read = [*hashed_files(map(Path, files), "the result"), *(() if odd is None else odd.files)]
+    if read:
+        page = with_files(page, read)
+    if assessment:
+        page = with_assessment(page)
+    write_page(page, path)
+    claims = json.dumps(sealed({**page.claims, PAGE: file_hash(path)}), indent=2, allow_nan=False)
+    with replacing(claims_path(path)) as partial:
+        partial.write_text(claims + "\n", encoding="utf-8", newline="\n")
+    return path
+
+
+def claims_path(path: Path) -> Path:
+    """Return the path of the claims of a report."""
+    return path.with_suffix(".claims.json")
+
+
+def _check(about: About, space: FeatureSpace | None, columns: Iterable[str]) -> None:
+    known = [*([] if space is None else space.domains), *columns]
+    check_names("feature", [*about.units, *about.reasons], list(dict.fromkeys(known)))

@@ -1,0 +1,55 @@
+"""Generalised advantage estimation over a stretch of experience.
+
+An episode can end in two ways. *Terminated*: nothing comes after, its value is zero. *Truncated*
+by the time limit: the last state still has a value, which the critic supplies.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from verifai_jax.addons.rl.algorithm import Number
+
+
+class Ends(NamedTuple):
+    """The ends of episodes at each time: terminated only, and terminated or truncated."""
+
+    terminated: Bool[Array, "*time"]
+    truncated: Bool[Array, "*time"]
+
+
+def advantages(
+    reward: Float[Array, " time"],
+    value: Float[Array, " time"],
+    next_value: Float[Array, " time"],
+    ends: Ends,
+    discount: Number,
+    gae_lambda: Number,
+) -> Float[Array, " time"]:
+    """Estimate the advantage of each action; advantage plus `value` is the critic's target.
+
+    **Arguments:**
+    - `reward`: the reward of each step.
+    - `value`: the value of the state in which the action was taken.
+    - `next_value`: the value of the state that the step led to, *before* any reset.
+    - `ends`: the steps that ended an episode.
+    - `discount`, `gae_lambda`: the discount of future rewards, and the weight of longer
+      look-aheads, in `[0, 1]`.
+
+    Source: Schulman et al., High-dimensional continuous control using generalized advantage
+    estimation (2016), eqs. 10 and 16.
+    """
+    continues = 1.0 - ends.terminated
+    delta = reward + discount * continues * next_value - value
+    same_episode = 1.0 - (ends.terminated | ends.truncated)
+
+    def backwards(
+        later: Float[Array, ""], step: tuple[Float[Array, ""], Float[Array, ""]]
+    ) -> tuple[Float[Array, ""], Float[Array, ""]]:
+        delta, same_episode = step
+        advantage = delta + discount * gae_lambda * same_episode * later
+        return advantage, advantage
+
+    return jax.lax.scan(backwards, jnp.zeros(()), (delta, same_episode), reverse=True, unroll=16)[1]

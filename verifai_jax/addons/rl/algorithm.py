@@ -1,0 +1,118 @@
+"""The contract of a training algorithm: hyper-parameters with functions `init / step / policy`.
+
+    algorithm = PPO(learning_rate=1e-3, hidden=(32, 32))
+    state = algorithm.init(task, key, updates=200)
+    state, progress = algorithm.step(task, state)
+    policy = algorithm.policy(task, state)
+
+An algorithm is a frozen dataclass that JAX knows as a pytree: hyper-parameters that change no shape
+are its leaves, so one compiled program serves all their values. Hyper-parameters that change a
+shape are static fields (`static_field`); each combination of them is compiled once.
+"""
+
+import dataclasses
+from collections.abc import Callable, Iterable
+from typing import Any, ClassVar, NamedTuple, Protocol, TypeAlias, TypeVar, runtime_checkable
+
+from jaxtyping import Array, Float, Int, Key, Num, PyTree
+
+from verifai_jax.addons.rl.policy import Policy
+from verifai_jax.addons.rl.task.task import Task
+
+T = TypeVar("T")
+Number = Num[Array, ""] | float | int
+"""A hyper-parameter that JAX may trace."""
+AlgorithmState: TypeAlias = PyTree
+"""The state of a training run: any pytree of arrays, of the same structure after every update."""
+
+
+class Progress(NamedTuple):
+    """The episodes that ended in one update.
+
+    - `mean_return`: mean of their returns, with exploration; NaN if none ended.
+    - `episodes`: their number.
+    """
+
+    mean_return: Float[Array, ""]
+    episodes: Int[Array, ""]
+
+
+@runtime_checkable
+class Algorithm(Protocol):
+    """A training algorithm with its hyper-parameters. Its state is any pytree of arrays.
+
+    - `actions`: the kinds of action that it can learn, `Discrete` or `Continuous`.
+    - `steps_per_update`: number of environment steps in one `step`.
+    """
+
+    actions: ClassVar[tuple[type, ...]]
+
+    @property
+    def steps_per_update(self) -> int:
+        """Number of environment steps in one update."""
+        ...
+
+    def check(self) -> None:
+        """Refuse invalid hyper-parameters.
+
+        **Raises:** `ValueError`, naming the hyper-parameter and its value.
+        """
+        ...
+
+    def init(
+        self, task: Task, key: Key[Array, ""], updates: int | Int[Array, ""]
+    ) -> AlgorithmState:
+        """Make the state before the first update.
+
+        **Arguments:**
+        - `task`: the task to learn.
+        - `key`: a random key, from which all random numbers of the training are derived.
+        - `updates`: the number of updates, after which schedules end.
+        """
+        ...
+
+    def step(self, task: Task, state: AlgorithmState) -> tuple[AlgorithmState, Progress]:
+        """Perform one update: take some steps of the environments and learn from them.
+
+        **Returns:** the state after it, and the episodes that ended in it.
+        """
+        ...
+
+    def policy(self, task: Task, state: AlgorithmState) -> Policy:
+        """Return the policy learnt so far, without exploration."""
+        ...
+
+
+def static_field(default: T) -> T:
+    """Make a dataclass field that determines shapes or structure: static under `jit`."""
+    return dataclasses.field(default=default, metadata={"static": True})
+
+
+def check_values(
+    algorithm: object, names: Iterable[str], holds: Callable[[Any], bool], wanted: str
+) -> None:
+    """Refuse the first of the named hyper-parameters for which `holds` is false.
+
+    **Arguments:**
+    - `algorithm`: the object with the hyper-parameters.
+    - `names`: fields to check.
+    - `holds(value) -> bool`: the condition on each value.
+    - `wanted`: the condition in words that follow "must be".
+    **Raises:** `ValueError`: "PPO's clip must be positive; got -1".
+    """
+    for name in names:
+        if not holds(value := getattr(algorithm, name)):
+            raise ValueError(f"{type(algorithm).__name__}'s {name} must be {wanted}; got {value}")
+
+
+def check_fit(algorithm: Algorithm, task: Task) -> None:
+    """Refuse a task whose kind of action the algorithm cannot learn.
+
+    **Raises:** `ValueError`, naming the algorithm, the task and the kinds that fit.
+    """
+    if not isinstance(task.action, algorithm.actions):
+        kinds = " or ".join(kind.__name__.lower() for kind in algorithm.actions)
+        raise ValueError(
+            f"{type(algorithm).__name__} learns {kinds} actions; "
+            f"{type(task).__name__} has {task.action}"
+        )

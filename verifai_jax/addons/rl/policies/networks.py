@@ -1,0 +1,102 @@
+"""Networks of the usual forms, as pure functions of their weights."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, PyTree
+
+from verifai_jax.addons.rl.policies.errors import PolicyError
+from verifai_jax.core.messages.errors import check_names
+
+ACTIVATIONS: dict[str, Callable[[Array], Array]] = {
+    "tanh": jnp.tanh,
+    "relu": jax.nn.relu,
+    "elu": jax.nn.elu,
+    "selu": jax.nn.selu,
+    "gelu": lambda x: jax.nn.gelu(x, approximate=False),
+    "silu": jax.nn.silu,
+    "swish": jax.nn.silu,
+    "leakyrelu": lambda x: jax.nn.leaky_relu(x, 0.01),
+    "sigmoid": jax.nn.sigmoid,
+    "softplus": jax.nn.softplus,
+    "identity": lambda x: x,
+}
+"""Functions between layers, by the lower-case names of PyTorch's classes."""
+Layers = tuple[tuple[Float[Array, "inputs outputs"], Float[Array, " outputs"]], ...]
+
+
+def activation_name(name: str) -> str:
+    """Return the name in `ACTIVATIONS` of an activation, such as `LeakyReLU`.
+
+    **Raises:** `UnknownNameError`.
+    """
+    plain = name.lower().replace("_", "")
+    check_names("activation", [plain], ACTIVATIONS)
+    return plain
+
+
+@dataclass(frozen=True)
+class Mlp:
+    """A multilayer perceptron, with an activation after each layer except the last.
+
+    - `activation`: a name of `ACTIVATIONS`.
+    - `categories`: if given, integer observations become one-hot vectors of these lengths.
+    - `pixels`: whether observations are images `[channels, height, width]` from 0 to 255, which
+      first pass through the three convolutions of Mnih et al. (2015).
+    """
+
+    activation: str
+    categories: tuple[int, ...] = ()
+    pixels: bool = False
+
+    def example(self, weights: PyTree) -> np.ndarray | None:
+        """Return zeros in the form of an observation; None for images, of unknown size."""
+        if self.pixels:
+            return None
+        return np.zeros(len(self.categories) or weights[0][0].shape[0])
+
+    def __call__(self, weights: PyTree, observation: Array, memory: None) -> tuple[Array, None]:
+        """Return the outputs of the last layer."""
+        layers, x = weights, observation
+        if self.pixels:
+            convolutions, layers = weights
+            x = _nature(convolutions, jnp.asarray(x, float) / 255)
+        elif self.categories:
+            parts = jnp.split(jnp.reshape(x, -1), len(self.categories))
+            hot = [
+                (part[0] == jnp.arange(n)).astype(float)
+                for part, n in zip(parts, self.categories, strict=True)
+            ]
+            x = jnp.concatenate(hot)
+        elif x.ndim and x.shape[-1] != layers[0][0].shape[0]:
+            x = jnp.reshape(x, -1)
+        between = ACTIVATIONS[self.activation]
+        check_size(x, layers[0][0].shape[0])
+        for i, (weight, bias) in enumerate(layers):
+            # The linear layer after convolutions has the activation of those.
+            f = jax.nn.relu if self.pixels and i == 0 else between
+            x = x @ weight + bias
+            x = x if i == len(layers) - 1 else f(x)
+        return x, None
+
+
+def check_size(observation: Array, size: int) -> None:
+    """Check that an observation has as many numbers as a network needs.
+
+    **Raises:** `PolicyError`.
+    """
+    if not observation.ndim or observation.shape[-1] != size:
+        raise PolicyError(
+            f"the network takes observations of {size} numbers; got shape {list(observation.shape)}"
+        )
+
+
+def _nature(convolutions: Layers, image: Float[Array, "c h w"]) -> Float[Array, " k"]:
+    x = image[None]
+    for (kernel, bias), stride in zip(convolutions, (4, 2, 1), strict=True):
+        x = jax.lax.conv(x, kernel, (stride, stride), "VALID") + bias[:, None, None]
+        x = jax.nn.relu(x)
+    return jnp.reshape(x, -1)

@@ -1,0 +1,472 @@
+"""Graphs of ONNX as pure functions of JAX.
+
+policy = read_onnx("walk.onnx")
+
+Weights are a pytree; integers for shapes and indices stay constants, so that JAX compiles with
+fixed shapes. Source: the ONNX specification, `docs/IR.md` and `docs/Operators.md`.
+"""
+
+import hashlib
+import json
+import math
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, fields
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, PyTree
+
+from verifai_jax.addons.rl.policies.errors import MAX_BYTES, MAX_NUMBERS, PolicyError
+from verifai_jax.addons.rl.policies.onnx_layers import extreme
+from verifai_jax.addons.rl.policies.onnx_memory import memory_of
+from verifai_jax.addons.rl.policies.onnx_node import TYPES, Node, cast, fitting, known
+from verifai_jax.addons.rl.policies.onnx_operators import GROWING, OPERATORS, output_size
+from verifai_jax.core.messages.errors import check_names, require
+from verifai_jax.core.messages.text import one_line
+
+Values = dict[str, Any]
+OPSET = 18
+"""The operator set of the graphs that `writing` makes; runtimes since 2023 read it."""
+SPILLED = ""
+"""What has the name of no value: whether whole numbers have left their range."""
+OPSETS = 7, 26
+"""The first and the last operator set that is read."""
+
+
+@dataclass(frozen=True, eq=False)
+class Graph:
+    """The function of a graph: `(weights, observation, memory) -> (outputs, memory)`.
+
+    Graphs with equal content are equal, so policies that only differ in weights share a program.
+
+    - `nodes`: the nodes in the order of computation.
+    - `constants`: arrays that are not weights: shapes, indices, flags.
+    - `inputs`: names of the observations, with their shapes.
+    - `memory`: pairs of an input and the output that is its next value.
+    - `output`: name of the output.
+    - `types`: numbers of the types of inputs; without one it is real.
+    """
+
+    nodes: tuple[Node, ...]
+    constants: Mapping[str, np.ndarray]
+    inputs: Mapping[str, tuple[int, ...]]
+    memory: tuple[tuple[str, str], ...]
+    output: str
+    types: Mapping[str, int] = field(default_factory=dict)
+
+    @cached_property
+    def digest(self) -> str:
+        """Hash of all parts."""
+        parts = [getattr(self, f.name) for f in fields(self)]
+        text = json.dumps(
+            parts,
+            sort_keys=True,
+            default=lambda part: (
+                vars(part)
+                if isinstance(part, Node)
+                else [part.dtype.str, part.shape, part.tobytes().hex()]
+            ),
+        )
+        return hashlib.sha256(text.encode()).hexdigest()[:20]
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Graph) and self.digest == other.digest
+
+    def __hash__(self) -> int:
+        return hash(self.digest)
+
+    def __repr__(self) -> str:
+        return f"Graph({self.digest})"
+
+    def example(self, weights: PyTree) -> Any:
+        """Return zeros in the form of an observation, without a batch axis."""
+        zeros = {n: np.zeros(s[1:] if s[:1] == (1,) else s) for n, s in self.inputs.items()}
+        return next(iter(zeros.values())) if len(zeros) == 1 else zeros
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the graph as plain data, for `read_graph`.
+
+        Only for graphs of `writing.traced`, whose attributes are numbers and texts.
+        """
+        nodes = [[n.operator, n.inputs, n.outputs, n.attributes] for n in self.nodes]
+        inputs = {name: list(shape) for name, shape in self.inputs.items()}
+        return {"nodes": nodes, "inputs": inputs, "memory": self.memory, "output": self.output}
+
+    def __call__(self, weights: PyTree, observation: Any, memory: PyTree) -> tuple[Array, PyTree]:
+        """Compute the outputs of one observation, or of a batch of the graph's own rank."""
+        values: Values = {**self.constants, **weights}
+        added = 0
+        for name, shape in self.inputs.items():
+            rank = len(shape)
+            given = observation[name] if isinstance(observation, Mapping) else observation
+            given = jnp.asarray(fitting(f"the observation {name!r}", given))
+            given = cast(given, TYPES[self.types.get(name, 1)])
+            added = rank - given.ndim
+            if added < 0:
+                raise PolicyError(
+                    f"the network takes observations of rank {rank} at most; got shape "
+                    f"{list(given.shape)}"
+                )
+            values[name] = given.reshape((1,) * added + given.shape)
+        for (name, _), value in zip(self.memory, memory or (), strict=True):
+            values[name] = value
+        run(self.nodes, values)
+        absent = [n for n in (self.output, *dict(self.memory).values()) if n not in values]
+        if absent:
+            raise PolicyError(f"{absent[0]!r} is an output that is not supported")
+        outputs = jnp.asarray(fitting(f"the output {self.output!r}", values[self.output]))
+        if outputs.dtype in (jnp.float16, jnp.bfloat16):
+            outputs = cast(outputs, float)
+        if SPILLED in values:
+            real = jnp.issubdtype(outputs.dtype, jnp.floating)
+            none = jnp.nan if real else extreme(outputs, "min")
+            outputs = jnp.where(values[SPILLED], none, outputs)
+        for _ in range(added):
+            outputs = outputs[0] if outputs.ndim > 1 and outputs.shape[0] == 1 else outputs
+        after = tuple(values[name] for _, name in self.memory) or None
+        return outputs, after
+
+
+def run(nodes: Sequence[Node], values: Values) -> None:
+    """Compute nodes one after the other, and store their outputs among the values.
+
+    **Raises:** `PolicyError` that names the node, its operator and its input shapes.
+    """
+    total = 0
+    for node in nodes:
+        absent = [name for name in node.inputs if name and name not in values]
+        if absent:
+            raise PolicyError(f"{node} reads {absent[0]!r}, an output that is not supported")
+        inputs = [values[name] if name else None for name in node.inputs]
+        try:
+            _check_size(node, total + output_size(node, *inputs))
+            if node.operator == "If":
+                outputs = _branch(node, inputs[0], values)
+            else:
+                outputs = OPERATORS[node.operator](node, *inputs)
+                _note_spilled(node, inputs, outputs, values)
+        except PolicyError:
+            raise
+        except Exception as error:
+            shapes = ", ".join("-" if i is None else str(list(np.shape(i))) for i in inputs)
+            raise PolicyError(
+                f"{node} cannot be computed from inputs of shapes {shapes}: {one_line(str(error))}"
+            ) from error
+        outputs = outputs if isinstance(outputs, tuple) else (outputs,)
+        total += sum(int(np.size(made)) for made in outputs)
+        _check_size(node, total)
+        values.update(zip(node.outputs, outputs, strict=False))
+
+
+def _note_spilled(node: Node, inputs: Sequence[Any], outputs: Any, values: Values) -> None:
+    """Note among the values whether whole numbers of 64 bits leave the 32 that JAX has for them."""
+    if isinstance(outputs, tuple) or known(outputs):
+        return
+    for value in inputs if node.operator not in ("Slice", "Reshape", "Expand") else ():
+        fitting(node, value)
+    if not node.wide or node.operator not in GROWING or outputs.dtype.itemsize == 8:
+        return
+    reals = [i if i is None or known(i) else jnp.asarray(i, float) for i in inputs]
+    about = OPERATORS[GROWING[node.operator]](node, *reals)
+    ends = np.iinfo(outputs.dtype)
+    beyond = ~jnp.all((about >= float(ends.min)) & (about < float(ends.max)))
+    values[SPILLED] = values.get(SPILLED, False) | beyond
+
+
+def _check_size(node: Node, count: int) -> None:
+    if count > MAX_NUMBERS:
+        raise PolicyError(
+            f"with {node} the graph computes {count:z.3g} numbers; the graph of a policy may "
+            "compute at most "
+            f"{MAX_NUMBERS:,}"
+        )
+
+
+def _branch(node: Node, condition: Any, values: Values) -> tuple[Any, ...]:
+    """Compute the branch of an `If` whose condition is a constant."""
+    if not isinstance(condition, np.ndarray | np.generic):
+        raise PolicyError(
+            f"{node} branches on a value of the observation, which is not supported: export the "
+            "model with torch.where instead"
+        )
+    inner, outputs = node.attributes["then_branch" if np.all(condition) else "else_branch"]
+    within = dict(values)
+    run(inner, within)
+    values.update({SPILLED: within[SPILLED]} if SPILLED in within else {})
+    return tuple(within[name] for name in outputs)
+
+
+def read_onnx(
+    path: Path | None,
+    data: bytes,
+    what: str,
+    *,
+    output: str | None,
+    memory: Mapping[str, str] | None,
+) -> tuple[Graph, dict[str, Array], PyTree]:
+    """Read an ONNX model.
+
+    **Arguments:**
+    - `path`: path of the file, next to which tensors may be stored; None for bytes.
+    - `what`: its name in errors.
+    - `output`: name of the output to use, if there are several.
+    - `memory`: the recurrent values `{input: output}`; found by ports and names if None.
+    **Returns:** the graph, its weights, and its initial memory: zeros, or None.
+    **Raises:** `PolicyError` for a damaged model, or one with unsupported operators.
+    """
+    package = require("onnx", extra="policies")
+    try:
+        model = package.load_from_string(data)
+        graph = model.graph
+        opset = max(
+            (o.version for o in model.opset_import if o.domain in ("", "ai.onnx")), default=0
+        )
+    except Exception as error:
+        raise PolicyError(
+            f"{what} is not an ONNX model, or is damaged: {one_line(str(error))}"
+        ) from error
+    others = sorted({o.domain for o in model.opset_import} - {"", "ai.onnx"})
+    if graph.output and others and not opset:
+        raise PolicyError(
+            f"{what} uses only operators of {', '.join(others)}, such as those of trees, which are "
+            "not supported: give the policy as a Python function, such as one of its ONNX runtime"
+        )
+    if not graph.output or not opset:
+        raise PolicyError(f"{what} is not an ONNX model: it has no outputs, or names no operators")
+    arrays = {t.name: _tensor(t, path, what) for t in graph.initializer}
+    fed = [i for i in graph.input if i.name not in arrays]
+    first, last = OPSETS
+    if not first <= opset <= last:
+        raise PolicyError(
+            f"{what} has operator set {opset}; {first} to {last} are supported: export it with "
+            f"opset_version={OPSET}"
+        )
+    infer, wrong = package.shape_inference.infer_shapes, ""
+    try:
+        graph = infer(model, check_type=True).graph
+    except Exception as error:
+        # Sizes may be declared wrongly, which does no harm.
+        if re.search("(unsupported|inconsistent) type|input size", str(error)):
+            wrong = one_line(str(error))
+    nodes = _nodes(graph, opset, {*arrays, *(i.name for i in fed)}, path, what)
+    types = {i.name: i.type.tensor_type.elem_type for i in fed}
+    wrong = wrong or next((f"type {t} of {n!r}" for n, t in types.items() if t not in TYPES), "")
+    if wrong:
+        raise PolicyError(f"{what} has types that ONNX or this reader does not allow: {wrong}")
+    weights, constants = _sorted_out(arrays)
+    for each in fed:
+        if math.prod(_shape(each)) > MAX_NUMBERS:
+            raise PolicyError(f"{what} takes an input {each.name!r} of shape {list(_shape(each))}")
+    made = [o.name for o in graph.output]
+    shapes = ({i.name: _shape(i) for i in fed}, {o.name: _shape(o) for o in graph.output})
+    feeds = memory_of(nodes, *shapes, memory, output, what)
+    left = [i for i in fed if i.name not in feeds]
+    remembered = [i for i in fed if i.name in feeds]
+    if not left:
+        raise PolicyError(f"{what} has no input for an observation")
+    inputs = {i.name: _shape(i) for i in left}
+    chosen = _output([n for n in made if n not in feeds.values()], output, made, what)
+    start = tuple(cast(jnp.zeros(_shape(i)), TYPES[types[i.name]]) for i in remembered) or None
+    ordered = tuple((i.name, feeds[i.name]) for i in remembered)
+    types = {name: types[name] for name in inputs if TYPES[types[name]] is not float}
+    return Graph(nodes, constants, inputs, ordered, chosen, types), weights, start
+
+
+def _sorted_out(arrays: Mapping[str, np.ndarray]) -> tuple[dict[str, Array], dict[str, np.ndarray]]:
+    """Return the weights among arrays, which are real numbers, and the others."""
+    real = {n: a for n, a in arrays.items() if a.dtype.kind not in "iub" and a.size}
+    weights = {n: jnp.asarray(a) for n, a in real.items()}
+    return weights, {n: a for n, a in arrays.items() if n not in weights}
+
+
+def read_graph(
+    data: Mapping[str, Any], arrays: Mapping[str, np.ndarray], what: str
+) -> tuple[Graph, dict[str, Array], PyTree]:
+    """Return the result of `read_onnx`, from `Graph.to_json` and all arrays by name.
+
+    **Raises:** `PolicyError` for data that do not describe a graph.
+    """
+    try:
+        nodes = tuple(
+            Node(operator, outputs[0], tuple(inputs), tuple(outputs), {
+                name: tuple(v) if isinstance(v, list) else v for name, v in attributes.items()
+            }, OPSET)
+            for operator, inputs, outputs, attributes in data["nodes"]
+        )  # fmt: skip
+        inputs = {str(n): tuple(int(k) for k in shape) for n, shape in data["inputs"].items()}
+        memory = tuple((str(one), str(after)) for one, after in data["memory"])
+        start = tuple(jnp.asarray(arrays[one]) for one, _ in memory) or None
+        output = str(data["output"])
+    except Exception as error:
+        raise PolicyError(f"{what} is damaged: its graph is not valid ({error!r})") from error
+    rest = {n: a for n, a in arrays.items() if n not in dict(memory)}
+    for name, array in arrays.items():
+        if array.dtype.kind not in "fiub" or np.any(np.isnan(array)):
+            raise PolicyError(f"the array {name!r} of {what} holds NaN, or no numbers")
+    check_nodes(nodes, {*arrays, *inputs}, [output, *(after for _, after in memory)], what)
+    weights, constants = _sorted_out(rest)
+    return Graph(nodes, constants, inputs, memory, output), weights, start
+
+
+def check_nodes(nodes: Sequence[Node], known: set[str], outputs: Sequence[str], what: str) -> None:
+    """Check that operators exist, and that inputs of nodes and outputs are computed earlier.
+
+    **Raises:** `PolicyError` that names the node.
+    """
+    known = set(known)
+    missing = sorted({n.operator for n in nodes} - {*OPERATORS, "If"})
+    if missing:
+        first = next(n for n in nodes if n.operator == missing[0])
+        raise PolicyError(
+            f"{what} uses {', '.join(missing)}, which is not supported (node {first.name!r}): "
+            "leave it out of the exported model, or give the policy as a Python function"
+        )
+    for node in nodes:
+        absent = [name for name in node.inputs if name and name not in known]
+        if absent:
+            raise PolicyError(
+                f"{what} is damaged: {node} reads {absent[0]!r}, which no node before it computes"
+            )
+        known.update(node.outputs)
+    for name in outputs:
+        if name not in known:
+            raise PolicyError(f"{what} is damaged: no node computes its output {name!r}")
+
+
+def _nodes(
+    graph: Any,
+    opset: int,
+    known: set[str],
+    path: Path | None,
+    what: str,
+    types: Mapping[str, int] | None = None,
+) -> tuple[Node, ...]:
+    """Return the nodes of a graph, checked."""
+    found, inner, types = [], set(known), {**(types or {})}
+    for each in (*graph.input, *graph.value_info, *graph.output):
+        types[each.name] = each.type.tensor_type.elem_type
+    types |= {each.name: each.data_type for each in graph.initializer}
+    for node in graph.node:
+        if node.domain not in ("", "ai.onnx"):
+            raise PolicyError(
+                f"{what} uses {node.op_type} of {node.domain}, which is not ONNX's own"
+            )
+        attributes = {
+            a.name: _attribute(a, opset, inner, path, what, types) for a in node.attribute
+        }
+        name = node.name or (node.output[0] if node.output else "")
+        wide = any(types.get(output) in (7, 13) for output in node.output[:1])
+        inputs, outputs = tuple(node.input), tuple(node.output)
+        found.append(Node(node.op_type, name, inputs, outputs, attributes, opset, wide))
+        inner.update(node.output)
+    check_nodes(found, known, [o.name for o in graph.output], what)
+    package = require("onnx", extra="policies")
+    for node in found:
+        try:
+            page = package.defs.get_schema(node.operator, node.opset, "").attributes
+        except package.defs.SchemaError:
+            raise PolicyError(f"{node} of {what} is not in operator set {opset}") from None
+        more = [name for name in node.attributes if name not in page]
+        node.refuse(more, f"of {what} has {more}, no attributes in operator set {opset}")
+    return tuple(found)
+
+
+def _attribute(
+    attribute: Any,
+    opset: int,
+    known: set[str],
+    path: Path | None,
+    what: str,
+    types: Mapping[str, int],
+) -> Any:
+    package = require("onnx", extra="policies")
+    kinds = package.AttributeProto
+    if attribute.type == kinds.TENSOR:
+        return _tensor(attribute.t, path, what)
+    if attribute.type == kinds.GRAPH:
+        inner = attribute.g
+        arrays = {t.name: _tensor(t, path, what) for t in inner.initializer}
+        nodes = _nodes(inner, opset, known | {*arrays}, path, what, types)
+        constants = tuple(
+            Node("Constant", name, (), (name,), {"value": array}, opset)
+            for name, array in arrays.items()
+        )
+        return (*constants, *nodes), tuple(o.name for o in inner.output)
+    value = package.helper.get_attribute_value(attribute)
+    if isinstance(value, bytes):
+        return value.decode("utf-8", "replace")
+    if isinstance(value, float | int):
+        return value
+    if not isinstance(value, list | tuple):
+        raise PolicyError(f"the attribute {attribute.name!r} in {what} is not supported")
+    return tuple(v.decode("utf-8", "replace") if isinstance(v, bytes) else v for v in value)
+
+
+def _tensor(tensor: Any, path: Path | None, what: str) -> np.ndarray:
+    """Return a tensor of the model, which may be stored in a file next to it."""
+    package = require("onnx", extra="policies")
+    try:
+        if tensor.data_location == package.TensorProto.EXTERNAL:
+            array = _external(tensor, path)
+        else:
+            array = package.numpy_helper.to_array(tensor)
+        if array.dtype.kind not in "fiub" and "float" not in array.dtype.name:
+            raise ValueError(f"it holds {array.dtype}")
+    except Exception as error:
+        raise PolicyError(
+            f"the tensor {tensor.name!r} of {what}: {one_line(str(error))}"
+        ) from error
+    if array.dtype.kind not in "iub":
+        if array.dtype not in (np.float16, jnp.bfloat16):
+            array = np.asarray(array, np.float32)
+        if np.any(np.isnan(array)):
+            raise PolicyError(f"the tensor {tensor.name!r} of {what} holds NaN")
+    return array
+
+
+def _external(tensor: Any, path: Path | None) -> np.ndarray:
+    """Read a tensor that is stored in a file of the model's own folder.
+
+    **Raises:** `ValueError` for a file elsewhere, or one that is too small.
+    """
+    package = require("onnx", extra="policies")
+    said = {entry.key: entry.value for entry in tensor.external_data}
+    name = said.get("location", "")
+    if path is None or not name or Path(name).name != name:
+        raise ValueError(f"it is kept in {name!r}, which is not a file next to the model")
+    dtype = package.helper.tensor_dtype_to_np_dtype(tensor.data_type)
+    count = int(np.prod(tensor.dims, dtype=object)) * dtype.itemsize
+    offset, length = int(said.get("offset", 0)), int(said.get("length", count))
+    file = path.parent / name
+    if length != count or min(offset, count) < 0 or count > MAX_BYTES:
+        raise ValueError(f"it says {length} bytes for shape {list(tensor.dims)}")
+    if file.resolve().parent != path.resolve().parent:
+        raise ValueError(f"{name} is a link to another folder")
+    if offset + count > file.stat().st_size:
+        raise ValueError(f"{name} is smaller than the model says")
+    with file.open("rb") as opened:
+        opened.seek(offset)
+        return np.frombuffer(opened.read(count), dtype).reshape(tuple(tensor.dims))
+
+
+def _shape(value: Any) -> tuple[int, ...]:
+    """Return the shape of an input or output, with 1 for an unspecified size."""
+    return tuple(int(d.dim_value) or 1 for d in value.type.tensor_type.shape.dim)
+
+
+def _output(left: list[str], chosen: str | None, made: list[str], what: str) -> str:
+    if chosen is not None:
+        check_names("output", [chosen], made)
+        return chosen
+    if len(left) == 1:
+        return left[0]
+    named = [n for n in left if n.lower().rstrip("s") in ("action", "mu", "mean", "logit")]
+    if len(named) != 1:
+        raise PolicyError(
+            f"{what} has outputs {', '.join(left)}: say which is the action by output="
+        )
+    return named[0]

@@ -1,0 +1,135 @@
+"""Weights of a file that PyTorch has written, without PyTorch and without unpickling.
+
+weights = read_state(archive_bytes)          # {"mlp.0.weight": [out, in], ...}
+
+A file of `torch.save` is an archive with one pickle, `data.pkl`, that refers to one file a storage.
+Source: `torch/serialization.py` of PyTorch 2.
+"""
+
+import io
+import math
+import zipfile
+from collections.abc import Mapping
+from typing import Any
+
+import ml_dtypes
+import numpy as np
+
+from verifai_jax.addons.rl.policies.errors import MAX_BYTES, PolicyError
+from verifai_jax.addons.rl.policies.pickled import Name, Persistent, Record, array_of, read_pickle
+
+_STORAGES: dict[str, Any] = {
+    "FloatStorage": np.float32,
+    "DoubleStorage": np.float64,
+    "HalfStorage": np.float16,
+    "BFloat16Storage": ml_dtypes.bfloat16,
+    "LongStorage": np.int64,
+    "IntStorage": np.int32,
+    "ShortStorage": np.int16,
+    "CharStorage": np.int8,
+    "ByteStorage": np.uint8,
+    "BoolStorage": np.bool_,
+}
+
+
+def open_archive(data: bytes, what: str) -> zipfile.ZipFile:
+    """Open an archive.
+
+    **Raises:** `PolicyError` for another file, and for one larger than `MAX_BYTES` when unpacked.
+    """
+    try:
+        archive = zipfile.ZipFile(io.BytesIO(data))
+    except Exception as error:
+        raise PolicyError(f"{what} is not an archive, or is damaged: {error}") from error
+    size = sum(entry.file_size for entry in archive.infolist())
+    if size > MAX_BYTES:
+        raise PolicyError(
+            f"{what} unpacks to {size / 1e6:z.0f} MB, and a policy may have "
+            f"{MAX_BYTES / 1e6:z.0f} MB"
+        )
+    return archive
+
+
+def read_member(archive: zipfile.ZipFile, name: str, what: str) -> bytes:
+    """Return the bytes of a member of an archive.
+
+    **Raises:** `PolicyError` for a member that is missing, damaged, or larger than stated.
+    """
+    try:
+        entry = archive.getinfo(name)
+        with archive.open(entry) as file:
+            data = file.read(entry.file_size + 1)
+    except Exception as error:
+        raise PolicyError(f"{what} has no readable {name}: {error}") from error
+    if len(data) > entry.file_size:
+        raise PolicyError(f"{name} of {what} is larger than the archive says")
+    return data
+
+
+def read_state(data: bytes, what: str) -> dict[str, np.ndarray]:
+    """Return the tensors in a file of `torch.save`, by their names.
+
+    Names of nested dictionaries are joined by dots. Values that are not tensors are left out.
+
+    **Raises:** `PolicyError` for a file without tensors, or with damaged ones.
+    """
+    archive = open_archive(data, what)
+    pickles = [n for n in archive.namelist() if n.rpartition("/")[2] == "data.pkl"]
+    if len(pickles) != 1:
+        raise PolicyError(f"{what} is not a file of torch.save: it has no data.pkl")
+    folder = pickles[0].rpartition("/")[0]
+    content = read_pickle(read_member(archive, pickles[0], what), what)
+    found: dict[str, np.ndarray] = {}
+    _collect(content, "", found, lambda key: read_member(archive, f"{folder}/data/{key}", what), 0)
+    if not found:
+        raise PolicyError(f"{what} holds no tensors by name: save module.state_dict()")
+    return found
+
+
+def _collect(value: Any, name: str, found: dict[str, np.ndarray], read: Any, depth: int) -> None:
+    items = dict(enumerate(value)) if isinstance(value, list | tuple) else value
+    if isinstance(value, Record):
+        items = value.items or value.state  # An object, such as one of running means.
+    array = array_of(value)
+    if array is not None and array.dtype.kind in "fiub":
+        found[name] = array
+    elif isinstance(items, Mapping) and depth < 8:
+        for key, inner in items.items():
+            joined = f"{name}.{key}" if name else str(key)
+            _collect(inner, joined, found, read, depth + 1)
+    elif (tensor := _tensor(value, read, name)) is not None:
+        found[name] = tensor
+
+
+def _tensor(value: Any, read: Any, name: str) -> np.ndarray | None:
+    """Return the tensor pickled as `_rebuild_tensor_v2(storage, offset, size, stride, ...)`."""
+    if not isinstance(value, Record) or not isinstance(value.function, Name):
+        return None
+    if value.function.name == "_rebuild_parameter":
+        return _tensor(value.arguments[0], read, name)
+    if value.function.name != "_rebuild_tensor_v2":
+        return None
+    try:
+        storage, offset, shape, stride = value.arguments[:4]
+        assert isinstance(storage, Persistent)
+        _, kind, key, _, _ = storage.reference
+        dtype = _STORAGES[kind.name]
+        flat = np.frombuffer(read(key), dtype)
+        last = offset + sum((n - 1) * s for n, s in zip(shape, stride, strict=True))
+        if min((offset, *shape, *stride)) < 0 or (math.prod(shape) and last >= len(flat)):
+            raise ValueError("it reaches beyond its storage")
+        if math.prod(shape) > len(flat):
+            raise ValueError("it has more numbers than its storage")
+        strides = tuple(s * flat.itemsize for s in stride)
+        view = np.lib.stride_tricks.as_strided(flat[offset:], shape, strides, writeable=False)
+    except PolicyError:
+        raise
+    except Exception as error:
+        raise PolicyError(f"the tensor {name!r} is damaged: {error}") from error
+    return widened(np.array(view))
+
+
+def widened(array: np.ndarray) -> np.ndarray:
+    """Return numbers of fewer than 32 bits, which are not integers, as float32."""
+    real = array.dtype.kind not in "iub" and array.dtype.itemsize < 4
+    return array.astype(np.float32) if real else array

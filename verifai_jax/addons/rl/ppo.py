@@ -1,0 +1,362 @@
+"""Proximal policy optimisation: experience of many environments, a few clipped passes over it.
+
+    ppo = PPO(learning_rate=1e-3, hidden=(32, 32))
+    state = ppo.init(task, key, updates=200)
+    state, progress = ppo.step(task, state)
+
+Source: Schulman et al., Proximal policy optimization algorithms (2017).
+"""
+
+from dataclasses import dataclass
+from typing import ClassVar, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int, Key, PyTree, Shaped
+
+from verifai_jax.addons.rl.advantage import Ends, advantages
+from verifai_jax.addons.rl.algorithm import Number, Progress, check_values, static_field
+from verifai_jax.addons.rl.experience import (
+    Episodes,
+    Transition,
+    observation_size,
+    progress,
+    start_episodes,
+)
+from verifai_jax.addons.rl.observations import (
+    ObservationStatistics,
+    mean_and_scale,
+    normalise,
+    update,
+)
+from verifai_jax.addons.rl.on_policy import minibatch_epochs
+from verifai_jax.addons.rl.optimizer import adam, annealed
+from verifai_jax.addons.rl.policy import Layers, Policy, network, new_layers, scale_to_range
+from verifai_jax.addons.rl.task.task import Action, Continuous, Discrete, State, Task
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class PPO:
+    """Proximal policy optimisation, for discrete and continuous actions, with its hyper-parameters.
+
+    - `learning_rate`: the learning rate of Adam; falls linearly to 0 over the training if `anneal`.
+    - `discount`, `gae_lambda`: the discount of future rewards, and the weight of longer
+      look-aheads, in `[0, 1]`.
+    - `clip`: how far the ratio of new to old probability may differ from 1.
+    - `entropy`, `value_weight`: weights of entropy and value error in the loss.
+    - `max_gradient`: norm to which gradients are clipped.
+    - `environments`, `horizon`: number of environments, and of steps of each, in an update.
+    - `epochs`, `minibatches`: number of passes over these steps, and of minibatches in a pass.
+    - `hidden`, `value_hidden`: widths of the policy's and the critic's hidden layers.
+    - `normalise`: whether to normalise observations by their running mean and deviation.
+    """
+
+    # JAX rebuilds the class with stacked numbers and placeholders in place of numbers.
+    __no_type_check__ = True
+    actions: ClassVar[tuple[type, ...]] = (Discrete, Continuous)
+    learning_rate: Number = 2.5e-4
+    discount: Number = 0.99
+    gae_lambda: Number = 0.95
+    clip: Number = 0.2
+    entropy: Number = 0.01
+    value_weight: Number = 0.5
+    max_gradient: Number = 0.5
+    environments: int = static_field(8)
+    horizon: int = static_field(128)
+    epochs: int = static_field(4)
+    minibatches: int = static_field(4)
+    hidden: tuple[int, ...] = static_field((64, 64))
+    value_hidden: tuple[int, ...] = static_field((64, 64))
+    normalise: bool = static_field(False)
+    anneal: bool = static_field(True)
+
+    @property
+    def steps_per_update(self) -> int:
+        """Number of environment steps in one update."""
+        return self.environments * self.horizon
+
+    def check(self) -> None:
+        """Refuse invalid hyper-parameters.
+
+        **Raises:** `ValueError`, naming the hyper-parameter and its value.
+        """
+        positive = ("learning_rate", "clip", "max_gradient")
+        check_values(self, positive, lambda value: float(value) > 0, "positive")
+        fractions = ("discount", "gae_lambda")
+        check_values(self, fractions, lambda value: 0 <= float(value) <= 1, "between 0 and 1")
+        weights = ("entropy", "value_weight")
+        check_values(self, weights, lambda value: float(value) >= 0, "at least 0")
+        counts = ("environments", "horizon", "epochs", "minibatches")
+        check_values(self, counts, lambda value: value >= 1, "at least 1")
+        steps = self.steps_per_update
+        wanted = f"a divisor of environments * horizon = {steps}"
+        check_values(self, ["minibatches"], lambda value: steps % value == 0, wanted)
+        widths = ("hidden", "value_hidden")
+        check_values(self, widths, lambda value: all(w >= 1 for w in value), "positive widths")
+
+    def init(self, task: Task, key: Key[Array, ""], updates: int | Int[Array, ""]) -> "PPOState":
+        """Make the state before the first of `updates` updates."""
+        policy_key, critic_key, reset_key, key = jax.random.split(key, 4)
+        episodes = start_episodes(task, reset_key, self.environments)
+        size = observation_size(task, episodes)
+        discrete = isinstance(task.action, Discrete)
+        outputs = task.action.n if isinstance(task.action, Discrete) else task.action.size
+        weights = Weights(
+            # A nearly uniform first policy, and a critic that starts at unit scale.
+            policy=new_layers(policy_key, (size, *self.hidden, outputs), gain=0.01),
+            critic=new_layers(critic_key, (size, *self.value_hidden, 1), gain=1.0),
+            log_std=None if discrete else jnp.zeros(outputs),
+        )
+        return PPOState(
+            weights=weights,
+            moments=adam(self.max_gradient).init(weights),
+            statistics=ObservationStatistics.initial(size),
+            episodes=episodes,
+            key=key,
+            done=jnp.int32(0),
+            updates=jnp.int32(updates),
+        )
+
+    def step(self, task: Task, state: "PPOState") -> tuple["PPOState", Progress]:
+        """Collect `horizon` steps of each environment and learn from them.
+
+        **Returns:** the state after it, and the episodes that ended in it.
+        """
+        collect_key, learn_key, key = jax.random.split(state.key, 3)
+        episodes, experience = _collect(self, task, state, collect_key)
+        statistics = (
+            update(state.statistics, experience.observation) if self.normalise else state.statistics
+        )
+        weights, moments = _learn(self, task, state, experience, learn_key)
+        after = PPOState(weights, moments, statistics, episodes, key, state.done + 1, state.updates)
+        return after, progress(experience.transition)
+
+    def policy(self, task: Task, state: "PPOState") -> Policy:
+        """Return the policy learnt so far, without exploration."""
+        mean, scale = mean_and_scale(state.statistics) if self.normalise else (None, None)
+        return Policy(state.weights.policy, mean, scale, state.weights.log_std, task.action)
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True, eq=False)
+class Weights:
+    """The learnt numbers.
+
+    - `policy`, `critic`: layers of the two networks.
+    - `log_std`: `[size]`, logarithm of the deviation for exploration; None for discrete actions.
+    """
+
+    # JAX rebuilds the class with stacked arrays and placeholders, which have other shapes.
+    __no_type_check__ = True
+    policy: Layers
+    critic: Layers
+    log_std: Float[Array, " size"] | None
+
+
+class PPOState(NamedTuple):
+    """The state between two updates.
+
+    - `weights`, `moments`: the learnt numbers, and the optimizer's state.
+    - `statistics`: the statistics of the observations so far.
+    - `episodes`: the present episode of each environment.
+    - `key`: the random key of the next update.
+    - `done`, `updates`: number of updates so far, and in all.
+    """
+
+    weights: Weights
+    moments: PyTree
+    statistics: ObservationStatistics
+    episodes: Episodes
+    key: Key[Array, ""]
+    done: Int[Array, ""]
+    updates: Int[Array, ""]
+
+
+class Experience(NamedTuple):
+    """Steps of the environments, `[environments, horizon]`.
+
+    - `observation`: the policy's input.
+    - `action`: an index, or a vector scaled to [-1, 1].
+    - `outputs`: the outputs of the policy's network.
+    - `transition`: the result of the action.
+    """
+
+    observation: Float[Array, "*steps k"]
+    action: Shaped[Array, "..."]
+    outputs: Float[Array, "*steps outputs"]
+    transition: Transition
+
+
+class Minibatch(NamedTuple):
+    """Steps to learn from, with a leading axis `[rows]`.
+
+    - `observation`: the observation, normalised if the algorithm does so.
+    - `action`: as in `Experience`.
+    - `log_probability`: the log probability of the action under the policy that took it.
+    - `advantage`: the advantage of the action.
+    - `target`: the target of the critic.
+    """
+
+    observation: Float[Array, "*rows k"]
+    action: Shaped[Array, "..."]
+    log_probability: Float[Array, "*rows"]
+    advantage: Float[Array, "*rows"]
+    target: Float[Array, "*rows"]
+
+
+def _collect(
+    ppo: PPO, task: Task, state: PPOState, key: Key[Array, ""]
+) -> tuple[Episodes, Experience]:
+    """Collect experience `[environments, horizon]`, with a new episode where one ends."""
+    log_std = state.weights.log_std
+
+    def step(
+        episode: tuple[State, Int[Array, ""], Float[Array, ""]],
+        drawn: tuple[Float[Array, " outputs"], Key[Array, ""], Key[Array, ""]],
+    ) -> tuple[tuple[State, Int[Array, ""], Float[Array, ""]], Experience]:
+        before, age, total = episode
+        noise, step_key, reset_key = drawn
+        observation = task.observe(before)
+        outputs = network(
+            state.weights.policy, normalise(state.statistics, observation, ppo.normalise)
+        )
+        action = _explore(task.action, outputs, log_std, noise)
+        taken = action if isinstance(task.action, Discrete) else scale_to_range(task.action, action)
+        after, reward, terminated = task.step(step_key, before, taken)
+        age, total = age + 1, total + reward
+        ends = Ends(terminated, age >= task.time_limit)
+        over = ends.terminated | ends.truncated
+        experience = Experience(
+            observation=observation,
+            action=action,
+            outputs=outputs,
+            transition=Transition(
+                jnp.asarray(reward, jnp.float32), task.observe(after), ends, total
+            ),
+        )
+        fresh = (task.reset(reset_key), jnp.int32(0), jnp.zeros(()))
+        return jax.tree.map(
+            lambda new, old: jnp.where(over, new, old), fresh, (after, age, total)
+        ), experience
+
+    def draw(
+        key: Key[Array, ""],
+    ) -> tuple[Float[Array, " outputs"], Key[Array, ""], Key[Array, ""]]:
+        action_key, step_key, reset_key = jax.random.split(key, 3)
+        return _noise(task.action, action_key), step_key, reset_key
+
+    def one_environment(
+        episode: tuple[State, Int[Array, ""], Float[Array, ""]], key: Key[Array, ""]
+    ) -> tuple[tuple[State, Int[Array, ""], Float[Array, ""]], Experience]:
+        # All at once: random bits of a few lanes at a time would cost as much as the network.
+        drawn = jax.vmap(draw)(jax.random.split(key, ppo.horizon))
+        return jax.lax.scan(step, episode, drawn)
+
+    keys = jax.random.split(key, ppo.environments)
+    episodes = (state.episodes.state, state.episodes.age, state.episodes.total)
+    episodes, experience = jax.vmap(one_environment)(episodes, keys)
+    return Episodes(*episodes), experience
+
+
+def _learn(
+    ppo: PPO, task: Task, state: PPOState, experience: Experience, key: Key[Array, ""]
+) -> tuple[Weights, PyTree]:
+    """Take a few epochs of clipped policy and value steps on one stretch of experience."""
+    normalised = jax.vmap(jax.vmap(lambda o: normalise(state.statistics, o, ppo.normalise)))
+    transition = experience.transition
+    observation = normalised(experience.observation)
+    next_observation = normalised(transition.next_observation)
+    critic = jax.vmap(jax.vmap(lambda o: network(state.weights.critic, o)[0]))
+    value = critic(observation)
+    estimate = jax.vmap(advantages, in_axes=(0, 0, 0, 0, None, None))
+    advantage = estimate(
+        transition.reward,
+        value,
+        critic(next_observation),
+        transition.ends,
+        ppo.discount,
+        ppo.gae_lambda,
+    )
+    log_std = state.weights.log_std
+    log_probability = jax.vmap(jax.vmap(lambda o, a: _log_probability(task.action, o, log_std, a)))(
+        experience.outputs, experience.action
+    )
+    batch = Minibatch(
+        observation=observation,
+        action=experience.action,
+        log_probability=log_probability,
+        advantage=advantage,
+        target=advantage + value,
+    )
+    return minibatch_epochs(
+        lambda weights, part: _loss(weights, ppo, task.action, part),
+        (state.weights, state.moments),
+        batch,
+        key,
+        adam(ppo.max_gradient),
+        annealed(ppo.learning_rate, state.done, state.updates, ppo.anneal),
+        ppo.epochs,
+        ppo.minibatches,
+    )
+
+
+def _loss(weights: Weights, ppo: PPO, action: Action, part: Minibatch) -> Float[Array, ""]:
+    outputs = jax.vmap(lambda o: network(weights.policy, o))(part.observation)
+    value = jax.vmap(lambda o: network(weights.critic, o)[0])(part.observation)
+    log_probability = jax.vmap(lambda o, a: _log_probability(action, o, weights.log_std, a))(
+        outputs, part.action
+    )
+    advantage = part.advantage
+    advantage = (advantage - jnp.mean(advantage)) / (jnp.std(advantage) + 1e-8)
+    ratio = jnp.exp(log_probability - part.log_probability)
+    clipped = jnp.clip(ratio, 1 - ppo.clip, 1 + ppo.clip)
+    surrogate = jnp.mean(jnp.minimum(ratio * advantage, clipped * advantage))  # eq. 7
+    value_error = jnp.mean(jnp.square(value - part.target)) / 2
+    entropy = jnp.mean(jax.vmap(lambda o: _entropy(action, o, weights.log_std))(outputs))
+    return -surrogate + ppo.value_weight * value_error - ppo.entropy * entropy  # eq. 9
+
+
+def _noise(action: Action, key: Key[Array, ""]) -> Float[Array, " outputs"]:
+    """Draw the noise of an action, which does not depend on the network."""
+    if isinstance(action, Discrete):
+        return jax.random.gumbel(key, (action.n,))
+    return jax.random.normal(key, (action.size,))
+
+
+def _explore(
+    action: Action,
+    outputs: Float[Array, " outputs"],
+    log_std: Float[Array, " outputs"] | None,
+    noise: Float[Array, " outputs"],
+) -> Shaped[Array, "..."]:
+    """Draw from the distribution that the outputs describe (Gumbel-max if discrete)."""
+    if isinstance(action, Discrete):
+        return jnp.argmax(noise + outputs).astype(jnp.int32)
+    assert log_std is not None
+    return outputs + jnp.exp(log_std) * noise
+
+
+def _log_probability(
+    action: Action,
+    outputs: Float[Array, " outputs"],
+    log_std: Float[Array, " outputs"] | None,
+    taken: Shaped[Array, "..."],
+) -> Float[Array, ""]:
+    if isinstance(action, Discrete):
+        # A choice instead of an index, whose derivative would scatter row by row.
+        chosen = jnp.arange(action.n) == taken
+        return jnp.sum(jnp.where(chosen, jax.nn.log_softmax(outputs), 0.0))
+    assert log_std is not None
+    standard = (taken - outputs) / jnp.exp(log_std)
+    return -jnp.sum(jnp.square(standard) / 2 + log_std + jnp.log(2 * jnp.pi) / 2)
+
+
+def _entropy(
+    action: Action, outputs: Float[Array, " outputs"], log_std: Float[Array, " outputs"] | None
+) -> Float[Array, ""]:
+    if isinstance(action, Continuous):
+        assert log_std is not None
+        return jnp.sum(log_std + (jnp.log(2 * jnp.pi) + 1) / 2)
+    log_probability = jax.nn.log_softmax(outputs)
+    return -jnp.sum(jnp.exp(log_probability) * log_probability)

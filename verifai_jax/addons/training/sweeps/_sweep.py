@@ -1,0 +1,211 @@
+"""Sweeps: train many configurations and rank the policies by their certified safety.
+
+    result = sweep(study, search="halton", configurations=32)
+    result = sweep(study, search="bayes", configurations=64, folder="sweeps/mine")  # resumable
+
+A sweep is a deterministic function of computations that are cached one by one: a training up to a
+checkpoint, the return of a policy, a part of a certification. Killed at any moment and called again
+with the same folder, it reads the finished ones, computes the rest, and gives the same table.
+"""
+
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+from verifai_jax.addons.estimation.certification.attack import check_attack
+from verifai_jax.addons.rl._evaluate import EPISODES
+from verifai_jax.addons.training.sweeps.clock import Clock
+from verifai_jax.addons.training.sweeps.fingerprint import fingerprint
+from verifai_jax.addons.training.sweeps.halving import Halving
+from verifai_jax.addons.training.sweeps.optuna import OptunaSampler
+from verifai_jax.addons.training.sweeps.proposers import make_proposer
+from verifai_jax.addons.training.sweeps.result import Sweep
+from verifai_jax.addons.training.sweeps.running import RunningSweep
+from verifai_jax.addons.training.sweeps.study import Study, StudyError
+from verifai_jax.addons.training.sweeps.trainer import STEPS
+from verifai_jax.core.compute.executors import Executor
+from verifai_jax.core.messages.checks import check_count, check_fraction, check_positive
+from verifai_jax.core.messages.errors import suggests_options
+from verifai_jax.core.store.cache import locked_cache
+from verifai_jax.core.user_code.callbacks import Callback, check_callbacks
+from verifai_jax.search import Search
+
+
+@suggests_options
+def sweep(
+    study: Study,
+    search: str | Search | OptunaSampler = "halton",
+    configurations: int = 32,
+    *,
+    seed: int = 0,
+    samples: int = 512,
+    confidence: float = 0.95,
+    budget: int | None = None,
+    attack: str | Search = "cross_entropy",
+    attack_simulations: int = 256,
+    halving: Halving | None = None,
+    batch: int | None = None,
+    episodes: int = EPISODES,
+    folder: str | Path | None = None,
+    max_seconds: float | None = None,
+    progress: bool | None = None,
+    note: Mapping[str, Any] | None = None,
+    callbacks: Iterable[Callback] = (),
+    executor: Executor | None = None,
+    even_if_changed: bool = False,
+) -> Sweep:
+    """Train configurations of a study's hyper-parameters and certify their policies.
+
+    A row of the result is a policy: a configuration, trained with one seed, at one checkpoint. The
+    same seed gives the same table on one machine.
+
+    **Arguments:**
+    - `study`: hyper-parameters, trainer and specification.
+    - `search`: the search over the hyper-parameters: a name, a `Search`, `"optuna:tpe"`, or an
+      `OptunaSampler`. A search that learns proposes in rounds and minimises the failure rate, then
+      the worst robustness, then the return.
+    - `configurations`: maximum number of configurations; each is trained with each of the study's
+      seeds.
+    - `seed`: the seed of the search and of the samples; training seeds belong to the study.
+    - `samples`: minimum number of samples of each policy in its certification.
+    - `confidence`: the confidence of all verdicts together, between 0 and 1.
+    - `budget`: number of samples of the whole certification; see `certify`.
+    - `attack`, `attack_simulations`: the search that looks for failures of each policy first, and
+      its number of simulations for each; its failures enter no rate.
+    - `halving`: how to stop all but the best configurations at each checkpoint.
+    - `batch`: configurations in a round of a search that learns.
+    - `episodes`: number of episodes over which the nominal return is averaged.
+    - `folder`: the folder that caches finished work; passing it again resumes an interrupted sweep.
+    - `max_seconds`: wall-clock limit; no training begins after two thirds of it.
+    - `progress`: True draws bars, False none; None draws them on a terminal and in a notebook.
+    - `note`: plain data that is stored in the folder next to the work.
+    - `callbacks`: functions called for each policy when its return is known, and again when its
+      safety is, with the number of calls so far and a dictionary of plain numbers; cached work
+      counts too.
+    - `executor`: an executor whose workers train and simulate, as in `falsify`; the table is the
+      same. With `halving`, configurations that continue after a checkpoint are trained from the
+      start.
+    - `even_if_changed`: whether to continue with finished work of a folder although files of the
+      study have changed since it began; the record then says so.
+    **Returns:** the policies with their returns and certificates. An interrupted sweep (Ctrl-C, out
+    of time) returns its finished part; `record.complete` is False.
+    **Raises:** before anything trains, the `StudyError` and `UnknownNameError` of `Study.check`;
+    `ValueError` for options out of range and for a search that needs gradients; `UnknownNameError`
+    for an unknown search or option; `CacheError` for a folder that is damaged, foreign, of another
+    format, or of another sweep.
+    """
+    check_options(
+        study,
+        configurations=configurations,
+        seed=seed,
+        samples=samples,
+        confidence=confidence,
+        budget=budget,
+        attack_simulations=attack_simulations,
+        halving=halving,
+        batch=batch,
+        episodes=episodes,
+        max_seconds=max_seconds,
+    )
+    called = check_callbacks(callbacks)
+    study.check()
+    check_attack(study.untrained_problem(), attack)
+    proposer = make_proposer(
+        search, study.space, configurations=configurations, seed=seed, batch=batch
+    )
+    options: dict[str, Any] = {
+        "search": proposer.to_json(),
+        "seed": seed,
+        "samples": samples,
+        "confidence": confidence,
+        "budget": budget,
+        "attack": attack if isinstance(attack, str) else repr(attack),
+        "attack_simulations": attack_simulations,
+        "halving": None if halving is None else {"reduction": halving.reduction, "by": halving.by},
+        "episodes": episodes,
+    }
+    if proposer.learns:
+        # Its proposals depend on both.
+        options |= {"configurations": configurations, "batch": proposer.batch}
+    with locked_cache(folder) as cache, Clock(study.name, max_seconds, progress) as clock:
+        sources = cache.claim(fingerprint(study, options), study.sources(), even_if_changed)
+        if note is not None:
+            cache.note("command", dict(note))
+        options |= {"configurations": configurations, "p": study.p}
+        options["curve"] = None if study.curve_formula is None else str(study.curve_formula)
+        running = RunningSweep(
+            study, options, cache, clock, halving, attack, called, executor=executor,
+            sources=sources,
+        )  # fmt: skip
+        return Sweep(running.run(proposer), study, reuse=cache.reuse())
+
+
+def check_options(
+    study: object,
+    *,
+    configurations: int,
+    seed: int,
+    samples: int,
+    confidence: float,
+    budget: int | None,
+    attack_simulations: int,
+    halving: object,
+    batch: int | None,
+    episodes: int,
+    max_seconds: float | None,
+) -> None:
+    """Check the options of a sweep, separately and against its study.
+
+    **Raises:** `TypeError` for an argument that is not a study or a `Halving`; `ValueError` for a
+    number out of range, or a budget that cannot sample all policies; `StudyError` for halving
+    without checkpoints or with trainings of different lengths.
+    """
+    if not isinstance(study, Study):
+        raise TypeError(f"sweep needs a Study; got {study!r}")
+    counts = {"configurations": configurations, "samples": samples, "episodes": episodes}
+    if batch is not None:
+        counts["batch"] = batch
+    for name, value in counts.items():
+        check_count(name, value)
+    for name, value in {"seed": seed, "attack_simulations": attack_simulations}.items():
+        check_count(name, value, 0)
+    check_fraction("confidence", confidence)
+    if max_seconds is not None:
+        check_positive("max_seconds", max_seconds)
+    if halving is not None:
+        _check_halving(study, halving)
+    if budget is not None:
+        policies = count_policies(
+            study, configurations, halving if isinstance(halving, Halving) else None
+        )
+        if budget < policies * samples:
+            raise ValueError(
+                f"{policies} policies with {samples} samples each need a budget of at least "
+                f"{policies * samples}; got {budget}"
+            )
+
+
+def count_policies(study: Study, configurations: int, halving: Halving | None) -> int:
+    """Return the maximum number of rows of a sweep."""
+    several_lengths = STEPS in study.space.domains
+    checkpoints = 1 + sum(several_lengths or at < study.trainer.steps for at in study.checkpoints)
+    left, total = configurations, 0
+    for _ in range(checkpoints):
+        total += left
+        left = left if halving is None else halving.survivors(left)
+    return total * len(study.training_seeds)
+
+
+def _check_halving(study: Study, halving: object) -> None:
+    if not isinstance(halving, Halving):
+        raise TypeError(f"halving must be a Halving; got {halving!r}")
+    if STEPS in study.space.domains:
+        raise StudyError(
+            "halving compares trainings of one length at their checkpoints; "
+            "take steps out of the space"
+        )
+    if not [at for at in study.checkpoints if at < study.trainer.steps]:
+        raise StudyError(
+            "halving stops trainings at checkpoints; the study has none before the end at "
+            f"{study.trainer.steps} steps"
+        )

@@ -1,0 +1,248 @@
+"""Trainings by a user's function, with each call in a separate process.
+
+runs = FunctionRuns(study, cache, clock)
+runs.train([runs.add(values, seed=0)], rung=0)
+
+Each process is new and its global random numbers are seeded, so a policy depends only on the
+arguments of the call. A function with an argument `resume` gets a folder with a copy of the files
+that it left at the previous checkpoint; the original stays until the call has ended and is stored.
+"""
+
+import json
+import logging
+import random
+import shutil
+import sys
+import tempfile
+import time
+import weakref
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any, cast
+
+import jax
+import numpy as np
+
+from verifai_jax.addons.rl.policies import Policy
+from verifai_jax.addons.rl.policies import policy as load
+from verifai_jax.addons.rl.policies.onnx_graph import read_graph
+from verifai_jax.addons.training.sweeps.clock import Clock
+from verifai_jax.addons.training.sweeps.fingerprint import digest
+from verifai_jax.addons.training.sweeps.record import Curve
+from verifai_jax.addons.training.sweeps.study import Study
+from verifai_jax.addons.training.sweeps.trainer import STEPS, FunctionTrainer, resumes, whole_number
+from verifai_jax.addons.training.sweeps.training_runs import (
+    RunCheckpoint,
+    TrainingRun,
+    TrainingRuns,
+)
+from verifai_jax.core.compute.cores import available_cores
+from verifai_jax.core.compute.executors import Executor, check_executor, gather
+from verifai_jax.core.messages.text import format_error, one_line
+from verifai_jax.core.store.cache import Cache
+from verifai_jax.core.store.log import Arrays
+from verifai_jax.core.values.trace import Status, Trace
+from verifai_jax.systems.blackbox.workers import Pool
+
+log = logging.getLogger("verifai_jax.sweeps")
+
+
+class FunctionRuns(TrainingRuns):
+    """All trainings of a sweep by a function; arguments as in `TrainingRuns`."""
+
+    def __init__(
+        self, study: Study, cache: Cache, clock: Clock, executor: Executor | None = None
+    ) -> None:
+        super().__init__(study, cache, clock)
+        if executor is not None:
+            check_executor(executor)
+        self._trainer = cast(FunctionTrainer, study.trainer)
+        self._workers = executor
+        self.starts: dict[int, Any] = {}
+        """For a function with an argument `starts`, what it gets of a training, by its number."""
+        if cache.path is None:
+            self._folder = Path(tempfile.mkdtemp(prefix="verifai_jax_trainings_"))
+            weakref.finalize(self, shutil.rmtree, self._folder, ignore_errors=True)
+        else:
+            self._folder = cache.path.parent / "trainings"
+        if study.checkpoints and not resumes(self._trainer.train):
+            log.warning(
+                "%s has no argument resume: it trains anew up to each checkpoint",
+                self._trainer.name,
+            )
+
+    def add(self, values: Mapping[str, object], seed: int) -> int:
+        steps = whole_number(values.get(STEPS, self._trainer.steps), STEPS)
+        key = digest({name: values[name] for name in sorted(values)})
+        checkpoints = self.study.checkpoints_of(steps)
+        self.runs.append(TrainingRun(dict(values), seed, key, checkpoints, None))
+        return len(self.runs) - 1
+
+    def train(self, numbers: Sequence[int], rung: int, *, further: bool = False) -> None:
+        """Train up to a checkpoint, storing those on the way; see `TrainingRuns.train`."""
+        for at in range(rung + 1):
+            waiting = []
+            for number in numbers:
+                if number in self.errors or at >= self.rungs(number):
+                    continue
+                self._recall(number, at)
+                if (number, at) in self._checkpoints:
+                    self._advanced(number, at)
+                else:
+                    waiting.append(number)
+            if waiting:
+                self._call(waiting, at)
+        if not further:
+            self.forget(numbers)
+
+    def forget(self, numbers: Sequence[int]) -> None:
+        for number in numbers:
+            shutil.rmtree(self._folder_of(number), ignore_errors=True)
+
+    def _call(self, numbers: list[int], at: int) -> None:
+        """Call the function for each of these, with at most one call per worker at a time."""
+        calls: list[dict[str, Any]] = []
+        for number in numbers:
+            run = self.runs[number]
+            steps, folder = run.checkpoints[at], str(self._begin(number, at))
+            calls.append({"values": dict(run.values), "steps": steps, "folder": folder})
+            if number in self.starts:
+                calls[-1]["starts"] = self.starts[number]
+        seeds = [self.runs[number].seed for number in numbers]
+        train = partial(train_once, self._trainer.train, self._trainer.observation)
+
+        def ended(index: int, result: "Arrays | str") -> None:
+            number = numbers[index]
+            if isinstance(result, str):
+                self.errors[number] = one_line(result)
+            else:
+                self._end(number, at, result)
+            self.clock.check()
+
+        if self._workers is not None:
+            submit = self._workers.submit
+            pairs = zip(calls, seeds, strict=True)
+            gather([submit(attempt, train, call, seed) for call, seed in pairs], ended)
+            return
+        workers = min(self._trainer.workers or available_cores(), len(calls))
+        pool = Pool(train, self._trainer.train, workers, None, retries=0, fresh=True)
+        for index, outcome in pool.outcomes(calls, seeds):
+            made = cast("Arrays", outcome.trace)
+            ended(index, made if outcome.status == Status.OK else outcome.message)
+
+    def _begin(self, number: int, at: int) -> Path:
+        """Make the folder of a call, with what the call before it left."""
+        folder = self._folder_of(number, at).with_suffix(".part")
+        shutil.rmtree(folder, ignore_errors=True)
+        if at and self._folder_of(number, at - 1).exists():
+            shutil.copytree(self._folder_of(number, at - 1), folder)
+        else:
+            folder.mkdir(parents=True)
+        return folder
+
+    def _end(self, number: int, at: int, arrays: Arrays) -> None:
+        """Store a finished call, and then let go of the one before it."""
+        folder = self._folder_of(number, at)
+        shutil.rmtree(folder, ignore_errors=True)
+        folder.with_suffix(".part").rename(folder)
+        self.cache.put({self.cache_name(number, at): arrays})
+        self._set_checkpoint(number, at, arrays)
+        if at:
+            shutil.rmtree(self._folder_of(number, at - 1), ignore_errors=True)
+        self._advanced(number, at)
+
+    def _folder_of(self, number: int, at: int | None = None) -> Path:
+        run = self.runs[number]
+        folder = self._folder / f"{run.key}-{run.seed}"
+        return folder if at is None else folder / str(run.checkpoints[at])
+
+    def _advanced(self, number: int, at: int) -> None:
+        self.clock.advance(self._steps(number, at) - self._steps(number, at - 1))
+
+    def _set_checkpoint(self, number: int, rung: int, arrays: Arrays) -> None:
+        held = {n.removeprefix(ARRAY): a for n, a in arrays.items() if n.startswith(ARRAY)}
+        finite = all(bool(np.all(np.isfinite(a))) for a in held.values())
+        what = f"the policy of {self.cache_name(number, rung)}"
+        plain = {name: np.nan_to_num(array) for name, array in held.items()}
+        graph, weights, start = read_graph(json.loads(bytes(arrays["graph"])), plain, what)
+        policy = Policy(jax.device_get(weights), graph, jax.device_get(start))
+        if (why := self._why_not_of_the_form(policy)) is not None:
+            self.errors.setdefault(number, why)
+        curve = Curve(arrays["steps"], arrays["mean_return"])
+        seconds = float(arrays["seconds"])
+        self._checkpoints[number, rung] = RunCheckpoint(policy, finite, curve, seconds)
+
+    def _why_not_of_the_form(self, policy: Policy) -> str | None:
+        """Say that actions have another shape than those of the example, which fits the problem."""
+        example = self._trainer.untrained_policy("")
+        seen = policy.compute.example(policy.weights)  # pyright: ignore[reportFunctionMemberAccess]
+        try:
+            made, wanted = (
+                jax.eval_shape(partial(_first_action, each), seen) for each in (policy, example)
+            )
+        except Exception:  # The example may be of other observations.
+            return None
+        if made.shape == wanted.shape:
+            return None
+        return (
+            f"the trained policy returns actions of shape {list(made.shape)}, and example= of the "
+            f"trainer, with which the problem was checked, of shape {list(wanted.shape)}"
+        )
+
+
+ARRAY = "array/"
+"""Prefix of the names of a policy's arrays among the stored arrays of a training."""
+
+
+def _first_action(policy: Any, observation: Any) -> Any:
+    memory = getattr(policy, "initial_memory", None)
+    return policy.act(observation) if memory is None else policy.act(observation, memory)[0]
+
+
+def train_once(
+    train: Callable[..., Any], observation: Any, call: Mapping[str, Any], seed: int
+) -> Trace:
+    """Call the training function, and convert its policy to arrays; runs in a process.
+
+    **Arguments:**
+    - `train`: the training function, see `Trainer`.
+    - `observation`: an example observation for policies that do not define their input, or None.
+    - `call`: the hyper-parameters `values`, the total `steps`, the `folder` to resume from, and
+      `starts`, whether the function receives it.
+    - `seed`: training seed.
+    **Returns:** the arrays, which the pool passes on unchanged.
+    """
+    random.seed(seed)
+    np.random.seed(seed)  # noqa: NPY002 - what other frameworks draw from.
+    if (torch := sys.modules.get("torch")) is not None:
+        torch.manual_seed(seed)
+    options: dict[str, Any] = {"resume": Path(call["folder"])} if resumes(train) else {}
+    if "starts" in call:
+        options["starts"] = call["starts"]
+    began = time.perf_counter()
+    made = train(jax.random.key(seed), dict(call["values"]), steps=call["steps"], **options)
+    seconds = time.perf_counter() - began
+    curve: Mapping[str, Any] = {"steps": (), "mean_return": ()}
+    if isinstance(made, tuple) and len(made) == 2 and isinstance(made[1], Mapping):
+        made, curve = (made[0], made[1]) if {*made[1]} == {*curve} else (made, curve)
+    graph, arrays, start = load(made, observation=observation).as_graph(observation)
+    held = {**arrays, **{name: s for (name, _), s in zip(graph.memory, start, strict=True)}}
+    found = {
+        "graph": np.frombuffer(json.dumps(graph.to_json()).encode(), np.uint8),
+        "steps": np.asarray(curve["steps"], np.int64),
+        "mean_return": np.asarray(curve["mean_return"], np.float64),
+        "seconds": np.asarray(seconds, np.float64),
+        **{f"{ARRAY}{name}": array for name, array in held.items()},
+    }
+    return cast(Trace, found)
+
+
+def attempt(
+    train: Callable[[Mapping[str, Any], int], Trace], call: Mapping[str, Any], seed: int
+) -> "Arrays | str":
+    """Return the result of `train_once`, or its error as text; runs on a worker."""
+    try:
+        return cast("Arrays", train(call, seed))
+    except Exception as error:
+        return format_error(error)

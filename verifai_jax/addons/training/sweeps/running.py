@@ -1,0 +1,387 @@
+"""The state of a sweep that runs: its configurations, training runs, returns and certificates."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from verifai_jax._version import __version__
+from verifai_jax.addons.estimation.certification._certify import certify
+from verifai_jax.addons.estimation.certification.result import Certificate, Certificates
+from verifai_jax.addons.rl._evaluate import batched_mean_returns
+from verifai_jax.addons.training.sweeps import record
+from verifai_jax.addons.training.sweeps.clock import CERTIFYING, TRAINING, Clock, OutOfTime
+from verifai_jax.addons.training.sweeps.fingerprint import digest
+from verifai_jax.addons.training.sweeps.function_runs import FunctionRuns
+from verifai_jax.addons.training.sweeps.halving import SAFETY, Halving
+from verifai_jax.addons.training.sweeps.hyperparameters import Hyperparameters
+from verifai_jax.addons.training.sweeps.proposers import WORST, Proposer, objective
+from verifai_jax.addons.training.sweeps.rows import Row, columns_of, tabulate
+from verifai_jax.addons.training.sweeps.study import Study
+from verifai_jax.addons.training.sweeps.trainer import FunctionTrainer
+from verifai_jax.addons.training.sweeps.training_runs import TrainingRuns
+from verifai_jax.core.compute.executors import Executor
+from verifai_jax.core.messages.errors import end_if_interrupted
+from verifai_jax.core.store.cache import Cache
+from verifai_jax.core.store.log import Arrays
+from verifai_jax.core.user_code.callbacks import Callback, notify
+from verifai_jax.search import Search
+
+SCREENING = 64
+"""Samples of a policy, and simulations of the attack on it, by which a search or halving chooses.
+
+Certificates take fresh samples."""
+_MAX_BARREN = 64
+"""Rounds of a search without a new configuration before proposals end."""
+FOR_TRAINING = 2 / 3
+"""Share of `max_seconds` after which no training begins, to leave time to certify."""
+_LAST = 10**9
+"""Number of a checkpoint beyond the last one of every training."""
+
+
+@dataclass(eq=False)
+class _Configuration:
+    """One configuration: values, training runs, and the checkpoint at which halving stopped it."""
+
+    values: Hyperparameters
+    runs: tuple[int, ...]
+    stopped: int | None = None
+
+
+@dataclass(eq=False)
+class RunningSweep:
+    """The state of a sweep: its configurations, training runs, returns and safety.
+
+    An entry is a pair of numbers: a training run, and one of its checkpoints.
+    """
+
+    study: Study
+    options: dict[str, Any]
+    cache: Cache
+    clock: Clock
+    halving: Halving | None
+    attack: str | Search
+    callbacks: tuple[Callback, ...] = ()
+    calls: int = 0
+    executor: Executor | None = None
+    sources: Sequence[Mapping[str, Any]] = ()
+    runs: TrainingRuns = field(init=False)
+    configurations: list[_Configuration] = field(default_factory=list)
+    numbers: dict[str, int] = field(default_factory=dict)
+    returns: dict[tuple[int, int], float] = field(default_factory=dict)
+    return_range: tuple[float, float] | None = None
+    safety: dict[tuple[int, int], Certificate] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        by_function = isinstance(self.study.trainer, FunctionTrainer)
+        kind = FunctionRuns if by_function else TrainingRuns
+        self.runs = kind(self.study, self.cache, self.clock, self.executor)
+
+    def run(self, proposer: Proposer) -> record.SweepRecord:
+        """Train and certify, or as much of it as time allows."""
+        complete, certificates = True, None
+        try:
+            try:
+                total = self.options["configurations"] * len(self.study.training_seeds)
+                steps = total * self.study.trainer.steps
+                with self.clock.stage(TRAINING, steps, "steps", FOR_TRAINING):
+                    self._train_all(proposer)
+            except OutOfTime:
+                complete = False
+            certificates = self._certify()
+            complete &= certificates is None or certificates.stopped != "interrupted"
+        except (KeyboardInterrupt, OutOfTime):
+            complete = False
+        return self._record(certificates, complete)
+
+    # Training
+
+    def _train_all(self, proposer: Proposer) -> None:
+        wanted, barren = self.options["configurations"], 0
+        while len(self.configurations) < wanted and barren < _MAX_BARREN:
+            proposals = proposer.propose(wanted - len(self.configurations))
+            if not proposals:
+                return
+            fresh = self._add(proposals)
+            barren = 0 if fresh else barren + 1
+            if fresh:
+                self._train(fresh)
+            if proposer.learns:
+                proposer.observe(self._objectives(proposals))
+
+    def _add(self, proposals: Sequence[Hyperparameters]) -> list[int]:
+        """Add the configurations that are new; return their numbers."""
+        fresh = []
+        for values in proposals:
+            name = digest(values)
+            if name in self.numbers:
+                continue
+            self.numbers[name] = len(self.configurations)
+            fresh.append(len(self.configurations))
+            runs = tuple(self.runs.add(values, seed) for seed in self.study.training_seeds)
+            self.configurations.append(_Configuration(dict(values), runs))
+        return fresh
+
+    def _train(self, numbers: Sequence[int]) -> None:
+        runs = self._runs_of(numbers)
+        last = len(self.study.checkpoints_of(self.study.trainer.steps)) - 1
+        if self.halving is None:
+            self.runs.train(runs, max(map(self.runs.rungs, runs)) - 1)
+            self._measure_returns(runs)
+            return
+        for rung in range(last + 1):
+            self.runs.train(self._runs_of(numbers), rung, further=rung < last)
+            self._measure_returns(self._runs_of(numbers))
+            if rung < last:
+                values = self._halving_objectives(self.halving.by, numbers, rung)
+                selected = self.halving.select(values)
+                for number in set(values) - set(selected):
+                    self.configurations[number].stopped = rung
+                    self.runs.forget(self.configurations[number].runs)
+                numbers = selected
+
+    def _runs_of(self, numbers: Sequence[int]) -> list[int]:
+        return [run for number in numbers for run in self.configurations[number].runs]
+
+    def _measure_returns(self, runs: Sequence[int]) -> None:
+        """Measure the nominal returns of all checkpoints of training runs that have none yet."""
+        missing: list[tuple[int, int]] = []
+        before = len(self.returns)
+        for run in runs:
+            for rung in range(self.runs.rungs(run)):
+                if not self._is_finite((run, rung)) or (run, rung) in self.returns:
+                    continue
+                arrays = self.cache.get(self._return_name(run, rung))
+                if arrays is None:
+                    missing.append((run, rung))
+                else:
+                    self.returns[run, rung] = float(arrays["return"])
+        policies = [self._policy(entry) for entry in missing]
+        task = self.study.trainer.evaluation_task
+        if task is None:
+            measured: Any = [(list(range(len(missing))), self._training_returns(missing))]
+        else:
+            measured = batched_mean_returns(task, policies, episodes=self.options["episodes"])
+        for some, values in measured:
+            entries: dict[str, Arrays] = {}
+            for i, value in zip(some, values, strict=True):
+                self.returns[missing[i]] = float(value)
+                entries[self._return_name(*missing[i])] = {"return": np.asarray(value, np.float64)}
+            self.cache.put(entries)
+            self.clock.check()
+        for entry in list(self.returns)[before:]:
+            self._notify(entry, {"nominal_return": self.returns[entry]})
+
+    def _training_returns(self, entries: Sequence[tuple[int, int]]) -> list[float]:
+        checkpoints = [self.runs.checkpoint(*entry) for entry in entries]
+        return [each.training_return for each in checkpoints if each is not None]
+
+    def _notify(self, entry: tuple[int, int], values: Mapping[str, float]) -> None:
+        """Call the callbacks with numbers of a policy."""
+        run, rung = entry
+        training, checkpoint = self.runs.runs[run], self.runs.checkpoint(run, rung)
+        assert checkpoint is not None
+        number = next(n for n, one in enumerate(self.configurations) if run in one.runs)
+        self.calls += 1
+        about = {
+            "configuration": number,
+            "training_seed": training.seed,
+            "environment_steps": training.checkpoints[rung],
+            "training_return": checkpoint.training_return,
+        }
+        notify(self.callbacks, self.calls, {**about, **values})
+
+    def _return_name(self, run: int, rung: int) -> str:
+        return f"return/{self.runs.cache_name(run, rung)}"
+
+    def _is_finite(self, entry: tuple[int, int]) -> bool:
+        checkpoint = self.runs.checkpoint(*entry)
+        return checkpoint is not None and checkpoint.finite
+
+    def _policy(self, entry: tuple[int, int]) -> record.TrainedPolicy:
+        checkpoint = self.runs.checkpoint(*entry)
+        assert checkpoint is not None
+        return checkpoint.policy
+
+    # Objectives of searches and of halving
+
+    def _halving_objectives(self, by: str, numbers: Sequence[int], rung: int) -> dict[int, float]:
+        """Return the objectives of configurations at a checkpoint; NaN where one is unknown."""
+        if by == SAFETY:
+            values = self._screen({n: self._entries_of(n, rung) for n in numbers})
+            return {n: float("nan") if value is None else value for n, value in values.items()}
+        objectives = {}
+        for number in numbers:
+            entries = self._entries_of(number, rung)
+            returns = [self.returns.get(entry, np.nan) for entry in entries]
+            objectives[number] = -float(np.mean(returns)) if entries else float("nan")
+        return objectives
+
+    def _objectives(self, proposals: Sequence[Hyperparameters]) -> list[float | None]:
+        """Return the objectives of proposals at the end of their training; None if unknown."""
+        numbers = [self.numbers[digest(values)] for values in proposals]
+        entries = {}
+        for number in dict.fromkeys(numbers):
+            rung = self.configurations[number].stopped
+            entries[number] = self._entries_of(number, _LAST if rung is None else rung)
+        values = self._screen(entries)
+        return [values[number] for number in numbers]
+
+    def _entries_of(self, number: int, rung: int) -> list[tuple[int, int]]:
+        """Return the entries of a configuration's runs at a checkpoint, or at their last."""
+        runs = self.configurations[number].runs
+        return [(n, min(rung, self.runs.rungs(n) - 1)) for n in runs]
+
+    def _screen(self, entries: dict[int, list[tuple[int, int]]]) -> dict[int, float | None]:
+        """Estimate objectives of configurations by few simulations, never to certify."""
+        finite = [entry for group in entries.values() for entry in group if self._is_finite(entry)]
+        returns = [self.returns[entry] for entry in finite]
+        if self.return_range is None and returns:
+            self.return_range = min(returns), max(returns)
+        samples = min(SCREENING, self.options["samples"])
+        safety: dict[tuple[int, int], Certificate] = {}
+        if finite:
+            # Other samples than those of the certificates.
+            seed = int(np.random.SeedSequence([self.options["seed"], 1]).generate_state(1)[0])
+            policies = [self._policy(entry) for entry in finite]
+            certificates = self._certify_policies(
+                policies,
+                samples=samples,
+                budget=samples * len(policies),
+                seed=seed,
+                attack_simulations=min(SCREENING, self.options["attack_simulations"]),
+                progress=None,
+            )
+            # A half-finished screening would change the proposals of a resumed sweep.
+            end_if_interrupted(certificates.stopped)
+            safety = dict(zip(finite, certificates.rows, strict=True))
+        objectives: dict[int, float | None] = {}
+        for number, group in entries.items():
+            values = [self._objective(entry, safety.get(entry)) for entry in group]
+            failed = any(entry[0] in self.runs.errors for entry in group)
+            objectives[number] = None if failed else float(np.mean(values))
+        return objectives
+
+    def _objective(self, entry: tuple[int, int], safety: Certificate | None) -> float:
+        if safety is None or self.return_range is None:
+            return WORST
+        rate, worst = columns_of(safety)["failure_rate"], safety.worst_robustness
+        value = objective(rate, worst, self.returns[entry], self.return_range)
+        return WORST if value is None else value
+
+    # Certification
+
+    def _certify(self) -> Certificates | None:
+        """Certify the finite policies of all rows; None without any."""
+        entries = [
+            (run, rung)
+            for run in self._runs_of(range(len(self.configurations)))
+            for rung in range(self.runs.rungs(run))
+            if self._is_finite((run, rung))
+        ]
+        if not entries:
+            return None
+        total = len(entries) * self.options["samples"]
+        with self.clock.stage(CERTIFYING, total, "simulations"):
+            # Training may have been out of time before returns were measured.
+            self._measure_returns(list(dict.fromkeys(run for run, _ in entries)))
+            certificates = self._certify_policies(
+                [self._policy(entry) for entry in entries],
+                samples=self.options["samples"],
+                budget=self.options["budget"],
+                seed=self.options["seed"],
+                attack_simulations=self.options["attack_simulations"],
+                progress=self.clock.show,
+            )
+        self.safety = dict(zip(entries, certificates.rows, strict=True))
+        for entry, safety in self.safety.items():
+            numbers = columns_of(safety)
+            del numbers["failure_rate"], numbers["verdict"]
+            self._notify(entry, {"nominal_return": self.returns[entry], **numbers})
+        return certificates
+
+    def _certify_policies(
+        self, policies: Sequence[record.TrainedPolicy], **options: Any
+    ) -> Certificates:
+        def remember(name: str, compute: Callable[[], Arrays]) -> Arrays:
+            try:
+                self.clock.check()
+            except OutOfTime:
+                # The certification answers an interruption by its finished part.
+                raise KeyboardInterrupt from None
+            return self.cache.remember(f"certify/{name}", compute)
+
+        return certify(
+            self.study.problem,
+            policies,
+            p=self.study.p,
+            confidence=self.options["confidence"],
+            attack=self.attack,
+            remember=remember,
+            executor=self.executor,
+            **options,
+        )
+
+    # The record
+
+    def _record(self, certificates: Certificates | None, complete: bool) -> record.SweepRecord:
+        rows: list[Row] = []
+        certified: dict[tuple[int, int], int] = {}
+        for number, configuration in enumerate(self.configurations):
+            for run in configuration.runs:
+                for row in self._rows(number, configuration, run):
+                    if row.entry in self.safety:
+                        certified[row.entry] = len(rows)
+                    rows.append(row)
+        table = tabulate(rows, self.study)
+        return record.SweepRecord(
+            study=self.study.name,
+            seed=self.options["seed"],
+            columns=table.columns,
+            hyperparameters=tuple(self.study.space.columns),
+            policies=table.policies,
+            worst=table.worst,
+            curves=table.curves,
+            certificates=certificates,
+            certified=tuple(certified[entry] for entry in self.safety),
+            options=self.options,
+            version=__version__,
+            seconds=dict(self.clock.seconds),
+            complete=complete,
+            sources=tuple(self.sources),
+        )
+
+    def _rows(self, number: int, configuration: _Configuration, run: int) -> list[Row]:
+        training = self.runs.runs[run]
+        rows: list[Row] = []
+        for rung, steps in enumerate(training.checkpoints):
+            checkpoint = self.runs.checkpoint(run, rung)
+            if checkpoint is None:
+                continue
+            status = record.TRAINED if configuration.stopped != rung else record.STOPPED
+            rows.append(
+                Row(
+                    configuration=number,
+                    seed=training.seed,
+                    steps=steps,
+                    values=configuration.values,
+                    status=status if checkpoint.finite else record.NONFINITE,
+                    entry=(run, rung),
+                    checkpoint=checkpoint,
+                    nominal_return=self.returns.get((run, rung), float("nan")),
+                    safety=self.safety.get((run, rung)),
+                )
+            )
+        if run in self.runs.errors:
+            rows.append(
+                Row(
+                    configuration=number,
+                    seed=training.seed,
+                    steps=training.checkpoints[-1],
+                    values=configuration.values,
+                    status=record.error_status(self.runs.errors[run]),
+                    entry=(run, -1),
+                )
+            )
+        return rows

@@ -1,0 +1,155 @@
+"""Symbols of loops and of layers, which keep nonlinear uncertainties correlated.
+
+A step of a loop rotates and shears the set of states, and nonlinear terms add an uncertainty to
+each number. If each step enclosed the set in a box, the boxes would grow. Here the uncertainties of
+a loop's carried numbers are symbols, which the next step treats like those of the features. Once
+there are many, they are replaced by the symbols of one parallelepiped, with orthogonal sides after
+scaling. The uncertainties of a layer's units stay separate symbols through the following layers, up
+to a result of few numbers.
+
+Source: R. Lohner, Enclosing the solutions of ordinary initial and boundary value problems (1987);
+N. Nedialkov, K. Jackson, G. Corliss, Validated solutions of initial value problems for ordinary
+differential equations, Applied Mathematics and Computation 105 (1999), section 6.
+"""
+
+import itertools
+from collections.abc import Sequence
+
+import numpy as np
+
+from verifai_jax.addons.verification.sets.form import SLACK, Form, Frame, alike, padded
+from verifai_jax.addons.verification.sets.whole import Whole
+
+WIDEST = 24
+"""Numbers that a loop carries at most for its symbols to be worth their cost, which is squared."""
+MANY = 512
+"""Symbols at most of a layer and those before it."""
+FEW = 8
+"""Numbers of a result that do not carry the symbols of layers on: what follows would cost more."""
+WORTH = 0.002
+"""Share of the spread from which on what is not linear gets symbols of its own."""
+ORDER = 6
+"""Symbols for each number that a loop carries, beyond which they become those of a parallelepiped.
+With as many as there are numbers the quadrotor of benchmarks/verify.py has no bounds after 78
+steps, with six times as many they stay narrow, and the other problems take less time as well."""
+_NUMBERS = itertools.count(1)
+
+
+def framed(carry: Sequence[Form | Whole], boxes: int, features: int) -> list[Form | Whole]:
+    """Return what a loop carries, with its uncertainties as symbols of a new frame.
+
+    **Arguments:**
+    - `carry`: values of any shapes; integers, and values equal for all boxes, stay unchanged.
+    - `boxes`: size of the batch.
+    - `features`: number of symbols of the features.
+    """
+    kept = {i: v for i, v in enumerate(carry)
+            if isinstance(v, Form) and (v.slopes is not None or len(v.centre) > 1)}  # fmt: skip
+    values, out = [*kept.values()], list(carry)
+    sizes = [int(np.prod(value.shape, dtype=np.int64)) for value in values]
+    count = sum(sizes)
+    if not count or count > WIDEST:
+        return [v.unframed() if isinstance(v, Form) else v for v in carry]
+    values, _, old = alike(values)
+    old = max(old, features)
+    slopes = np.zeros((old, boxes, count))
+    centre, radius, size, low, high = (np.empty((boxes, count)) for _ in range(5))
+    start = 0
+    for value, each in zip(values, sizes, strict=True):
+        part = slice(start, start + each)
+        ends = value.bounds()
+        for into, array in (
+            (centre, value.centre), (radius, value.radius), (size, value.size),
+            (low, ends[0]), (high, ends[1]),
+        ):  # fmt: skip
+            into[:, part] = array.reshape(len(array), each)
+        if value.slopes is not None:
+            rows = value.slopes
+            slopes[: len(rows), :, part] = rows.reshape(*rows.shape[:2], each)
+        start += each
+    bounded = np.isfinite(radius)
+    radius = np.where(bounded, radius, 0.0)
+    noise = np.zeros((boxes, count, old - features + count))
+    noise[:, :, : old - features] = slopes[features:].transpose(1, 2, 0)
+    noise[:, np.arange(count), old - features + np.arange(count)] = radius
+    sides, rest = noise, np.zeros((boxes, count))
+    if noise.shape[2] > ORDER * count:
+        sides, rest = _sides(noise)
+    new = np.concatenate([slopes[:features], sides.transpose(2, 0, 1)])
+    radius = np.where(bounded, rest + 4 * SLACK * np.abs(noise).sum(2), np.inf)
+    size = np.minimum(size, np.maximum(np.abs(low), np.abs(high)))
+    frame = Frame(next(_NUMBERS), features, len(new))
+    start = 0
+    for i, value, each in zip(kept, values, sizes, strict=True):
+        part, shape = slice(start, start + each), (boxes, *value.shape)
+        pieces = [array[:, part].reshape(shape) for array in (centre, radius, size, low, high)]
+        own = new[:, :, part].reshape(len(new), *shape)
+        # Bounded numbers get no interval: what is computed with it would cost, and is no tighter.
+        ends = (None, None) if np.isfinite(pieces[1]).all() else (pieces[3], pieces[4])
+        out[i] = Form(pieces[0], own, pieces[1], pieces[2], value.dtype, *ends, frame)
+        start += each
+    return out
+
+
+def of_layer(units: Form, features: int) -> Form:
+    """Return the numbers of a layer, with the radius of each as its own symbol.
+
+    **Arguments:**
+    - `units`: an array with one axis.
+    - `features`: number of symbols of the features.
+    """
+    outer, bounded = units.frame, np.isfinite(units.radius)
+    first = features if outer is None else outer.stop
+    count = units.shape[0]
+    if first + count > MANY or units.radius[bounded].sum() <= WORTH * units.spread[bounded].sum():
+        return units
+    own = np.where(bounded, units.radius, 0.0)[None] * np.eye(count)[:, None]
+    old = padded(units, first)
+    old = np.broadcast_to(old, (first, *np.broadcast_shapes(old.shape[1:], own.shape[1:])))
+    return Form(
+        units.centre, np.concatenate([old, np.broadcast_to(own, (count, *old.shape[1:]))]),
+        np.where(bounded, 0.0, np.inf), units.size, units.dtype, units.low, units.high,
+        Frame(next(_NUMBERS), first, first + count, outer, of_layer=True),
+    )  # fmt: skip
+
+
+def _sides(noise: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the sides of parallelepipeds around zonotopes, and what they miss by rounding.
+
+    **Arguments:**
+    - `noise`: `[boxes, numbers, symbols]`.
+    **Returns:** `[boxes, numbers, numbers]`, each column a side, and `[boxes, numbers]`.
+    """
+    scale = np.abs(noise).sum(2)
+    count = noise.shape[1]
+    unit = noise / np.where(scale > 0, scale, 1.0)[:, :, None]
+    own = np.arange(count)
+    unit[:, own, own - count] += scale == 0
+    rows = np.arange(len(unit))
+    rest, own_sides = unit, np.empty_like(unit[:, :, :count])
+    turned = np.empty_like(own_sides)
+    for k in range(count):
+        # The longest of what is not spanned yet.
+        longest = np.argmax(np.square(rest).sum(1), axis=1)
+        side = rest[rows, :, longest]
+        side = side / np.linalg.norm(side, axis=1, keepdims=True)
+        turned[:, :, k] = side
+        whole = unit[rows, :, longest]
+        own_sides[:, :, k] = whole / np.linalg.norm(whole, axis=1, keepdims=True)
+        rest = rest - side[:, :, None] * (side[:, None] @ rest)
+    # Sides as they are lose nothing of what they carry, orthogonal ones less of what is new.
+    skewed = _around(unit, own_sides, np.linalg.inv(own_sides))
+    straight = _around(unit, turned, turned.transpose(0, 2, 1))
+    better = np.abs(skewed[0]).sum((1, 2)) <= np.abs(straight[0]).sum((1, 2))
+    sides = np.where(better[:, None, None], skewed[0], straight[0]) * scale[:, :, None]
+    missed = np.where(better[:, None], skewed[1], straight[1])
+    return sides, scale * (missed + 2.0**-45) * 2
+
+
+def _around(
+    unit: np.ndarray, frame: np.ndarray, inverse: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the sides along a frame, and what an inverse that is not exact misses."""
+    lengths = np.abs(inverse @ unit).sum(2)
+    missed = np.abs(np.eye(unit.shape[1]) - frame @ inverse).sum(2)
+    return frame * lengths[:, None, :], missed

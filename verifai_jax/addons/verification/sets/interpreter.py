@@ -1,0 +1,150 @@
+"""The interpreter: a program that JAX traced, evaluated with sets, many boxes at once.
+
+    values = Interpreter(boxes=512, features=3).closed(jaxpr, inputs)    # or `MissingRule`
+
+The tables of `elementwise.py`, `arrays.py` and `control_flow.py` define the operations by the names
+of JAX's primitives.
+"""
+
+from collections.abc import Callable, Sequence
+from typing import Any, TypeAlias
+
+import jax.numpy as jnp
+import numpy as np
+from jax.typing import ArrayLike
+
+from verifai_jax.addons.verification.sets.form import Form
+from verifai_jax.addons.verification.sets.whole import Whole
+from verifai_jax.core.compute.jaxprs import CUSTOM_CALLS, called, run_through
+from verifai_jax.core.user_code.user_errors import source_line
+
+Value: TypeAlias = Form | Whole
+Params: TypeAlias = dict[str, Any]
+Equation: TypeAlias = Any
+"""A step of a program, `jax.core.JaxprEqn`."""
+Program: TypeAlias = Any
+"""A `Jaxpr` or a `ClosedJaxpr`."""
+Rule: TypeAlias = Callable[["Interpreter", Equation, list[Value]], list[Value]]
+Known: TypeAlias = Callable[[Program], Callable[[list[Value]], list[Value]] | None]
+RULES: dict[str, Rule] = {}
+"""What each primitive does with sets, by its name."""
+
+
+class MissingRule(NotImplementedError):
+    """An error for an operation of a program that has no rule for sets."""
+
+
+def rule(*names: str) -> Callable[[Rule], Rule]:
+    """Register a rule for primitives with these names."""
+
+    def register(function: Rule) -> Rule:
+        RULES.update(dict.fromkeys(names, function))
+        return function
+
+    return register
+
+
+class Interpreter:
+    """Evaluates programs with sets.
+
+    **Arguments:**
+    - `boxes`: size of the batch.
+    - `features`: number of symbols that stand for features.
+    - `known`: returns the rule for a custom-derivative function, given its program, or None.
+    """
+
+    def __init__(self, boxes: int, features: int, known: Known | None = None) -> None:
+        self.boxes, self.features, self.known = boxes, features, known
+        self.latest: tuple[Any, ...] | None = None
+        """The last step of a differential equation: what it was made of, and its results."""
+
+    def __call__(self, program: Program, inputs: Sequence[Value]) -> list[Value]:
+        """Evaluate a traced program; what is not defined becomes a set that is everything.
+
+        **Raises:** `MissingRule` for an operation without a rule, with its name and its line.
+        """
+        with np.errstate(all="ignore"):
+            return self.closed(program, inputs)
+
+    def program(
+        self, program: Program, constants: Sequence[ArrayLike], inputs: Sequence[Value]
+    ) -> list[Value]:
+        """Evaluate a `Jaxpr`.
+
+        **Raises:** `MissingRule` for an operation without a rule, with its name and its line.
+        """
+        known = [
+            constant(value, variable.aval.dtype)
+            for variable, value in zip(program.constvars, constants, strict=True)
+        ]
+        return run_through(
+            program, known, inputs, lambda each: constant(each.val, each.aval.dtype), self.step
+        )
+
+    def closed(self, program: Program, inputs: Sequence[Value]) -> list[Value]:
+        """Evaluate a program with its constants, or one without constants."""
+        inner = getattr(program, "jaxpr", program)
+        return self.program(inner, getattr(program, "consts", ()), inputs)
+
+    def step(self, step: Equation, inputs: list[Value]) -> list[Value]:
+        """Evaluate one operation."""
+        name = step.primitive.name
+        if (inner := called(step)) is not None:
+            known = self.known(inner) if self.known and name in CUSTOM_CALLS else None
+            return self.closed(inner, inputs) if known is None else known(inputs)
+        found = RULES.get(name)
+        if found is None:
+            return self.concrete(step, inputs)
+        try:
+            results = found(self, step, inputs)
+            for value, form in zip(results, (out.aval for out in step.outvars), strict=True):
+                if (value.dtype, value.shape) != (form.dtype, form.shape):
+                    raise NotImplementedError(f"a result of type {form.str_short()}")
+            return results
+        except MissingRule:
+            raise
+        except NotImplementedError as error:
+            raise MissingRule(f"{error}, by the operation {name}{_where(step)}") from error
+
+    def concrete(self, step: Equation, inputs: list[Value]) -> list[Value]:
+        """Evaluate with JAX an operation on integers that are equal for all boxes.
+
+        **Raises:** `MissingRule` for any other operation.
+        """
+        arrays = [v.common if isinstance(v, Whole) else None for v in inputs]
+        forms = [out.aval.dtype for out in step.outvars]
+        exact = all(jnp.issubdtype(f, jnp.integer) or f == jnp.bool_ for f in forms)
+        if not exact or any(array is None for array in arrays):
+            name = step.primitive.name
+            raise MissingRule(f"sets cannot go through the operation {name}{_where(step)}")
+        results = step.primitive.bind(*map(jnp.asarray, arrays), **step.params)
+        results = results if step.primitive.multiple_results else [results]
+        return [constant(r, f) for r, f in zip(results, forms, strict=True)]
+
+
+def constant(value: ArrayLike, dtype: np.dtype) -> Value:
+    """Return a constant of a program as a set."""
+    if jnp.issubdtype(dtype, jnp.floating):
+        return Form.constant(np.asarray(value), np.dtype(dtype))
+    if (jnp.issubdtype(dtype, jnp.integer) and dtype != jnp.uint64) or dtype == jnp.bool_:
+        return Whole.constant(np.asarray(value), np.dtype(dtype))
+    raise MissingRule(f"sets do not support numbers of type {dtype}")
+
+
+def _where(step: Equation) -> str:
+    line = source_line(step.source_info.traceback)
+    return f" ({line})" if line else ""
+
+
+def as_form(value: Value) -> Form:
+    """Return a value that is a real number; others raise `NotImplementedError`."""
+    if not isinstance(value, Form):
+        raise NotImplementedError("whole numbers where only real ones are supported")
+    return value
+
+
+def as_whole(value: Value) -> Whole:
+    """Return a whole number or a truth value; others raise `NotImplementedError`."""
+    if not isinstance(value, Whole):
+        raise NotImplementedError("real numbers where only whole ones are supported")
+    return value

@@ -1,6 +1,0 @@
-"""Certificates of safety for many policies at once."""
-
-from verifai_jax.estimation.certification._certify import certify as certify
-from verifai_jax.estimation.certification.allocation import race as race
-from verifai_jax.estimation.certification.result import Certificate as Certificate
-from verifai_jax.estimation.certification.result import Certificates as Certificates

@@ -1,5 +1,0 @@
-"""Fuzzing: simulations that show new behaviour, with or without a formula."""
-
-from verifai_jax.falsification.fuzzing._fuzz import fuzz as fuzz
-from verifai_jax.falsification.fuzzing.coverage import FuzzCoverage as FuzzCoverage
-from verifai_jax.falsification.fuzzing.run import FuzzRun as FuzzRun

@@ -1,9 +1,0 @@
-"""Environments of Brax, gymnax, Gymnasium and MuJoCo Playground as systems."""
-
-from verifai_jax.systems.environments._brax import Brax as Brax
-from verifai_jax.systems.environments._brax import brax as brax
-from verifai_jax.systems.environments._gymnasium import EpisodeFunction as EpisodeFunction
-from verifai_jax.systems.environments._gymnasium import gymnasium as gymnasium
-from verifai_jax.systems.environments._gymnax import Gymnax as Gymnax
-from verifai_jax.systems.environments._gymnax import gymnax as gymnax
-from verifai_jax.systems.environments._playground import playground as playground

@@ -1,7 +1,0 @@
-"""MuJoCo models as systems, in MJX or in C."""
-
-from verifai_jax.systems.mujoco.bindings import Scaled as Scaled
-from verifai_jax.systems.mujoco.system import MuJoCo as MuJoCo
-from verifai_jax.systems.mujoco.system import mjx as mjx
-from verifai_jax.systems.mujoco.system import mujoco as mujoco
-from verifai_jax.systems.mujoco.system import native as native

@@ -1,5 +1,0 @@
-"""Scenic programs as feature spaces, their scenes compiled to JAX."""
-
-from verifai_jax.systems.scenic._scenic import scenic as scenic
-from verifai_jax.systems.scenic.compilation import ProgramError as ProgramError
-from verifai_jax.systems.scenic.program import ScenicProgram as ScenicProgram

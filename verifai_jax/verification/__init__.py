@@ -1,5 +1,0 @@
-"""Division of a feature space into proved, broken and undecided boxes: `vj.verify`."""
-
-from verifai_jax.verification._verify import verify as verify
-from verifai_jax.verification.result import Verification as Verification
-from verifai_jax.verification.result import load_verification as load_verification

@@ -1,8 +1,0 @@
-"""Programs that JAX traced, evaluated with sets of numbers: bounds for whole boxes at once."""
-
-from verifai_jax.verification.sets import control_flow as control_flow
-from verifai_jax.verification.sets.flow import flow as flow
-from verifai_jax.verification.sets.form import Form as Form
-from verifai_jax.verification.sets.interpreter import Interpreter as Interpreter
-from verifai_jax.verification.sets.interpreter import MissingRule as MissingRule
-from verifai_jax.verification.sets.whole import Whole as Whole
