@@ -10,7 +10,6 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float, Real
 
-from verifai_jax.addons.monitoring.columns import LeftOut
 from verifai_jax.core.messages.errors import missing_name
 from verifai_jax.core.messages.text import format_seconds, format_time
 from verifai_jax.core.values.trace import Samples, Trace, as_array, check_period
@@ -129,7 +128,7 @@ def prepare(
 def _missing_signal(name: str, trace: Trace) -> Exception:
     """Return the error for a signal that a trace lacks, with the note of its recording on it."""
     error = missing_name("the trace", "signal", name, trace.signals)
-    said = [note for note in trace.notes if isinstance(note, LeftOut) and note.column == name]
+    said = [note for note in trace.notes if getattr(note, "column", None) == name]
     return type(error)(f"{error}; {said[0]}") if said else error
 
 

@@ -11,9 +11,9 @@ import re
 from collections.abc import Mapping, Sequence
 
 from verifai_jax.addons.monitoring.margins import Margins, Step, margins
-from verifai_jax.addons.monitoring.streams import Count, Op, Plan, streams
 from verifai_jax.mtl.formula import Formula
 from verifai_jax.mtl.semantics import Semantics, hard
+from verifai_jax.mtl.streams import Count, Op, Plan, streams
 from verifai_jax.mtl.tree import missing_case
 from verifai_jax.mtl.words import number_text
 

@@ -12,13 +12,13 @@ from xml.etree import ElementTree
 
 from verifai_jax.addons.monitoring.c_monitor import export_c
 from verifai_jax.addons.monitoring.margins import margins
-from verifai_jax.addons.monitoring.streams import streams
 from verifai_jax.addons.monitoring.watching import FLAGS
 from verifai_jax.addons.native.machine_code import Unavailable, compile_library
 from verifai_jax.core.messages.text import counted
 from verifai_jax.core.store.atomic_files import replacing
 from verifai_jax.mtl.formula import Formula
 from verifai_jax.mtl.semantics import Semantics, hard
+from verifai_jax.mtl.streams import streams
 
 KINDS = ("", "_low", "_high")
 """Outputs of each formula: what `watch` returns of a step, and the ends of its interval."""

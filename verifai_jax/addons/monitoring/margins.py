@@ -9,9 +9,9 @@ front.leaves                    # the results that are the margins
 from collections.abc import Callable, Mapping
 from typing import NamedTuple
 
-from verifai_jax.addons.monitoring.streams import Plan
 from verifai_jax.mtl.expression import Arithmetic, Component, Duration, Number, Signal
 from verifai_jax.mtl.formula import Formula, Term
+from verifai_jax.mtl.streams import Plan
 from verifai_jax.mtl.tree import missing_case, postorder
 
 FEW = 64

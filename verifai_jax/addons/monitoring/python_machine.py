@@ -15,9 +15,9 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from verifai_jax.addons.monitoring.margins import Margins, Step
-from verifai_jax.addons.monitoring.streams import Count, Op, Plan
 from verifai_jax.mtl.expression import CONSTANT
 from verifai_jax.mtl.host_values import FUNCTIONS
+from verifai_jax.mtl.streams import Count, Op, Plan
 
 Memory = list[float]
 Join = Callable[[float, float], float]

@@ -22,12 +22,12 @@ from jaxtyping import Float
 from verifai_jax.addons.monitoring.c_monitor import HEAD, HELPERS, monitor_code
 from verifai_jax.addons.monitoring.margins import Margins, margins
 from verifai_jax.addons.monitoring.python_machine import PythonMachine
-from verifai_jax.addons.monitoring.streams import Plan, streams
 from verifai_jax.addons.native.machine_code import Unavailable, compiler, library_file
 from verifai_jax.core.messages.errors import missing_name
 from verifai_jax.core.values.gaps import with_gaps
 from verifai_jax.mtl.formula import Formula
 from verifai_jax.mtl.semantics import Semantics, hard
+from verifai_jax.mtl.streams import Plan, streams
 
 R = TypeVar("R")
 Numbers: TypeAlias = Sequence[float] | np.ndarray | ctypes.Array[ctypes.c_double]

@@ -39,6 +39,7 @@ from verifai_jax.addons.simulators.environments.spaces import (
     named_numbers,
     no_action,
 )
+from verifai_jax.core.display.lazy import lazy_import
 from verifai_jax.core.messages.checks import check_count
 from verifai_jax.core.messages.errors import require, suggests_options, unknown_name
 from verifai_jax.core.user_code.user_errors import check_called_with
@@ -118,6 +119,12 @@ class EpisodeFunction:
 
     def __repr__(self) -> str:
         return self.name
+
+    def filmed(self, replay: Any) -> Any:
+        """Return the film of a replay, as `System.filmed` does."""
+        return lazy_import("verifai_jax.addons.simulators.pictures.gymnasium_film", "EpisodeFilm")(
+            self, replay
+        )
 
     def renewed(self) -> "EpisodeFunction":
         """Return the same function with a new environment."""

@@ -73,7 +73,8 @@ class Sweep(Drawn, Reported):
       cached before, and of all; empty for a loaded sweep.
     """
 
-    _picture = "sweep", "plot_sweep"
+    _report = "verifai_jax.addons.training.sweep_report", "sweep_page"
+    _picture = "verifai_jax.addons.training.pictures.sweep", "plot_sweep"
     """Return against failure probability, learning curves and importances."""
     record: SweepRecord
     study: Study | None = None

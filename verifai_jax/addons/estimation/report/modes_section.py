@@ -1,15 +1,7 @@
-"""Sections that a report may have: the error of its number, the design domain, failure modes."""
+"""The section of a report on the modes of failure, and their claims."""
 
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, replace
-from typing import Any
-
-from verifai_jax.addons.analysis import OddCoverage
-from verifai_jax.addons.estimation.error_budgets.result import ErrorBudget
 from verifai_jax.addons.estimation.failure_modes import Mode, Modes
-from verifai_jax.addons.reports.claims import Claim
 from verifai_jax.addons.reports.markup import (
-    Child,
     Markup,
     bullets,
     element,
@@ -17,78 +9,12 @@ from verifai_jax.addons.reports.markup import (
     picture,
     table,
 )
-from verifai_jax.addons.reports.page import Page, Section, before_limits
-from verifai_jax.addons.reports.run_question import NO_REASON, About
+from verifai_jax.addons.reports.page import Section
+from verifai_jax.addons.reports.run_question import About
 from verifai_jax.addons.reports.sections import MODEL, NOT_SEEN, SAMPLES
 from verifai_jax.addons.reports.studies import png
 from verifai_jax.core.messages.text import format_percent
 from verifai_jax.features.english import number
-
-ADDED = (
-    "The parts are measured one by one and added. What two algorithms have in common, such as "
-    "wrong equations, is in none of them."
-)
-"""Assumption of the sum."""
-
-
-def with_errors(page: Page, errors: ErrorBudget) -> Page:
-    """Return a page with this section before the limits, and its claim as `E1`."""
-    rows: list[Sequence[Child]] = [
-        (
-            part.name,
-            f"{part.low:+z.2g} to {part.high:+z.2g}" if part.measured else "not measured",
-            "yes" if part.counted and part.measured else "no",
-            part.text,
-        )
-        for part in errors.parts
-    ]
-    section = Section(
-        "errors",
-        "How wrong the number can be",
-        (
-            paragraph("Claim E1: ", errors.total),
-            table(["part", "greater by", "in the sum", "how it was found"], rows),
-            paragraph(ADDED),
-            paragraph(f"The prior: {errors.prior}"),
-        ),
-    )
-    evidence = (f"{errors.simulations:,} simulations", "section errors")
-    claim = Claim("E1", errors.total, evidence, (ADDED,))
-    claims = {**page.claims, "claims": [*page.claims["claims"], asdict(claim)]}
-    return replace(before_limits(page, section), claims=claims)
-
-
-def with_odd(page: Page, found: OddCoverage) -> Page:
-    """Return a page with this section before the limits."""
-    rows = []
-    for each in found.domain.attributes:
-        row = found.table.loc[each.name].to_dict()
-        said = (each.reason or NO_REASON, each.source or NO_REASON)
-        rows.append((each.name, row["feature"] or "none", row["inside"], *said, *_shares(row)))
-    pairs = [(*names, *_shares(row)) for names, row in found.pairs.to_dict("index").items()]
-    shares = ["cells with a row", "of the volume", "of the prior"]
-    text = (
-        f"Of {found.rows:,} rows with a verdict {found.outside:,} are outside the domain, and not "
-        "counted below. A cell is a part of an attribute's range, or one of its values."
-    )
-    section = Section(
-        "domain",
-        f"The operational design domain {found.domain.name}",
-        (
-            paragraph(text),
-            table(["attribute", "feature", "inside", "reason", "source", *shares], rows),
-            table(["attribute", "with", *shares], pairs, "Pairs of attributes"),
-        ),
-    )
-    return before_limits(page, section)
-
-
-def _shares(row: Mapping[str, Any]) -> tuple[str, str, str]:
-    """Write the cells of a row, and its shares of volume and prior."""
-    mass = row["mass"]
-    prior = format_percent(mass) if mass == mass else "not known"
-    return f"{int(row['occupied'])} of {int(row['cells'])}", format_percent(row["volume"]), prior
-
 
 MAX_MODES = 8
 """Ways of failing that are written out."""

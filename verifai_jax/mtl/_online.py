@@ -24,7 +24,6 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from verifai_jax.addons.monitoring.streams import Op, Plan, streams
 from verifai_jax.core.messages.errors import missing_name
 from verifai_jax.core.values.gaps import with_gaps
 from verifai_jax.mtl._parse import parse
@@ -32,6 +31,7 @@ from verifai_jax.mtl.evaluate import Evaluator
 from verifai_jax.mtl.expression import durations_in
 from verifai_jax.mtl.formula import Formula
 from verifai_jax.mtl.semantics import Kind, Semantics, hard
+from verifai_jax.mtl.streams import Op, Plan, streams
 from verifai_jax.mtl.tree import missing_case
 
 
