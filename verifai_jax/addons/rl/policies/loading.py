@@ -23,11 +23,11 @@ from verifai_jax.addons.rl.policies.objects import from_object, read_brax
 from verifai_jax.addons.rl.policies.onnx_graph import read_graph, read_onnx
 from verifai_jax.addons.rl.policies.sb3 import read_normaliser, read_sb3
 from verifai_jax.addons.rl.policies.torch_archive import open_archive, read_member, read_state
-from verifai_jax.addons.rl.policy import Policy as OwnPolicy
-from verifai_jax.addons.rl.policy import load_policy
 from verifai_jax.core.messages.checks import check_count
 from verifai_jax.core.messages.errors import require, suggests_options
 from verifai_jax.core.messages.text import one_line
+from verifai_jax.systems.policy import Policy as OwnPolicy
+from verifai_jax.systems.policy import load_policy
 
 Network = Callable[[dict[str, Array], PyTree], PyTree]
 FORMATS = (".zip", ".onnx", ".safetensors", ".pt", ".pth", ".npz")
