@@ -49,7 +49,14 @@ def attach(
         if module == package:
             value = importlib.import_module(f"{package}.{name}")
         else:
-            value = lazy_import(module, name)
+            try:
+                value = lazy_import(module, name)
+            except ModuleNotFoundError as error:
+                if error.name is None or not f"{module}.".startswith(f"{error.name}."):
+                    raise
+                raise AttributeError(
+                    f"{package}.{name} belongs to {module}, an add-on whose files are missing"
+                ) from error
         setattr(sys.modules[package], name, value)
         return value
 
