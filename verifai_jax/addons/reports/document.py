@@ -5,7 +5,7 @@ write_report(sweep, "sweep.html")               # a sweep, an estimate, a compar
 """
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -23,7 +23,7 @@ from verifai_jax.problem.problem import Problem
 
 
 class AddedSection(Protocol):
-    """A result that adds a section to a report: `vj.error_budget`, a covered design domain."""
+    """What adds a section to a report: an error budget, a covered design domain, one of yours."""
 
     def on_page(self, page: Page) -> Page:
         """Return the page with the section."""
@@ -62,6 +62,7 @@ def write_report(
     errors: AddedSection | None = None,
     odd: DesignDomain | None = None,
     assessment: bool = False,
+    sections: Sequence[AddedSection] = (),
     progress: bool | None = None,
 ) -> Path:
     """Write the evidence report on a result as one HTML file, and its claims as JSON next to it.
@@ -86,6 +87,8 @@ def write_report(
       that a run covers. Features without their own units and reasons take those of the domain.
     - `assessment`: whether to add sections for an assessor: the claims as a tree, the nine steps of
       credibility with boxes to fill in, and a page to sign.
+    - `sections`: further sections, such as those of other packages: objects with
+      `on_page(page) -> page`.
     - `progress`: whether to show one line of progress; see `core.display.progress` for the default.
     **Raises:** `UnknownNameError` for a unit or a reason of a feature that does not exist;
     `ValueError` for an invalid number of simulations, and for a run whose rows have changed since
@@ -122,6 +125,8 @@ def write_report(
         if not isinstance(result, Run):
             raise TypeError(f"odd= is for a report on a run; got {type(result).__name__}")
         page = odd.coverage(result).on_page(page)
+    for section in sections:
+        page = section.on_page(page)
     if assessment:
         page = with_assessment(page)
     write_page(page, path)

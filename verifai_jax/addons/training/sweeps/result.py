@@ -402,8 +402,8 @@ def load_sweep(folder: str | Path, study: Study | str | None = None) -> Sweep:
 
     **Arguments:**
     - `folder`: the folder.
-    - `study`: the study or its target, such as `"specs/cartpole_training.py:safe_training"`; needed for
-      `.problem(i)` and further counterexamples. The files never name code to run.
+    - `study`: the study or its target, such as `"specs/cartpole_training.py:safe_training"`; it is
+      needed for `.problem(i)` and further counterexamples. The files never name code to run.
     **Raises:** `FileNotFoundError` for a folder without a sweep; `SweepFileError` for a damaged
     one, one of another format, or a study of another name or with other hyper-parameters.
     """
