@@ -1,6 +1,6 @@
 """A proof about a part of a feature space, as `falsify(proved=)` uses it."""
 
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Protocol, runtime_checkable
 
 from verifai_jax.problem.problem import Problem
 
@@ -8,6 +8,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
 
+@runtime_checkable
 class Proof(Protocol):
     """A result that proves the property on a part of a feature space."""
 

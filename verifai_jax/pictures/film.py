@@ -3,7 +3,7 @@
 import io
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Protocol, TypeAlias
+from typing import Protocol, TypeAlias, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float, Int, UInt8
@@ -27,6 +27,7 @@ LAST = 1500
 """Milliseconds that the last frame stays, which is the one that matters."""
 
 
+@runtime_checkable
 class Film(Protocol):
     """Pictures of one simulation that its own simulator draws; `System.filmed` returns them.
 

@@ -7,7 +7,7 @@ write_report(sweep, "sweep.html")               # a sweep, an estimate, a compar
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 from verifai_jax.addons.reports.assessment import with_assessment
 from verifai_jax.addons.reports.page import Page, write_page
@@ -22,6 +22,7 @@ from verifai_jax.falsification.run import Run
 from verifai_jax.problem.problem import Problem
 
 
+@runtime_checkable
 class AddedSection(Protocol):
     """What adds a section to a report: an error budget, a covered design domain, one of yours."""
 
@@ -30,6 +31,7 @@ class AddedSection(Protocol):
         ...
 
 
+@runtime_checkable
 class DesignDomain(Protocol):
     """An operational design domain, as `vj.read_odd` reads it."""
 

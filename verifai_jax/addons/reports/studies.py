@@ -8,7 +8,7 @@ studies.left_out                                # what was not done, and why
 import io
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any, Protocol, TypeVar
+from typing import Any, Protocol, TypeVar, runtime_checkable
 
 import numpy as np
 
@@ -41,6 +41,7 @@ LARGEST_ANIMATION = 1_500_000
 """Bytes of an animation at most."""
 
 
+@runtime_checkable
 class ModesSection(Protocol):
     """Modes of failure, as `vj.modes` finds them, in a report."""
 
