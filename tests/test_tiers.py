@@ -68,7 +68,9 @@ def test_the_tests_of_the_core_pass_without_add_ons(
     environment = {**shared_cache, "JAX_DISABLE_MOST_OPTIMIZATIONS": "1"}
     environment.update({name: os.environ[name] for name in ("XLA_FLAGS",) if name in os.environ})
     whole = [f"--ignore=tests/{name}.py" for name in WHOLE]
-    done = call(core, environment, "-m", "pytest", "-q", "-p", "no:cacheprovider", *whole, "tests")
+    quick = "not addons and not slow and not thorough and not proves"
+    words = ("-m", "pytest", "-q", "-p", "no:cacheprovider", "-m", quick, *whole, "tests")
+    done = call(core, environment, *words)
     assert done.returncode == 0, done.stdout[-4000:]
 
 
