@@ -121,7 +121,7 @@ def count_wrong(name, rates, runs, p, draw_of=bernoulli):
 
 def trained(configurations):
     """Train policies of PPO with many learning rates, discounts and seeds."""
-    from envs.cartpole import CartPoleTask
+    from envs.cartpole_task import CartPoleTask
     from verifai_jax.addons.rl import PPO, BatchedTraining, Configuration
 
     random = np.random.default_rng(0)

@@ -155,7 +155,7 @@ def frames(tiny):
 
 def training(tiny):
     """Measure PPO on the cart-pole, many learning rates side by side."""
-    from envs.cartpole import CartPoleTask
+    from envs.cartpole_task import CartPoleTask
     from verifai_jax.addons.rl import PPO
     from verifai_jax.addons.rl.batched_training import BatchedTraining, Configuration
 

@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 
 import verifai_jax as vj
-from envs.cartpole import CartPoleTask
+from envs.cartpole_task import CartPoleTask
 from envs.hopper import HopperTask, hopper
 from envs.hopper import neural as hopping
 from envs.lane_keeping import LaneKeepingTask, lane_keeping, neural

@@ -19,7 +19,7 @@ import jax
 import numpy as np
 
 from benchmarks.control_tasks import Acrobot, Pendulum
-from envs.cartpole import CartPoleTask
+from envs.cartpole_task import CartPoleTask
 from envs.mountain_car import ContinuousMountainCarTask, MountainCarTask
 from verifai_jax.addons.rl import PPO, evaluate
 from verifai_jax.addons.rl.batched_training import BatchedTraining, Configuration

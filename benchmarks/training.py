@@ -30,7 +30,7 @@ Training = Callable[[int], tuple[float, float]]
 
 def ours(task_name: str) -> Training:
     """Return our training by seed, which gives CPU seconds and the mean return of its policy."""
-    from envs.cartpole import CartPoleTask
+    from envs.cartpole_task import CartPoleTask
     from verifai_jax.addons.rl import PPO, evaluate, train
 
     if task_name == "cartpole":

@@ -8,7 +8,8 @@ Nothing is written, and the exit status is 1, if the policy did not learn to bal
 
 import sys
 
-from envs.cartpole import POLICY_FILE, CartPoleTask
+from envs.cartpole import POLICY_FILE
+from envs.cartpole_task import CartPoleTask
 from envs.training import Training
 from verifai_jax.addons.rl import PPO
 

@@ -12,7 +12,7 @@ length) and 0.1 kg.
 import verifai_jax as vj
 from envs import cartpole
 from envs.cartpole_drawing import draw
-from verifai_jax.addons.rl import PPO, Policy
+from verifai_jax.systems.policy import Policy
 
 ON_THE_TRACK = "abs(x) <= 2.4"
 UPRIGHT = "abs(theta) <= 0.20944"
@@ -129,25 +129,3 @@ def balance_with(policy: Policy) -> vj.Problem:
         description="stay on the track and upright for 4 s, whatever the pole",
         draw=draw,
     )
-
-
-# Return says how long the nominal pole stays up; whether any pole does is another question. A
-# training that varies the pole (`length_range`, `masspole_range`) sees what it is asked later.
-safe_training = vj.Study(
-    "safe_training",
-    vj.FeatureSpace(
-        {
-            "learning_rate": vj.LogUniform(3e-4, 1e-2),
-            "discount": vj.Box(0.95, 0.999),
-            "gae_lambda": vj.Box(0.9, 1.0),
-            "clip": vj.Box(0.1, 0.4),
-            "entropy": vj.Box(0.0, 0.02),
-            "length_range": vj.Box(0.0, 2.0),
-            "x0_range": vj.Box(0.05, 1.0),
-        }
-    ),
-    vj.Trainer(cartpole.CartPoleTask(), PPO(anneal=False), steps=32_768),
-    balance_with,
-    p=0.01,
-    description="which PPO trainings give a network that keeps every pole of `balance` up",
-)

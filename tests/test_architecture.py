@@ -2,9 +2,11 @@
 
 import ast
 import functools
+import importlib
 import re
 import subprocess
 import sys
+import tomllib
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -17,22 +19,39 @@ LAYERS = (
     {"core", "statistics", "_version"},
     {"features", "mtl", "search"},
     {"systems"},
-    {"problem", "rl"},
+    {"problem"},
     {"evaluation"},
-    {"verification"},
     {"falsification"},
-    {"analysis", "synthesis", "perception"},
-    {"estimation"},
-    {"faults", "training"},
-    {"reports"},
+    {"counterexamples", "pictures"},
     {"cli", "testing"},
 )
-"""Rooms from the ground up: each may import itself and the layers below its own."""
+"""Rooms of the core from the ground up: each may import itself and the layers below its own."""
 
 STANDS_ON = {
     # Neighbours in a layer do not know each other, with these exceptions.
     "statistics": {"core"},
+    "pictures": {"counterexamples"},
 }
+ADDONS = {
+    "native": set(),
+    "clusters": set(),
+    "agents": set(),
+    "simulators": set(),
+    "scenic": set(),
+    "fuzzing": set(),
+    "analysis": set(),
+    "reports": {"analysis"},
+    "monitoring": {"native", "reports"},
+    "verification": {"reports"},
+    "rl": {"simulators"},
+    "estimation": {"analysis", "monitoring", "reports", "rl", "verification"},
+    "faults": {"estimation", "reports"},
+    "synthesis": {"estimation", "verification"},
+    "perception": {"analysis"},
+    "training": {"analysis", "estimation", "monitoring", "reports", "rl"},
+    "assurance": {"analysis", "estimation", "monitoring", "reports", "verification"},
+}
+"""The other add-ons that each add-on may import; each is below those that import it."""
 USES_PUBLIC_NAMES = {"cli"}
 """Rooms that import what a user imports, from `verifai_jax` itself."""
 BESIDE = {"remote_client", "__init__", "__main__"}
@@ -116,7 +135,10 @@ def graph() -> dict[str, set[str]]:
 
 
 def room_of(module: str) -> str:
+    """Return the room of a module: a folder of the package, and `addons.NAME` for an add-on."""
     parts = module.split(".")
+    if parts[1:2] == ["addons"] and len(parts) > 2:
+        return f"addons.{parts[2]}"
     return parts[1] if len(parts) > 1 else "__init__"
 
 
@@ -133,8 +155,9 @@ def test_a_circle_would_be_found():
 
 
 def folder_of(module: str) -> str:
-    """Return the folder that holds a file, down to the second level: `estimation.trials`."""
-    return ".".join(FILES[module].relative_to(PACKAGE).parent.parts[:2])
+    """Return the folder that holds a file, down to the second level of its room."""
+    depth = 2 + (room_of(module).startswith("addons."))
+    return ".".join(FILES[module].relative_to(PACKAGE).parent.parts[:depth])
 
 
 def test_no_circle_of_folders_within_a_room():
@@ -153,7 +176,7 @@ def test_imports_point_downwards():
     wrong = []
     for module, imported in graph().items():
         room = room_of(module)
-        if room in BESIDE:
+        if room in BESIDE or room.startswith("addons"):
             continue
         for other in imported:
             to = room_of(other)
@@ -168,7 +191,42 @@ def test_imports_point_downwards():
 
 def test_every_room_stands_in_a_layer():
     rooms = {room_of(module) for module in FILES} - BESIDE
-    assert rooms == set().union(*LAYERS)
+    assert rooms == {"addons", *(f"addons.{name}" for name in ADDONS)} | set().union(*LAYERS)
+
+
+def test_the_core_imports_no_add_on_and_names_none():
+    """What the core says of add-ons are groups of entry points."""
+    wrong = [
+        name
+        for name, file in FILES.items()
+        if not room_of(name).startswith("addons")
+        and room_of(name) not in BESIDE
+        and "verifai_jax.addons" in file.read_text()
+    ]
+    assert wrong == []
+
+
+def test_add_ons_import_each_other_along_the_list():
+    assert circles({name: set(others) for name, others in ADDONS.items()}) == []
+    wrong = []
+    for module, imported in graph().items():
+        room = room_of(module)
+        if room.startswith("addons."):
+            others = {room_of(other) for other in imported} - {room}
+            addons = {each.removeprefix("addons.") for each in others if each.startswith("addons.")}
+            wrong += [f"{module}: {each}" for each in addons - ADDONS[room.split(".")[1]]]
+    assert wrong == []
+
+
+def test_entry_points_name_what_exists():
+    data = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["entry-points"]
+    groups = [group for group in data if group.startswith("verifai_jax.")]
+    assert len(groups) >= 6
+    for group in groups:
+        for target in data[group].values():
+            module, _, name = target.partition(":")
+            found = importlib.import_module(module)
+            assert not name or hasattr(found, name), target
 
 
 KINDS = {"mtl": ("Formula", "Expression"), "features": ("Domain",), "search": ("Search",)}

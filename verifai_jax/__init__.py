@@ -152,6 +152,6 @@ if TYPE_CHECKING:
     from verifai_jax.systems.ode import sin_cos as sin_cos
     from verifai_jax.testing.checking import test as test
 # Imported when first used (PEP 562), so that importing this package takes milliseconds.
-__getattr__, __dir__, __all__ = _attach(__name__, "__version__")
+__getattr__, __dir__, __all__ = _attach(__name__, "__version__", group="verifai_jax.systems")
 _claim_cores()
 _watch()

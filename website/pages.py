@@ -181,15 +181,23 @@ def _rooms() -> dict[str, tuple[Path, list[str]]]:
             if file is not None:
                 names = [f"{name}.{each}" for each in _exported(file)]
                 rooms.setdefault(name, (file, []))[1].extend(names)
-            elif (room := package.joinpath(*folder.relative_to(package).parts[:1])).is_dir():
+            elif (room := package.joinpath(*_room(folder.relative_to(package)))).is_dir():
                 rooms.setdefault(room.name, (room / "__init__.py", []))[1].append(name)
+    # Names that an add-on gives to another room, by an entry point, stand with the add-on.
+    monitoring = package / "addons" / "monitoring" / "__init__.py"
+    rooms["monitoring"] = (monitoring, [f"addons.monitoring.{n}" for n in _exported(monitoring)])
     return dict(sorted(rooms.items()))
+
+
+def _room(path: Path) -> tuple[str, ...]:
+    """Return the folder of a room: the first, or of an add-on the second."""
+    return path.parts[: 2 if path.parts[:1] == ("addons",) else 1]
 
 
 def _exported(file: Path) -> list[str]:
     return sorted(
         alias.asname
-        for node in ast.parse(file.read_text()).body
+        for node in ast.walk(ast.parse(file.read_text()))
         if isinstance(node, ast.ImportFrom)
         for alias in node.names
         if alias.asname == alias.name

@@ -406,6 +406,7 @@ def test_the_help_may_be_cut_off_too():
     assert done.stderr == b""
 
 
+@pytest.mark.addons
 @pytest.mark.parametrize("words", [["--help"], ["monitor", "always x > 0", "log.csv"]])
 def test_an_output_that_cannot_be_written_is_one_line(tmp_path, words):
     if not Path("/dev/full").exists():
@@ -457,6 +458,7 @@ def test_a_target_by_its_variable(call, tmp_path):
     assert "specs/twice.py:again" in call("list", "specs/twice.py")
 
 
+@pytest.mark.addons
 def test_folders_of_something_else(call, tmp_path):
     call("falsify", "specs/ramp.py:calm", "--search", "uniform", "--budget", 8, "--no-pictures")
     for name, file, text in (
@@ -557,6 +559,7 @@ def test_what_doctor_calls_tested_is_what_the_constraints_and_the_classifiers_sa
     assert re.findall(r"Operating System :: (.*)\"", project) == ["POSIX :: Linux"]
 
 
+@pytest.mark.addons
 class TestMonitor:
     @pytest.fixture(autouse=True)
     def recording(self, call, tmp_path):
@@ -683,6 +686,7 @@ def test_an_option_that_the_run_has_fixed_is_refused_and_not_ignored(call, optio
     assert f"{option[0].replace('--no-', '--')} is fixed in the run" in output
 
 
+@pytest.mark.addons
 def test_an_unknown_kind_of_cluster_is_refused(call):
     output = call("falsify", "specs/ramp.py:ramp", "--cluster", "dusk://a:1", code=2)
     assert "unknown kind of cluster 'dusk'; did you mean 'dask'?" in output

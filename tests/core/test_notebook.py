@@ -57,6 +57,7 @@ def test_results_show_themselves(problem, run):
     assert "trace of 4 samples every 0.5 s" in replay.trace._repr_html_()
 
 
+@pytest.mark.addons
 def test_results_of_every_verb_show_themselves():
     from verifai_jax import counterexamples
     from verifai_jax.addons import analysis, synthesis

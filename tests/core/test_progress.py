@@ -137,6 +137,7 @@ def test_one_bar_on_a_terminal_for_a_verb_and_what_it_calls(monkeypatch):
     os.close(ours)
 
 
+@pytest.mark.addons
 def test_every_verb_that_takes_long_says_what_it_is_doing():
     verbs = [
         vj.compare, vj.repair, vj.synthesize, vj.shrink, vj.explain, vj.confirm,

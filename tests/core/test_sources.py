@@ -291,6 +291,7 @@ swing = vj.Problem("swing", {"a": vj.Box(0.0, 1.0)}, system, "always hinge < 1")
 """
 
 
+@pytest.mark.addons
 def test_a_problem_in_mujoco_has_the_files_that_it_was_loaded_from(tmp_path, monkeypatch):
     pytest.importorskip("mujoco")
     monkeypatch.chdir(tmp_path)

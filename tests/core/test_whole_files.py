@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 
 import verifai_jax as vj
-from verifai_jax.addons.rl import Continuous, Policy
 from verifai_jax.core.store.atomic_files import append, replacing, unwritable
 from verifai_jax.pictures.style import new_figure, show_or_save
+from verifai_jax.systems.actions import Continuous
+from verifai_jax.systems.policy import Policy, save_policy
 
 
 def test_a_file_is_replaced_once_it_is_whole(tmp_path):
@@ -36,7 +37,7 @@ def test_what_cannot_be_written_is_named_and_keeps_what_was_there(tmp_path, monk
     layers = ((np.zeros((1, 1), np.float32), np.zeros(1, np.float32)),)
     policy = Policy(layers, None, None, None, Continuous(-1.0, 1.0))
     path, picture = tmp_path / "p.npz", tmp_path / "nofile" / "x.png"
-    vj.rl.save_policy(policy, path)
+    save_policy(policy, path)
     before = path.read_bytes()
 
     def full(*_, **__):
@@ -46,7 +47,7 @@ def test_what_cannot_be_written_is_named_and_keeps_what_was_there(tmp_path, monk
     with pytest.raises(
         OSError, match=r"p.npz cannot be written \(No space left on device\); make room"
     ):
-        vj.rl.save_policy(policy, path)
+        save_policy(policy, path)
     assert path.read_bytes() == before
     (tmp_path / "nofile").write_text("")
     with pytest.raises(OSError, match=r"x.png cannot be written \("):

@@ -202,6 +202,7 @@ def test_workers_repeat_in_another_process():
     assert "memory or chance of its own" in str(run).splitlines()[1]
 
 
+@pytest.mark.addons
 def test_an_environment_with_a_running_mean_is_found_out():
     gym = pytest.importorskip("gymnasium")
 
@@ -227,6 +228,7 @@ def test_an_environment_with_a_running_mean_is_found_out():
     assert fresh.simulation.function.environment is not system.simulation.function.environment
 
 
+@pytest.mark.addons
 def test_fuzz_claims_what_came_again():
     run = vj.fuzz(problem(failing_at(17)), 60, batch=20, progress=False)
     assert run.table.counts.violating > 0

@@ -247,6 +247,7 @@ def test_titles_and_legends_of_pictures_count_the_same(run):
         assert numbers(axes.get_title()) == [violating, n]
 
 
+@pytest.mark.addons
 def test_the_analysis_counts_the_same(run):
     if not (run.table.all["status"] == "ok").any():
         return

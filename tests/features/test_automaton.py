@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from checked_types import unchecked
 
-from verifai_jax.addons.analysis.data.columns import feature_columns
 from verifai_jax.features import Array, Box, Categorical, DiscreteBox, FeatureSpace, Signal
 from verifai_jax.features.events import Automaton, Events, Past
 from verifai_jax.testing import check_domain
@@ -285,9 +284,6 @@ def test_plain_data_and_analysis_know_it():
     assert tuple(rows) == SPACE.columns
     assert set(rows["traffic[4].kind"]) <= {"", *TRAFFIC.names}
     assert set(rows["traffic[4].who"]) <= {"", "car", "truck"}
-    import pandas as pd
-
-    assert feature_columns(pd.DataFrame(rows), SPACE) == SPACE.columns
 
 
 class TestEvents:

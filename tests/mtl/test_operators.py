@@ -145,6 +145,7 @@ def test_a_rise_and_a_fall_are_at_the_samples_where_truth_changes():
     assert str(mtl.rise(mtl.signal("x") > 0)) == "rise (x > 0)"
 
 
+@pytest.mark.addons
 def test_exponentials_and_powers_are_read():
     trace = Trace({"x": np.array([2.0, 1.0])}, dt=1.0)
     assert mtl.parse("pow(x, 3) < exp(x)") == mtl.parse("x**3 < exp(x)")

@@ -186,11 +186,11 @@ def on_cluster(address: str | None) -> "Iterator[Executor | None]":
     if address is None:
         yield None
         return
-    from verifai_jax.addons.clusters import connect
+    from verifai_jax.core.display.extensions import verb
 
     try:
         held = contextlib.ExitStack()
-        executor = held.enter_context(connect(address))
+        executor = held.enter_context(verb("cluster")(address))
     except OSError as error:
         raise CommandError(str(error), BROKEN) from error
     with held:

@@ -2,7 +2,7 @@
 
 import shlex
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -10,7 +10,9 @@ from verifai_jax.cli.exit_codes import WRONG_USAGE
 from verifai_jax.cli.json_output import command, give_result
 
 if TYPE_CHECKING:
-    from verifai_jax import Problem, Study
+    from verifai_jax import Problem
+TARGETS = "verifai_jax.targets"
+"""Entry points of classes whose objects are targets of commands, as problems are."""
 
 
 @command(name="list")
@@ -20,11 +22,13 @@ def list_targets(location: str | None) -> None:
 
     Its Python files are run for that, those of inner folders are not.
     """
-    from verifai_jax import Problem, Study
+    from verifai_jax import Problem
+    from verifai_jax.core.display.extensions import extension, extensions
     from verifai_jax.core.messages.errors import MissingExtra
     from verifai_jax.core.user_code.targets import NothingDefined, TargetError, definitions
     from verifai_jax.search import names
 
+    studies = [extension(TARGETS, name) for name in extensions(TARGETS)]
     path = Path(location or "specs")
     if location is None and not path.exists():
         raise TargetError(_no_specs())
@@ -34,7 +38,7 @@ def list_targets(location: str | None) -> None:
     listed: list[dict[str, object]] = []
     for file in files:
         try:
-            targets = definitions(str(file), Problem, Study)
+            targets = definitions(str(file), Problem, *studies)
         except MissingExtra as error:
             click.echo(f"{file}: {error}")
             continue
@@ -63,7 +67,7 @@ def list_targets(location: str | None) -> None:
         raise click.exceptions.Exit(WRONG_USAGE)
 
 
-def _describe_target(name: str, target: "Problem | Study") -> dict[str, object]:
+def _describe_target(name: str, target: "Problem | Any") -> dict[str, object]:
     formulas = getattr(target, "formulas", None)
     return {
         "target": name,
@@ -74,7 +78,7 @@ def _describe_target(name: str, target: "Problem | Study") -> dict[str, object]:
     }
 
 
-def _print_target(target: "Problem | Study") -> None:
+def _print_target(target: "Problem | Any") -> None:
     varied = ", ".join(target.space.domains)
     formulas = getattr(target, "formulas", None)
     if formulas is None:

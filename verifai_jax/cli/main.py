@@ -18,24 +18,6 @@ from typing import Any
 import click
 
 from verifai_jax._version import __version__
-from verifai_jax.addons.agents.mcp import mcp
-from verifai_jax.addons.analysis.command import analyze
-from verifai_jax.addons.assurance.commands.qualify import qualify
-from verifai_jax.addons.assurance.commands.trace import trace
-from verifai_jax.addons.estimation.commands.compare import compare
-from verifai_jax.addons.estimation.commands.estimate import estimate
-from verifai_jax.addons.estimation.commands.modes import modes
-from verifai_jax.addons.estimation.commands.trials import trials
-from verifai_jax.addons.faults.command import fmea
-from verifai_jax.addons.fuzzing.command import fuzz
-from verifai_jax.addons.monitoring.commands.formula import formula
-from verifai_jax.addons.monitoring.commands.monitor import monitor
-from verifai_jax.addons.reports.command import report
-from verifai_jax.addons.synthesis.commands.repair import repair
-from verifai_jax.addons.synthesis.commands.synthesize import synthesize
-from verifai_jax.addons.training.commands.harden import harden
-from verifai_jax.addons.training.commands.sweep import sweep
-from verifai_jax.addons.verification.command import verify
 from verifai_jax.cli.confirm import confirm
 from verifai_jax.cli.counterexamples import replay_counterexamples, save_counterexamples
 from verifai_jax.cli.doctor import doctor
@@ -47,39 +29,24 @@ from verifai_jax.cli.list import list_targets
 from verifai_jax.cli.new import new
 from verifai_jax.cli.replay import replay
 from verifai_jax.cli.shrink import shrink
+from verifai_jax.core.display.extensions import extension, extensions
 from verifai_jax.core.messages.errors import unknown_name
 
 COMMANDS = (
     falsify,
-    fuzz,
-    harden,
     list_targets,
     replay,
-    analyze,
-    monitor,
-    formula,
     doctor,
     confirm,
-    estimate,
-    verify,
-    modes,
-    fmea,
     explain,
-    repair,
     shrink,
-    sweep,
-    synthesize,
     save_counterexamples,
     replay_counterexamples,
-    compare,
-    report,
-    trace,
-    qualify,
-    trials,
-    mcp,
     new,
 )
-"""The sub-commands. Their files import nothing heavy until a command runs."""
+"""The sub-commands of the core. Their files import nothing heavy until a command runs."""
+GROUP = "verifai_jax.commands"
+"""Entry points of the sub-commands of add-ons and of other packages."""
 
 
 @contextlib.contextmanager
@@ -158,6 +125,17 @@ class _Group(click.Group):
         if received:
             raise click.exceptions.Exit(128 + received[0])
         return result
+
+    def list_commands(self, ctx: click.Context) -> list[str]:
+        return sorted({*super().list_commands(ctx), *extensions(GROUP)})
+
+    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
+        found = super().get_command(ctx, cmd_name)
+        if found is None and cmd_name in extensions(GROUP):
+            found = extension(GROUP, cmd_name)
+            found.epilog = EPILOG
+            self.add_command(found)
+        return found
 
     def resolve_command(
         self, ctx: click.Context, args: list[str]

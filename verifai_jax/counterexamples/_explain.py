@@ -47,7 +47,7 @@ class Explained(Drawn, InNotebook):
     by decreasing influence; `simulations` spent; `replay`: the trace; `notes`.
     """
 
-    _picture = "counterexamples", "plot_explanation"
+    _picture = "verifai_jax.pictures.counterexamples", "plot_explanation"
     """The deciding signal with its bound and instant, and the features."""
     row: int
     formula: str

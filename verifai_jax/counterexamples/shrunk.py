@@ -49,7 +49,7 @@ class Shrunk(Drawn, InNotebook):
     likeliest features replace the nominal ones, and distances are numbers of standard deviations.
     """
 
-    _picture = "counterexamples", "plot_shrunk"
+    _picture = "verifai_jax.pictures.counterexamples", "plot_shrunk"
     """The coordinates that depart, and the signal that breaks the property."""
     problem: Problem
     row: int

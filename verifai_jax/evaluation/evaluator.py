@@ -17,6 +17,7 @@ from jaxtyping import Array, Float, Key
 
 from verifai_jax.core.compute.compilation import power_of_two
 from verifai_jax.core.compute.keys import run_keys
+from verifai_jax.core.display.extensions import extension, extensions
 from verifai_jax.core.display.progress import count_done
 from verifai_jax.evaluation.engine import FIRST, Engine, Wanted, engine_for
 from verifai_jax.evaluation.guidance import NOTHING, Guidance
@@ -26,12 +27,14 @@ from verifai_jax.evaluation.verdicts import Verdicts
 from verifai_jax.problem.problem import Problem
 
 if TYPE_CHECKING:
-    from verifai_jax.addons.native.native_engine import NativeEngine
     from verifai_jax.core.compute.executors import Executor
     from verifai_jax.evaluation.executor_engine import ExecutorEngine, Pending
     from verifai_jax.evaluation.host_engine import HostEngine
     from verifai_jax.evaluation.journal import Journal
     from verifai_jax.evaluation.unfinished import Part
+ENGINES = "verifai_jax.engines"
+"""Entry points of engines around XLA's; those of add-ons take `(engine, wanted, budget)`."""
+NATIVE = "native"
 NOT_NATIVE = (
     "simulated without native code, which supports only systems that JAX traces, in single "
     "precision and in this process"
@@ -88,10 +91,10 @@ class Evaluator:
         self.given = given and problem.space.width > 0
         # Points are float32 whatever the precision; what a person gives is not.
         self._dtype = np.dtype(precision if self.given else "float32")
-        self.engine: Engine | NativeEngine | HostEngine | ExecutorEngine
+        self.engine: Any
         self._host: HostEngine | None = None
         self.sender: ExecutorEngine | None = None
-        self._native: NativeEngine | None = None
+        self._native: Any = None
         if executor is not None:
             from verifai_jax.evaluation import executor_engine
 
@@ -114,10 +117,10 @@ class Evaluator:
                 problem, batch, gradient, precision, clauses, guidance, self.given
             )
             wanted = engine == "native" or (engine == "auto" and budget > FIRST)
-            if wanted and precision == "float32" and keep_traces is False:
-                from verifai_jax.addons.native import native_engine
-
-                self.engine = self._native = native_engine.NativeEngine(compiled, engine, budget)
+            possible = precision == "float32" and keep_traces is False
+            if wanted and possible and NATIVE in extensions(ENGINES):
+                around = extension(ENGINES, NATIVE)
+                self.engine = self._native = around(compiled, engine, budget)
         self._not_native = ()
         if engine == "native" and self._native is None:
             self._not_native = (NOT_NATIVE,)

@@ -169,7 +169,7 @@ class RowProgram:
     @property
     def work(self) -> int:
         """Approximate number of scalar operations in a simulation with its derivative."""
-        from verifai_jax.addons.native.native_code.work import work_of
+        from verifai_jax.evaluation.work import work_of
 
         with tracing(self.inputs.purpose), in_precision(self.precision):
             if not self.gradient:

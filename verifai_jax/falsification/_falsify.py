@@ -14,6 +14,7 @@ import numpy as np
 from verifai_jax import search as searches
 from verifai_jax.core.compute.compilation import tracing
 from verifai_jax.core.compute.precision import in_precision, reproducible_settings
+from verifai_jax.core.display.extensions import verb
 from verifai_jax.core.display.progress import shows_progress
 from verifai_jax.core.messages.checks import check_options
 from verifai_jax.core.messages.errors import suggests_options
@@ -24,6 +25,7 @@ from verifai_jax.falsification import cheap as cheaply
 from verifai_jax.falsification.derived import as_simulated
 from verifai_jax.falsification.loop import COMPILE, CONFIRM, REST, SEARCH, SIMULATE, Rounds
 from verifai_jax.falsification.model_changes import continued_with
+from verifai_jax.falsification.proof import Proof
 from verifai_jax.falsification.run import Run
 from verifai_jax.falsification.run_folder import RECORD, as_made, check_not_continued, load
 from verifai_jax.falsification.running import Ending, Running
@@ -57,7 +59,6 @@ from verifai_jax.search import Search
 if TYPE_CHECKING:
     import pandas as pd
 
-    from verifai_jax.addons.verification import Verification
     from verifai_jax.core.compute.executors import Executor
     from verifai_jax.features.given import Rows
     from verifai_jax.statistics.stopping import StoppingRule
@@ -91,7 +92,7 @@ def falsify(
     keep_going: bool = False,
     engine: str = "auto",
     cheap: Problem | None = None,
-    proved: "Verification | str | Path | None" = None,
+    proved: "Proof | str | Path | None" = None,
 ) -> Run:
     """Search the feature space for inputs under which the system breaks its property.
 
@@ -168,11 +169,10 @@ def falsify(
     as_wanted(engine)
     ends = Ending(started, budget, max_seconds, stop_after, stop_when)
     of_rest: tuple[str, ...] = ()
+    proof: Proof | None = None
     if proved is not None:
-        from verifai_jax.addons.verification.result import as_verification
-
-        proved = as_verification(proved)
-        problem, of_rest = proved.rest(problem, precision), (proved.note,)
+        proof = verb("proof")(proved)
+        problem, of_rest = proof.rest(problem, precision), (proof.note,)
     default = search == AUTO
     usual = "cross_entropy" if objective == "likelihood" else "portfolio"
     search = check_search(problem, usual if default else search)
@@ -187,8 +187,8 @@ def falsify(
         options = {"seed": seed, "precision": precision, "confirm": False, "progress": False}
         found = falsify(cheap, budget=cheaply.budget_for(budget), **options)
         first = cheaply.gravest_rows(found, cheap, budget)
-    elif proved is not None and first is None and search.learns and stop_when is None:
-        first = proved.loosest(problem, budget)
+    elif proof is not None and first is None and search.learns and stop_when is None:
+        first = proof.loosest(problem, budget)
     given = check_first(problem, first, stop_when, precision)
     callbacks = check_callbacks(callbacks)
     earlier = earlier_rows(warm_start, problem)

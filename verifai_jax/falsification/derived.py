@@ -9,7 +9,7 @@ features at their nominal values. To continue the run, users name the unmodified
 from collections.abc import Mapping
 from typing import Any
 
-from verifai_jax.core.display.lazy import lazy_import
+from verifai_jax.core.display.extensions import extension
 from verifai_jax.problem.problem import Problem
 
 
@@ -26,7 +26,7 @@ def as_simulated(problem: Problem, record: Mapping[str, Any]) -> Problem:
     if derived is None or problem.system.derived is not None:
         return problem
     try:
-        return lazy_import("verifai_jax.addons.fuzzing.implicit", "as_recorded")(problem, derived)
+        return extension("verifai_jax.runs", derived["verb"]).derive(problem, derived)
     except (TypeError, ValueError, AttributeError, KeyError):
         return problem  # What differs is said where the two are compared.
 

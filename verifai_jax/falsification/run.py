@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from verifai_jax.core.compute.keys import run_keys
+from verifai_jax.core.display.extensions import verb
 from verifai_jax.core.display.lazy import lazy_import
 from verifai_jax.core.display.notebook import InNotebook
 from verifai_jax.core.user_code.sources import Change
@@ -314,7 +315,7 @@ class Run(InNotebook):
 
     def analyze(self, **options: Any) -> Any:
         """Analyse the table: rules, importance, clusters, coverage; see `analysis.analyze`."""
-        return lazy_import("verifai_jax.addons.analysis", "analyze")(self, **options)
+        return verb("analyze")(self, **options)
 
     def replay(
         self, row: "int | np.integer | pd.Series | Mapping[str, Any]", precision: str | None = None
@@ -418,7 +419,7 @@ class Run(InNotebook):
           `traces`, `studies`, `modes`, `odd`, `assessment`.
         **Returns:** the path.
         """
-        return lazy_import("verifai_jax.addons.reports", "write_report")(self, path, **options)
+        return verb("report")(self, path, **options)
 
     def explore(self) -> Any:
         """Return a view of the table for a notebook: scatter, parallel coordinates, traces.
@@ -426,7 +427,7 @@ class Run(InNotebook):
         Hovering over a row shows its values; clicking on it simulates it again. It needs anywidget
         (extra `widget`); without it the result is the picture of `plot`.
         """
-        return lazy_import("verifai_jax.addons.reports", "explore")(self)
+        return verb("explore")(self)
 
     def save(self, path: str | Path) -> Path:
         """Write the run to a folder: its record, table and state; returns the folder.

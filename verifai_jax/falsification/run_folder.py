@@ -20,7 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import ArrayLike
 
-from verifai_jax.core.display.lazy import lazy_import
+from verifai_jax.core.display.extensions import extension
 from verifai_jax.core.messages.text import one_line
 from verifai_jax.core.store import files
 from verifai_jax.core.store.files import DamagedError
@@ -147,7 +147,7 @@ def as_made(run: Run) -> Run:
     return (
         run
         if run.derived is None
-        else lazy_import("verifai_jax.addons.fuzzing.run", "as_fuzz_run")(run)
+        else extension("verifai_jax.runs", run.derived["verb"]).as_made(run)
     )
 
 

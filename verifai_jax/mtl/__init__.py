@@ -1,26 +1,8 @@
 """Metric temporal logic: formulas, their text, their robustness on traces."""
 
-from verifai_jax.addons.monitoring.c_monitor import export_c
-from verifai_jax.addons.monitoring.calibrated import (
-    DomainMonitor,
-    PredictiveMonitor,
-    domain_monitor,
-    predictive_monitor,
-)
-from verifai_jax.addons.monitoring.dense import dense_gradient, dense_robustness, dense_signal
-from verifai_jax.addons.monitoring.distinguishing import Distinction, distinguish
-from verifai_jax.addons.monitoring.exemplary import Examples, examples
-from verifai_jax.addons.monitoring.findings import Finding, Findings
-from verifai_jax.addons.monitoring.fmu_monitor import export_fmu
-from verifai_jax.addons.monitoring.judgement import Judgement
-from verifai_jax.addons.monitoring.judging import judge
-from verifai_jax.addons.monitoring.linting import lint
-from verifai_jax.addons.monitoring.mining import Mined, mine
-from verifai_jax.addons.monitoring.mutation import Mutant, Mutants, mutants
-from verifai_jax.addons.monitoring.parametric import Template, templates
-from verifai_jax.addons.monitoring.recording import TimeColumnError, read
-from verifai_jax.addons.monitoring.resampling import resample
-from verifai_jax.addons.monitoring.watching import Watch, watch
+from typing import Any
+
+from verifai_jax.core.display.extensions import member, members
 from verifai_jax.mtl._explain import Explanation, explain
 from verifai_jax.mtl._latex import latex
 from verifai_jax.mtl._online import Online, online
@@ -54,20 +36,22 @@ from verifai_jax.mtl.semantics import Semantics, boolean, hard, smooth
 from verifai_jax.mtl.setting import HorizonError, SamplingError
 
 __all__ = [
-    "FALSE", "TRUE", "Distinction", "DomainMonitor", "End", "Examples", "Explanation",
-    "Expression", "Finding", "Findings", "Formula", "FormulaSyntaxError", "HorizonError",
-    "IntervalError", "Judgement", "Mined", "Mutant", "Mutants", "Online", "PredictiveMonitor",
-    "Requirement", "SamplingError", "Semantics", "SmoothingError", "Template",
-    "TimeColumnError", "Watch", "always", "anneal", "boolean", "dense_gradient",
-    "dense_robustness", "dense_signal", "distinguish", "domain_monitor", "draw", "duration",
-    "during", "eventually", "examples", "explain", "export_c", "export_fmu", "fall", "hard",
-    "historically", "judge", "latex", "lint", "mine", "mutants", "next_", "nnf", "normalize",
-    "once", "online", "parse", "phase", "predictive_monitor", "prev", "read",
-    "read_requirements", "resample", "rise", "robustness", "robustness_signal", "satisfied",
-    "signal", "simplify", "since", "smooth", "smoothing_error", "sometime_during",
-    "templates", "until", "watch", "write_requirements",
+    "FALSE", "TRUE", "End", "Explanation", "Expression", "Formula", "FormulaSyntaxError",
+    "HorizonError", "IntervalError", "Online", "Requirement", "SamplingError", "Semantics",
+    "SmoothingError", "always", "anneal", "boolean", "draw", "duration", "during",
+    "eventually", "explain", "fall", "hard", "historically", "latex", "next_", "nnf",
+    "normalize", "once", "online", "parse", "phase", "prev", "read_requirements", "rise",
+    "robustness", "robustness_signal", "satisfied", "signal", "simplify", "since", "smooth",
+    "smoothing_error", "sometime_during", "until", "write_requirements",
 ]  # fmt: skip
+GROUP = "verifai_jax.formulas"
+"""Entry points of modules whose names belong here, too: what add-ons do with formulas."""
+
+
+def __getattr__(name: str) -> Any:
+    value = globals()[name] = member(__name__, GROUP, name, __all__)
+    return value
 
 
 def __dir__() -> list[str]:
-    return list(__all__)
+    return sorted({*__all__, *members(GROUP)})

@@ -10,7 +10,6 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float, Real
 
-from verifai_jax.addons.monitoring.columns import LeftOut
 from verifai_jax.core.messages.errors import missing_name
 from verifai_jax.core.messages.text import format_seconds, format_time
 from verifai_jax.core.values.trace import Samples, Trace, as_array, check_period
@@ -130,7 +129,7 @@ def check_signals(formula: Formula, trace: Trace, source: str) -> None:
     for name in formula.signals():
         if name not in trace.signals:
             error = missing_name(source, "signal", name, trace.signals)
-            said = [n for n in trace.notes if isinstance(n, LeftOut) and n.column == name]
+            said = [n for n in trace.notes if getattr(n, "column", None) == name]
             raise type(error)(f"{str(error).rstrip('.')}; {said[0]}") if said else error
 
 

@@ -5,18 +5,14 @@ import io
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import UInt8
 
-from verifai_jax.addons.simulators.pictures.gymnasium_film import episode_of, film_episode
-from verifai_jax.addons.simulators.pictures.mujoco_motion import can_draw, record
-from verifai_jax.addons.simulators.pictures.mujoco_scene import film
 from verifai_jax.core.store.atomic_files import replacing
 from verifai_jax.evaluation.replay import Replay
-from verifai_jax.pictures.film import LAST, MAX_FRAMES, MAX_WANTED, check_film
+from verifai_jax.pictures.film import LAST, MAX_FRAMES, MAX_WANTED, Film, check_film
 from verifai_jax.pictures.style import DPI, new_figure
 
 FRAMES_PER_SECOND = 25
@@ -67,26 +63,22 @@ def animate(
     - `fps`: frames per second; chosen automatically when left out.
     **Raises:** `ValueError` for any other problem without `draw`, for a path that does not end in
     `.gif`, a camera without a MuJoCo model, and invalid sizes; `UnknownNameError` for a camera that
-    the model lacks; `mujoco_scene.NoRenderer` if MuJoCo cannot draw.
+    the model lacks; `film.NoRenderer` if MuJoCo cannot draw.
     """
     _check_gif(path)
     check_film(size, fps)
-    draw, system = replay.problem.draw, replay.problem.system
+    draw = replay.problem.draw
+    filmed: Film | None = None if draw is not None else replay.problem.system.filmed(replay)
     pixels = None if size is None else (int(size[0]), int(size[1]))
-    if camera is not None and (draw is not None or not can_draw(system)):
+    if camera is not None and (filmed is None or not filmed.has_cameras):
         raise ValueError(
             f"camera names a camera of a MuJoCo model, which does not draw problem "
             f"{replay.problem.name!r}; leave it out, got {camera!r}"
         )
     if draw is not None:
         animation = Animation(_drawn(replay, draw, pixels or SIZE, fps))
-    elif can_draw(system):
-        with TemporaryDirectory() as folder:
-            file_path = Path(folder) / "animation.gif"
-            file = film(record(replay), file_path, pixels, camera=camera, fps=fps)
-            animation = Animation(file.read_bytes())
-    elif episode_of(system) is not None:
-        animation = Animation(film_episode(replay, pixels, fps))
+    elif filmed is not None:
+        animation = Animation(filmed.gif(pixels, camera, fps))
     else:
         raise ValueError(
             f"problem {replay.problem.name!r} cannot be animated: it has no draw function "

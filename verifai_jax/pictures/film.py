@@ -2,7 +2,8 @@
 
 import io
 from collections.abc import Sequence
-from typing import TypeAlias
+from pathlib import Path
+from typing import Protocol, TypeAlias, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float, Int, UInt8
@@ -24,6 +25,38 @@ BACKGROUND = np.array([232, 237, 242], np.uint8)
 """Colour where nothing is."""
 LAST = 1500
 """Milliseconds that the last frame stays, which is the one that matters."""
+
+
+@runtime_checkable
+class Film(Protocol):
+    """Pictures of one simulation that its own simulator draws; `System.filmed` returns them.
+
+    - `draws`: whether the simulator draws pictures as it is set up.
+    - `has_cameras`: whether a picture may be taken by a camera with a name.
+    """
+
+    draws: bool
+    has_cameras: bool
+
+    def gif(
+        self,
+        size: Sequence[int] | None = None,
+        camera: str | None = None,
+        fps: float | None = None,
+    ) -> bytes:
+        """Return an animated GIF; sizes in pixels, frames per second.
+
+        **Raises:** `NoRenderer` if drawing is not possible here; `UnknownNameError` for a camera.
+        """
+        ...
+
+    def strip(self, path: Path) -> Path | None:
+        """Write frames side by side as a PNG, and return its path; None without such a picture."""
+        ...
+
+
+class NoRenderer(RuntimeError):
+    """An error if there is no OpenGL for drawing; the message says what to install or set."""
 
 
 def check_film(size: Sequence[int] | None, fps: float | None) -> None:

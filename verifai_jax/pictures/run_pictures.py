@@ -3,13 +3,11 @@
 import logging
 from pathlib import Path
 
-from verifai_jax.addons.simulators.pictures.gymnasium_film import episode_of, write_episode
-from verifai_jax.addons.simulators.pictures.mujoco_motion import can_draw, record
-from verifai_jax.addons.simulators.pictures.mujoco_scene import NoRenderer, film, strip
 from verifai_jax.core.messages.text import format_error
 from verifai_jax.evaluation.replay import Replay
 from verifai_jax.falsification.run import Run
-from verifai_jax.pictures.animation import animate
+from verifai_jax.pictures.animation import Animation, animate
+from verifai_jax.pictures.film import NoRenderer
 from verifai_jax.pictures.replay import plot_replay
 from verifai_jax.pictures.robustness_history import plot_robustness_history
 from verifai_jax.pictures.scatter import plot_features
@@ -50,17 +48,13 @@ def write_replay_pictures(
     plot_replay(replay, paths[0])
     if replay.problem.draw is not None:
         paths.append(animate(replay).save(folder / f"{name}.gif"))
-    elif can_draw(replay.problem.system):
+    elif (filmed := replay.problem.system.filmed(replay)) is not None and filmed.draws:
         try:
-            motion = record(replay)
-            paths.append(strip(motion, folder / f"{name}-strip.png"))
-            paths.append(film(motion, folder / f"{name}.gif"))
+            if (strip := filmed.strip(folder / f"{name}-strip.png")) is not None:
+                paths.append(strip)
+            paths.append(Animation(filmed.gif()).save(folder / f"{name}.gif"))
         except NoRenderer as error:
             logging.getLogger(__name__).warning("%s", error)
-    elif (episode := episode_of(replay.problem.system)) is not None:
-        try:
-            if episode.draws:
-                paths.append(write_episode(replay, folder / f"{name}.gif"))
         except Exception as error:  # What draws there is not this package's.
             logging.getLogger(__name__).warning("no film: %s", format_error(error))
     return paths

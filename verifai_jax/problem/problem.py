@@ -20,6 +20,7 @@ from jaxtyping import Array, Float, Key
 from verifai_jax.core.compute.compilation import ProgramCache, Slot
 from verifai_jax.core.compute.precision import truncate_silently
 from verifai_jax.core.compute.purity import TRACED_ONCE, watch
+from verifai_jax.core.display.extensions import verb
 from verifai_jax.core.display.lazy import lazy_import
 from verifai_jax.core.display.notebook import InNotebook, text_html
 from verifai_jax.core.messages.checks import check_name
@@ -247,7 +248,7 @@ class Problem(InNotebook):
         one; `ValueError` for a name that exists already, a fault that a channel cannot have, and a
         system whose loop is not known.
         """
-        function = lazy_import("verifai_jax.addons.faults.injection", "with_faults")
+        function = verb("faults")
         return function(self, faults, by_simulator)
 
     def objective(

@@ -9,6 +9,7 @@ from collections.abc import Mapping
 from dataclasses import fields
 from typing import TYPE_CHECKING, Any, cast
 
+from verifai_jax.core.display.extensions import extension, extensions
 from verifai_jax.core.display.lazy import attach, lazy_import
 from verifai_jax.core.messages.errors import check_names, unknown_name
 
@@ -64,12 +65,14 @@ _SEARCHES = {
     "descent": "Descent",
     "portfolio": "Portfolio",
 }
+GROUP = "verifai_jax.searches"
+"""Entry points of searches of other packages, by name."""
 _WRAPPERS = {"diverse": "Diverse", "likeliest": "Likeliest"}
 
 
 def names() -> tuple[str, ...]:
     """Return the names of all searches that `named` can build."""
-    return tuple(_SEARCHES)
+    return (*_SEARCHES, *extensions(GROUP))
 
 
 def named(name: str, **options: Any) -> "Search":
@@ -80,9 +83,12 @@ def named(name: str, **options: Any) -> "Search":
     - `options`: hyper-parameters of the search, by name.
     **Raises:** `ValueError` for an unknown name or option, or a value out of range.
     """
-    if name not in _SEARCHES:
-        raise unknown_name("search", name, _SEARCHES)
-    kind = lazy_import(__name__, _SEARCHES[name])
+    if name in _SEARCHES:
+        kind = lazy_import(__name__, _SEARCHES[name])
+    elif name in extensions(GROUP):
+        kind = extension(GROUP, name)
+    else:
+        raise unknown_name("search", name, names())
     check_names(f"option of search {name}", options, [field.name for field in fields(kind)])
     return kind(**options)
 
@@ -108,7 +114,11 @@ def to_json(search: "Search") -> dict[str, Any] | None:
     """Describe a search as plain data; None for one that has no name here."""
     kind = type(search)
     if not kind.__module__.startswith(f"{__name__}."):
-        return None
+        of_others = {extension(GROUP, name): name for name in extensions(GROUP)}
+        if kind not in of_others:
+            return None
+        plain = {field.name: getattr(search, field.name) for field in fields(cast(Any, search))}
+        return {"name": of_others[kind], "options": plain}
     # By the name of its class, since comparing with the classes would import all of them.
     if kind.__name__ == "Split":
         splits = cast("Split", search)

@@ -85,8 +85,8 @@ class System(ForUsers):
     _internal = frozenset((
         "abstract", "backend", "backends", "black_box", "can_fold", "can_refine",
         "can_simulate_batch", "can_simulate_each", "constants", "derived", "effort", "exact_step",
-        "fold", "forward_up_to", "held_signals", "known_signals", "lanes", "likely", "links",
-        "may_draw", "passing", "refined", "renewed", "reverse_hint", "simulate_batch",
+        "filmed", "fold", "forward_up_to", "held_signals", "known_signals", "lanes", "likely",
+        "links", "may_draw", "passing", "refined", "renewed", "reverse_hint", "simulate_batch",
         "simulate_each", "switches", "traced_factor", "unroll", "why_error", "why_not",
         "with_backend", "with_domains", "with_links", "workers",
     ))  # fmt: skip
@@ -176,6 +176,14 @@ class System(ForUsers):
         **Raises:** `ValueError` for a factor that is not a positive integer.
         """
         raise NotImplementedError(f"{self!r} has no refined(factor)")
+
+    def filmed(self, replay: Any) -> Any:
+        """Return the `pictures.film.Film` of a replay that the simulator draws; None without one.
+
+        **Arguments:**
+        - `replay`: the `Replay` of one simulation.
+        """
+        return None
 
     def renewed(self) -> "System":
         """Return the same system without any state left over from its simulations.
@@ -345,6 +353,9 @@ class FunctionSystem(System):
 
     def refined(self, factor: int | Int[Array, ""]) -> System:
         return as_system(self._method("refined")(factor))
+
+    def filmed(self, replay: Any) -> Any:
+        return self._method("filmed")(replay)
 
     def held_signals(self, features: Features) -> tuple[str, ...]:
         own = self._offers("held_signals")

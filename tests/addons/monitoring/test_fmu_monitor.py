@@ -11,7 +11,7 @@ from click.testing import CliRunner
 
 import verifai_jax as vj
 from verifai_jax.addons.monitoring import fmu_monitor
-from verifai_jax.addons.native.machine_code import Unavailable
+from verifai_jax.addons.native.native_code.machine_code import Unavailable
 from verifai_jax.cli.main import main
 
 pytestmark = pytest.mark.skipif(

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from mtl_oracle import DT, Oracle, formulas, recordings
 
 from verifai_jax import mtl
-from verifai_jax.addons.native.machine_code import COMPILERS
+from verifai_jax.addons.native.native_code.machine_code import COMPILERS
 from verifai_jax.core.messages.errors import UnknownNameError
 from verifai_jax.core.values.trace import Trace
 from verifai_jax.mtl.host_values import HostValues

@@ -4,7 +4,7 @@ import shutil
 
 import pytest
 
-from verifai_jax.addons.native.machine_code import COMPILERS
+from verifai_jax.addons.native.native_code.machine_code import COMPILERS
 
 
 @pytest.fixture(scope="module", autouse=True)

@@ -4,7 +4,7 @@ import jax
 import numpy as np
 import pytest
 
-from envs.cartpole import CartPoleTask
+from envs.cartpole_task import CartPoleTask
 from verifai_jax.addons.rl import PPO, train
 from verifai_jax.addons.rl.batched_training import BatchedTraining, Configuration
 

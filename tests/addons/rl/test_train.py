@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from envs.cartpole import CartPoleTask
+from envs.cartpole_task import CartPoleTask
 from verifai_jax.addons.rl import PPO, Continuous, Discrete, Task, evaluate, train
 from verifai_jax.addons.rl.observations import ObservationStatistics, update
 

@@ -38,11 +38,5 @@ if TYPE_CHECKING:
     from verifai_jax.addons.analysis.sensitivity.morris import morris as morris
     from verifai_jax.addons.analysis.sensitivity.sensitivity import Sensitivity as Sensitivity
     from verifai_jax.addons.analysis.sensitivity.sobol import sobol_indices as sobol_indices
-    from verifai_jax.addons.assurance.odd_coverage import OddCoverage as OddCoverage
-    from verifai_jax.addons.assurance.odd_files import odd_of as odd_of
-    from verifai_jax.addons.assurance.odd_files import read_odd as read_odd
-    from verifai_jax.addons.assurance.operational_domain import (
-        OperationalDomain as OperationalDomain,
-    )
 # Imported when first used: a folder inside needs few of these names.
 __getattr__, __dir__, __all__ = attach(__name__)

@@ -55,7 +55,7 @@ class Coverage(Drawn, InNotebook):
     `hole`: the features at its centre; all None without ordered features; `samples`.
     """
 
-    _picture = "coverage", "plot_coverage"
+    _picture = "verifai_jax.addons.analysis.pictures.coverage", "plot_coverage"
     """How often each cell is occupied, and the least occupied pair."""
     table: pd.DataFrame
     untried: pd.DataFrame

@@ -41,7 +41,7 @@ class Diverse(Drawn, InNotebook):
     `radius`: the largest distance of any row from its nearest chosen one.
     """
 
-    _picture = "clusters", "plot_diverse"
+    _picture = "verifai_jax.addons.analysis.pictures.clusters", "plot_diverse"
     """The rows among all, in their order, and the distances."""
     samples: Samples
     rows: Int[np.ndarray, " k"]

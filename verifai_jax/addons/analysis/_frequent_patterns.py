@@ -54,7 +54,7 @@ class FrequentPatterns(Drawn, InNotebook):
     reference shares.
     """
 
-    _picture = "frequent_patterns", "plot_frequent_patterns"
+    _picture = "verifai_jax.addons.analysis.pictures.frequent_patterns", "plot_frequent_patterns"
     """The shares of the most distinctive combinations, and those expected."""
     samples: Samples
     items: tuple[Item, ...]

@@ -48,7 +48,7 @@ class Importance(Drawn, InNotebook):
     rows; `missing`: why a model is missing; `name` of the run.
     """
 
-    _picture = "overview", "plot_importance"
+    _picture = "verifai_jax.addons.analysis.pictures.overview", "plot_importance"
     """The losses as bars."""
     table: pd.DataFrame
     scores: dict[str, float]

@@ -65,7 +65,7 @@ class Components(Drawn, InNotebook):
     Only directions in which the rows vary are included: none if all rows are equal.
     """
 
-    _picture = "pca", "plot_components"
+    _picture = "verifai_jax.addons.analysis.pictures.pca", "plot_components"
     """The rows along the first two components, and the loadings."""
     samples: Samples
     pivot: Float[np.ndarray, " k"]

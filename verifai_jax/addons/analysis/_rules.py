@@ -92,7 +92,7 @@ class Rules(Drawn, InNotebook):
     `samples`: all rows with a verdict.
     """
 
-    _picture = "panels", "plot_rules"
+    _picture = "verifai_jax.addons.analysis.pictures.panels", "plot_rules"
     """The rules over the two features that they use most."""
     rules: tuple[Rule, ...]
     coverage: float

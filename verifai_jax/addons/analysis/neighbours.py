@@ -47,7 +47,7 @@ class Neighbours(Drawn, InNotebook):
     which they lie, None if it is not a row; `how`: how they were chosen, as text.
     """
 
-    _picture = "clusters", "plot_neighbours"
+    _picture = "verifai_jax.addons.analysis.pictures.clusters", "plot_neighbours"
     """The rows among the others, over the two features that vary most."""
     samples: Samples
     rows: Int[np.ndarray, " k"]

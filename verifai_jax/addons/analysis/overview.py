@@ -70,7 +70,7 @@ class Analysis(Drawn):
     verdict, None if there are none.
     """
 
-    _picture = "overview", "plot_overview"
+    _picture = "verifai_jax.addons.analysis.pictures.overview", "plot_overview"
     """The failures over the two most important features, with the boxes of the rules, the
     representatives of clusters, and the importances as bars."""
     name: str

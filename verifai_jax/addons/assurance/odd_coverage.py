@@ -57,6 +57,10 @@ class OddCoverage(Tabular):
     _points: pd.DataFrame = field(repr=False)
     _drawn: Codes = field(repr=False)
 
+    def on_page(self, page: Any) -> Any:
+        """Return a report's page with a section on this coverage."""
+        return lazy_import("verifai_jax.addons.assurance.odd_section", "with_odd")(page, self)
+
     def next_points(self, count: int = 10) -> pd.DataFrame:
         """Return points inside the domain that occupy many empty cells and pairs of cells.
 

@@ -63,7 +63,8 @@ class Estimate(Drawn, Reported, InNotebook):
     - `drawn`: data of the pictures.
     """
 
-    _picture = "estimate", "plot_estimate"
+    _report = "verifai_jax.addons.estimation.report.estimate_report", "estimate_page"
+    _picture = "verifai_jax.addons.estimation.pictures.estimate", "plot_estimate"
     """The interval, the splitting levels and the weights, as far as there are any."""
     name: str
     probability: float | None

@@ -60,6 +60,7 @@ class CheckedSystem(System):
         self.system, self.ranges, self.verdicts = system, dict(ranges), verdicts
         self.cells = cells
         self.derived = {
+            "verb": "fuzz",
             "ranges": {name: [float(end) for end in ends] for name, ends in ranges.items()},
             "cells": None if cells is None else {n: [*map(float, c)] for n, c in cells.items()},
             "without_formula": verdicts,

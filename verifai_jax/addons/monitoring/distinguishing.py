@@ -45,7 +45,10 @@ class Distinction(Drawn, InNotebook):
     holds: tuple[bool, bool] | None
     robustness: tuple[float, float] | None
     tried: int
-    _picture: ClassVar[tuple[str, str]] = ("requirements", "plot_distinction")
+    _picture: ClassVar[tuple[str, str]] = (
+        "verifai_jax.addons.monitoring.pictures",
+        "plot_distinction",
+    )
 
     def __bool__(self) -> bool:
         return self.trace is not None

@@ -57,7 +57,10 @@ class Examples(Drawn, InNotebook):
     barely: Trace | None = field(repr=False)
     breaking: Trace | None = field(repr=False)
     robustness: dict[str, float]
-    _picture: ClassVar[tuple[str, str]] = ("requirements", "plot_examples")
+    _picture: ClassVar[tuple[str, str]] = (
+        "verifai_jax.addons.monitoring.pictures",
+        "plot_examples",
+    )
 
     @property
     def traces(self) -> dict[str, Trace]:

@@ -13,7 +13,7 @@ from xml.etree import ElementTree
 from verifai_jax.addons.monitoring.c_monitor import export_c
 from verifai_jax.addons.monitoring.margins import margins
 from verifai_jax.addons.monitoring.watching import FLAGS
-from verifai_jax.addons.native.machine_code import Unavailable, compile_library
+from verifai_jax.addons.native.native_code.machine_code import Unavailable, compile_library
 from verifai_jax.core.messages.text import counted
 from verifai_jax.core.store.atomic_files import replacing
 from verifai_jax.mtl.formula import Formula

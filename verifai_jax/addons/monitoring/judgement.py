@@ -10,7 +10,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from verifai_jax.core.display.lazy import lazy_import
+from verifai_jax.core.display.extensions import verb
 from verifai_jax.core.display.notebook import InNotebook, frame_html
 from verifai_jax.core.messages.text import counted, printable, shorten
 from verifai_jax.core.store.atomic_files import replacing
@@ -56,6 +56,8 @@ class Judgement(InNotebook):
     **Fields:** `requirements`; `rows`, one for each recording and requirement; `inputs`, the files
     of recordings and requirements with their hashes as they were read.
     """
+
+    _report = "verifai_jax.addons.monitoring.judgement_report", "judgement_page"
 
     requirements: tuple[Requirement, ...]
     rows: tuple[Row, ...] = field(repr=False)
@@ -215,7 +217,7 @@ class Judgement(InNotebook):
 
         **Returns:** the path of the HTML file.
         """
-        return lazy_import("verifai_jax.addons.reports", "write_report")(self, path)
+        return verb("report")(self, path)
 
     def junit(self, path: str | Path) -> Path:
         """Write the verdicts as JUnit XML: a suite for each requirement, a case for each recording.

@@ -7,6 +7,7 @@ from verifai_jax.addons.reports.claims import Claim, claims_json
 from verifai_jax.addons.reports.markup import Child, Markup, bullets, element, table
 from verifai_jax.addons.reports.page import Page, Section
 from verifai_jax.addons.reports.provenance import chained, versions
+from verifai_jax.addons.reports.run_question import About
 from verifai_jax.addons.reports.sections import (
     answers_section,
     chain_table,
@@ -21,8 +22,9 @@ RECORDED = "The recordings are of the system that the requirements are about, an
 """Assumption of every claim."""
 
 
-def judgement_page(judgement: Judgement) -> Page:
+def judgement_page(judgement: Judgement, about: About, problem: object = None) -> Page:
     """Make the report on a judgement."""
+    about.check(None)
     failing, missing = judgement.failing, judgement.without_verdict
     verdicts = len(judgement.rows) - len(missing)
     fleet = counted(len(judgement.files), "recording")

@@ -69,7 +69,7 @@ class Mined(Drawn, InNotebook):
     satisfied: int
     broken: Rate
     searched: int | None = None
-    _picture: ClassVar[tuple[str, str]] = ("requirements", "plot_mined")
+    _picture: ClassVar[tuple[str, str]] = ("verifai_jax.addons.monitoring.pictures", "plot_mined")
 
     def summary(self) -> str:
         """Write the parameters that were found, and the data that they rest on."""

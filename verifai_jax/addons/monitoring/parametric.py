@@ -313,6 +313,6 @@ def templates(words: str = "", domain: str | None = None) -> tuple[Template, ...
 
 @functools.cache
 def _library() -> tuple[Template, ...]:
-    file = resources.files("verifai_jax.mtl").joinpath("templates.toml")
+    file = resources.files("verifai_jax.addons.monitoring").joinpath("templates.toml")
     entries: list[dict[str, Any]] = tomllib.loads(file.read_text(encoding="utf-8"))["template"]
     return tuple(Template(expression=entry.pop("formula"), **entry) for entry in entries)

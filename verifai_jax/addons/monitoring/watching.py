@@ -22,7 +22,7 @@ from jaxtyping import Float
 from verifai_jax.addons.monitoring.c_monitor import HEAD, HELPERS, monitor_code
 from verifai_jax.addons.monitoring.margins import ALONE, Margins, margins
 from verifai_jax.addons.monitoring.python_machine import PythonMachine
-from verifai_jax.addons.native.machine_code import Unavailable, compiler, library_file
+from verifai_jax.addons.native.native_code.machine_code import Unavailable, compiler, library_file
 from verifai_jax.core.messages.errors import missing_name
 from verifai_jax.core.values.gaps import has_truths, with_gaps
 from verifai_jax.mtl.formula import Formula

@@ -18,7 +18,7 @@ import jax
 import numpy as np
 from jaxtyping import Array, Float, Key
 
-from verifai_jax.addons.native.machine_code import Unavailable, compiler
+from verifai_jax.addons.native.native_code.machine_code import Unavailable, compiler
 from verifai_jax.core.compute.compilation import Slot
 from verifai_jax.evaluation.engine import FIRST, Engine, Wanted
 from verifai_jax.evaluation.verdicts import Verdicts

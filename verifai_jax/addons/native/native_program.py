@@ -15,7 +15,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Key
 
-from verifai_jax.addons.native.machine_code import Unavailable
 from verifai_jax.addons.native.native_code.library import (
     Library,
     approve,
@@ -23,6 +22,7 @@ from verifai_jax.addons.native.native_code.library import (
     library_name,
     load,
 )
+from verifai_jax.addons.native.native_code.machine_code import Unavailable
 from verifai_jax.addons.native.native_code.source import translate
 from verifai_jax.addons.native.native_code.values import Untranslatable
 from verifai_jax.core.compute.keys import IMPLEMENTATION, simulation_key

@@ -40,6 +40,13 @@ from verifai_jax.cli.json_output import command, give_result
 )
 @arguments.ODD
 @option(
+    "--section",
+    "sections",
+    multiple=True,
+    metavar="NAME",
+    help="Add a section of an installed package, by its entry point in verifai_jax.sections.",
+)
+@option(
     "--assessment",
     is_flag=True,
     help="Add the claims as a tree, boxes on credibility, and a page to be signed.",
@@ -59,6 +66,7 @@ def report(
     studies: bool | None,
     modes: int | None,
     odd: Path | None,
+    sections: tuple[str, ...],
     assessment: bool,
     without_problem: bool,
 ) -> None:
@@ -67,6 +75,7 @@ def report(
     FOLDER may also be a file that `estimate --json`, `compare --json` or `verify --into` wrote.
     """
     from verifai_jax.addons.reports.document import claims_path, write_report
+    from verifai_jax.core.display.extensions import extension
 
     problem, output = None, output or folder / "report.html"
     if folder.is_file():
@@ -95,6 +104,7 @@ def report(
         modes=modes,
         odd=None if odd is None else read_odd(odd),
         assessment=assessment,
+        sections=[extension("verifai_jax.sections", name)(result) for name in sections],
         problem=problem,
         files=[folder] if folder.is_file() else [],
     )

@@ -7,7 +7,6 @@ from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
-from verifai_jax.addons.fuzzing.run import FuzzRun
 from verifai_jax.falsification.run import Run
 from verifai_jax.falsification.run_folder import shown_folder
 from verifai_jax.search import named
@@ -21,7 +20,7 @@ def run_command(run: Run) -> str | None:
     search = run.search_data or {}
     objective = ["--objective", "likelihood"] if "likeliest" in search else []
     search = search.get("likeliest", search)
-    if run.target is None or not search or "name" not in search or isinstance(run, FuzzRun):
+    if run.target is None or not search or "name" not in search or run.derived:
         return None
     words = ["verifai-jax", "falsify", run.target, "--search", str(search["name"])]
     words += _options_of_search(str(search["name"]), search.get("options") or {})
@@ -60,8 +59,10 @@ def run_python(run: Run) -> str:
         f"                 budget={run.budget}, batch={run.batch}, seed={run.seed},",
         f"                 precision={run.precision!r}, confirm={run.confirm})",
     ]
-    if isinstance(run, FuzzRun):
-        lines[2:] = [f"run = vj.fuzz(problem, budget={run.budget}, seed={run.seed})"]
+    if run.derived:
+        lines[2:] = [
+            f"run = vj.{run.derived['verb']}(problem, budget={run.budget}, seed={run.seed})"
+        ]
     return "\n".join(lines)
 
 

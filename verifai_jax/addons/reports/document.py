@@ -5,39 +5,52 @@ write_report(sweep, "sweep.html")               # a sweep, an estimate, a compar
 """
 
 import json
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol, runtime_checkable
 
-from verifai_jax.addons.analysis import OperationalDomain
-from verifai_jax.addons.estimation.comparison.result import Comparison, Transfer
-from verifai_jax.addons.estimation.error_budgets.result import ErrorBudget
-from verifai_jax.addons.estimation.report.comparison_report import comparison_page
-from verifai_jax.addons.estimation.report.estimate_report import estimate_page
-from verifai_jax.addons.estimation.report.transfer_report import transfer_page
-from verifai_jax.addons.estimation.result import Estimate
-from verifai_jax.addons.faults.failure_table.report import failure_table_page
-from verifai_jax.addons.faults.failure_table.result import FailureTable
-from verifai_jax.addons.monitoring.judgement_report import judgement_page
 from verifai_jax.addons.reports.assessment import with_assessment
 from verifai_jax.addons.reports.claims import PAGE, sealed
-from verifai_jax.addons.reports.optional_sections import with_errors, with_files, with_odd
-from verifai_jax.addons.reports.page import write_page
+from verifai_jax.addons.reports.page import Page, write_page
 from verifai_jax.addons.reports.run_question import About
 from verifai_jax.addons.reports.run_report import run_page
-from verifai_jax.addons.training.sweep_report import sweep_page
-from verifai_jax.addons.training.sweeps.result import Sweep
-from verifai_jax.addons.verification.report import verification_page
-from verifai_jax.addons.verification.result import Verification
+from verifai_jax.addons.reports.sections import with_files
+from verifai_jax.core.display.figure import Reported
+from verifai_jax.core.display.lazy import lazy_import
 from verifai_jax.core.display.progress import shows_progress
 from verifai_jax.core.messages.checks import check_count
-from verifai_jax.core.messages.errors import check_names
 from verifai_jax.core.store.atomic_files import replacing
 from verifai_jax.core.user_code.sources import file_hash, hashed_files
 from verifai_jax.falsification.run import Run
-from verifai_jax.features import FeatureSpace
-from verifai_jax.mtl import Judgement
 from verifai_jax.problem.problem import Problem
+
+
+@runtime_checkable
+class AddedSection(Protocol):
+    """What adds a section to a report: an error budget, a covered design domain, one of yours."""
+
+    def on_page(self, page: Page) -> Page:
+        """Return the page with the section."""
+        ...
+
+
+@runtime_checkable
+class DesignDomain(Protocol):
+    """An operational design domain, as `vj.read_odd` reads it."""
+
+    @property
+    def units(self) -> Mapping[str, str]:
+        """The units of its attributes."""
+        ...
+
+    @property
+    def reasons(self) -> Mapping[str, str]:
+        """The reasons for the ranges of its attributes."""
+        ...
+
+    def coverage(self, run: Any) -> AddedSection:
+        """Return the part of the domain that a run covers."""
+        ...
 
 
 @shows_progress("writing the report on")
@@ -51,10 +64,11 @@ def write_report(
     studies: bool | None = None,
     modes: int | None = None,
     problem: Problem | None = None,
-    errors: ErrorBudget | None = None,
-    odd: OperationalDomain | None = None,
+    errors: AddedSection | None = None,
+    odd: DesignDomain | None = None,
     assessment: bool = False,
     files: Sequence[str | Path] = (),
+    sections: Sequence[AddedSection] = (),
     progress: bool | None = None,
 ) -> Path:
     """Write the evidence report on a result as one HTML file, and its claims as JSON next to it.
@@ -81,6 +95,8 @@ def write_report(
       credibility with boxes to fill in, and a page to sign.
     - `files`: further files that the report rests on; it lists them with their hashes, as it does
       those of `odd`.
+    - `sections`: further sections, such as those of other packages: objects with
+      `on_page(page) -> page`.
     - `progress`: whether to show one line of progress; see `core.display.progress` for the default.
     **Raises:** `UnknownNameError` for a unit or a reason of a feature that does not exist;
     `ValueError` for an invalid number of simulations, and for a run whose rows have changed since
@@ -93,55 +109,35 @@ def write_report(
     )
     if modes is not None:
         check_count("modes", modes)
-    match result:
-        case Run():
-            if result.table.changed:
-                raise ValueError(
-                    f"no report can be written on the run of {result.name!r}, because its rows "
-                    f"are the evidence: {result.damage}"
-                )
-            space = result.problem.space if result.problem else None
-            _check(about, space, result.table.features)
-            apart = errors is not None or odd is not None
-            words = None if apart else " --assessment" * assessment
-            page = run_page(result, about, traces, studies, modes, words)
-        case Sweep():
-            _check(about, result.space, result.hyperparameters)
-            page = sweep_page(result, about)
-        case Estimate():
-            _check(about, None if problem is None else problem.space, ())
-            page = estimate_page(result, about, problem)
-        case Verification():
-            _check(about, None, result.features)
-            page = verification_page(result, about, problem)
-        case Comparison():
-            _check(about, result.candidates[0].space, ())
-            page = comparison_page(result, about, problem)
-        case Transfer():
-            _check(about, result.space, ())
-            page = transfer_page(result, about)
-        case FailureTable():
-            problem = problem if result.run is None else result.run.problem
-            _check(about, None if problem is None else problem.space, ())
-            page = failure_table_page(result, about, problem)
-        case Judgement():
-            _check(about, None, ())
-            page = judgement_page(result)
-        case _:
-            kind = type(result).__name__
-            raise TypeError(
-                "a report is on a run, a sweep, an estimate, a verification, a comparison, a "
-                f"transfer, a failure table or a judgement; got {kind}"
+    if isinstance(result, Run):
+        if result.table.changed:
+            raise ValueError(
+                f"no report can be written on the run of {result.name!r}, because its rows "
+                f"are the evidence: {result.damage}"
             )
+        about.check(result.problem.space if result.problem else None, result.table.features)
+        apart = errors is not None or odd is not None
+        words = None if apart else " --assessment" * assessment
+        page = run_page(result, about, traces, studies, modes, words)
+    elif isinstance(result, Reported):
+        page = lazy_import(*result._report)(result, about, problem)
+    else:
+        raise TypeError(
+            "a report is on a run, a sweep, an estimate, a verification, a comparison, a "
+            "transfer, a failure table, a judgement or another result with a report; got "
+            f"{type(result).__name__}"
+        )
     if errors is not None:
-        page = with_errors(page, errors)
+        page = errors.on_page(page)
     if odd is not None:
         if not isinstance(result, Run):
             raise TypeError(f"odd= is for a report on a run; got {type(result).__name__}")
-        page = with_odd(page, odd.coverage(result))
+        page = odd.coverage(result).on_page(page)
     read = [*hashed_files(map(Path, files), "the result"), *(() if odd is None else odd.files)]
     if read:
         page = with_files(page, read)
+    for section in sections:
+        page = section.on_page(page)
     if assessment:
         page = with_assessment(page)
     write_page(page, path)
@@ -154,8 +150,3 @@ def write_report(
 def claims_path(path: Path) -> Path:
     """Return the path of the claims of a report."""
     return path.with_suffix(".claims.json")
-
-
-def _check(about: About, space: FeatureSpace | None, columns: Iterable[str]) -> None:
-    known = [*([] if space is None else space.domains), *columns]
-    check_names("feature", [*about.units, *about.reasons], list(dict.fromkeys(known)))

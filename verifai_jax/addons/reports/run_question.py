@@ -1,6 +1,6 @@
 """The question of a run: the property, the space with its prior, the system, the search."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -8,6 +8,7 @@ import numpy as np
 
 from verifai_jax.addons.reports.markup import Child, Markup, element, paragraph, table
 from verifai_jax.addons.reports.page import Section
+from verifai_jax.core.messages.errors import check_names
 from verifai_jax.core.messages.text import format_seconds, one_line
 from verifai_jax.falsification.run import Run
 from verifai_jax.features import FeatureSpace
@@ -33,6 +34,11 @@ class About:
 
     units: Mapping[str, str]
     reasons: Mapping[str, str]
+
+    def check(self, space: FeatureSpace | None, columns: Iterable[str] = ()) -> None:
+        """Raise `UnknownNameError` for a name that is no feature of the space and no column."""
+        known = [*([] if space is None else space.domains), *columns]
+        check_names("feature", [*self.units, *self.reasons], list(dict.fromkeys(known)))
 
 
 def question(run: Run, about: About) -> Section:

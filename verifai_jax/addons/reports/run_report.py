@@ -7,7 +7,6 @@ import numpy as np
 from verifai_jax.addons.reports.claims import Claim, about_json, claims_json
 from verifai_jax.addons.reports.commands import report_command, run_command, run_python
 from verifai_jax.addons.reports.markup import element, paragraph, preformatted
-from verifai_jax.addons.reports.optional_sections import mode_claims, modes_section
 from verifai_jax.addons.reports.page import Page, Section
 from verifai_jax.addons.reports.provenance import Input, Link, Model, chained, folder_inputs
 from verifai_jax.addons.reports.run_findings import (
@@ -110,7 +109,7 @@ def run_page(
         findings(run),
         failures(run, found, about),
         reasons(found),
-        None if found.modes is None else modes_section(found.modes, about),
+        None if found.modes is None else found.modes.section(about),
         explore(run, view, found) if run.simulations else None,
         analysis(found),
         limits(run, found, assumptions(run)),
@@ -222,7 +221,7 @@ def run_claims(run: Run, studies: Studies) -> list[Claim]:
         less = "That fewer are not enough is not claimed: the search for fewer had a budget."
         texts.append((sentence, ("a simulation of the shrunk form",), (*common, less)))
     if studies.modes is not None:
-        texts += mode_claims(studies.modes)
+        texts += studies.modes.claims()
     if without := counts.without_verdict:
         sentence = f"{without:,} of {run.simulations:,} simulations have no verdict."
         texts.append((sentence, (table_, "column status"), ()))

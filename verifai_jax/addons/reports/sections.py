@@ -222,3 +222,12 @@ def result_page(
     claimed = claims_json(name, claims, chain, about)
     warnings = model_warnings(warned or model)
     return Page(f"{name}: {kind}", headline, tone, sections, claimed, warnings=warnings)
+
+
+def with_files(page: Page, files: Sequence[Input]) -> Page:
+    """Return a page with a section on further files, which are in its claims, too."""
+    rows = [(each.name, each.role, element("code", each.sha256)) for each in files]
+    content = table(["file", "what it is", "SHA-256"], rows)
+    section = Section("files", "Further files that this report rests on", (content,))
+    claims = {**page.claims, "files": [each._asdict() for each in files]}
+    return replace(before_limits(page, section), claims=claims)

@@ -4,29 +4,21 @@ result = read_result(Path("estimate.json"))     # an Estimate, a Comparison or a
 """
 
 import json
-import math
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import MISSING, fields
 from pathlib import Path
 from typing import Any
 
-from verifai_jax.addons.estimation.comparison.result import Compared, Comparison
-from verifai_jax.addons.estimation.result import METHODS, Estimate
-from verifai_jax.addons.verification.result import KIND, Verification, load_verification
+from verifai_jax.core.display.extensions import extension, extensions
 from verifai_jax.core.messages.text import one_line
 from verifai_jax.core.user_code.sources import Sources
 from verifai_jax.features import FeatureSpace
-from verifai_jax.statistics.paired_rates import PairedRates
 
-NOT_FINITE = ("effective", "relative_error")
-"""Numbers of an estimate that JSON has as null where they are not finite."""
-OPTIONAL = ("probability", "method", "p0", "backend", "stopped")
-"""Entries of an estimate that may be null."""
+READERS = "verifai_jax.reports"
+"""Entry points that read results, by the command or the kind in their JSON."""
 
 
-def read_result(
-    file: Path, space: FeatureSpace | None = None
-) -> Estimate | Comparison | Verification:
+def read_result(file: Path, space: FeatureSpace | None = None) -> Any:
     """Read an estimate, a comparison or a verification from the JSON written by a command.
 
     **Arguments:**
@@ -40,69 +32,20 @@ def read_result(
         data = json.loads(file.read_text(encoding="utf-8"))
     except (ValueError, RecursionError):
         data = None
-    if isinstance(data, dict) and data.get("kind") == KIND:
-        return load_verification(file)
-    commands = {"estimate": _estimate, "compare": lambda each: _comparison(each, space)}
-    if not isinstance(data, dict) or data.get("command") not in commands:
+    kind = data.get("kind", data.get("command")) if isinstance(data, dict) else None
+    if not isinstance(kind, str) or kind not in extensions(READERS):
         raise ValueError(
             f"{file} is not a result of verifai-jax estimate --json or verifai-jax compare --json"
         )
     try:
-        return commands[data["command"]](data)
+        return extension(READERS, kind)(file, data, space)
     except (KeyError, TypeError, AttributeError) as error:
         raise ValueError(
             f"{file} is damaged: {one_line(str(error))} is missing, or of another form"
         ) from None
 
 
-def _estimate(data: Mapping[str, Any]) -> Estimate:
-    values = _values(Estimate, data)
-    for name in NOT_FINITE:
-        values[name] = math.nan if values.get(name) is None else float(values[name])
-    for name in ("low", "high", "confidence", "upper_bound"):
-        values[name] = float(values[name])
-    if values["method"] not in (None, *METHODS):
-        raise KeyError("method")
-    values["notes"] = tuple(map(str, values.get("notes", ())))
-    values["sources"] = _sources(values.get("sources", {}))
-    return Estimate(**values)
-
-
-def _comparison(data: Mapping[str, Any], space: FeatureSpace | None) -> Comparison:
-    import pandas as pd
-
-    if space is None:
-        raise ValueError(
-            "a comparison does not say what its features are; give a problem that was compared: "
-            "--problem FILE.py:NAME"
-        )
-    candidates = tuple(
-        Compared(
-            str(each["name"]),
-            PairedRates(**_values(PairedRates, each)),
-            int(each["both_fail"]),
-            float(each["margin"]),
-            pd.DataFrame(),
-            pd.DataFrame(),
-            space,
-        )
-        for each in data["candidates"]
-    )
-    if not candidates:
-        raise KeyError("candidates")
-    return Comparison(
-        str(data["baseline"]),
-        candidates,
-        int(data["simulations"]),
-        str(data["stopped"]),
-        float(data["seconds"]),
-        int(data["seed"]),
-        tuple(map(str, data["notes"])),
-        {str(name): _sources(each) for name, each in data.get("sources", {}).items()},
-    )
-
-
-def _sources(data: Mapping[str, Any]) -> dict[str, Any]:
+def sources_of(data: Mapping[str, Any]) -> dict[str, Any]:
     """Return the record of what a result was made of, empty if it has none.
 
     **Raises:** `ValueError` for one of another form.
@@ -110,8 +53,13 @@ def _sources(data: Mapping[str, Any]) -> dict[str, Any]:
     return Sources.from_json(data).to_json() if data else {}
 
 
-def _values(kind: type, data: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the entries that are fields of a class, each of the kind of its annotation."""
+def values_of(
+    kind: type, data: Mapping[str, Any], optional: Collection[str] = ()
+) -> dict[str, Any]:
+    """Return the entries that are fields of a class, each of the kind of its annotation.
+
+    - `optional`: the names of entries that may be null.
+    """
     values = {}
     for field in fields(kind):
         if field.name not in data:
@@ -119,7 +67,7 @@ def _values(kind: type, data: Mapping[str, Any]) -> dict[str, Any]:
                 raise KeyError(field.name)
             continue
         value = data[field.name]
-        if value is None and field.name not in (*OPTIONAL, *NOT_FINITE):
+        if value is None and field.name not in optional:
             raise KeyError(field.name)
         wanted = {int: int, float: (int, float), str: str}.get(field.type)
         if wanted is not None and value is not None and not isinstance(value, wanted):

@@ -8,15 +8,13 @@ studies.left_out                                # what was not done, and why
 import io
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any, TypeVar
+from typing import Any, Protocol, TypeVar, runtime_checkable
 
 import numpy as np
 
 from verifai_jax.addons.analysis import Analysis, analyze
-from verifai_jax.addons.estimation.failure_modes import Modes
-from verifai_jax.addons.estimation.failure_modes import modes as find_modes
 from verifai_jax.addons.reports.view import rows_to_trace, trace_data
-from verifai_jax.addons.simulators.pictures.mujoco_motion import can_draw
+from verifai_jax.core.display.extensions import extension
 from verifai_jax.core.display.figure import Figure
 from verifai_jax.core.messages.text import format_error, one_line
 from verifai_jax.counterexamples import Explained, Shrunk, explain, shrink
@@ -41,6 +39,19 @@ MODES = "The ways of failing could not be found"
 """What is said where the search for them raised."""
 LARGEST_ANIMATION = 1_500_000
 """Bytes of an animation at most."""
+
+
+@runtime_checkable
+class ModesSection(Protocol):
+    """Modes of failure, as `vj.modes` finds them, in a report."""
+
+    def section(self, about: Any) -> Any:
+        """Return their section."""
+        ...
+
+    def claims(self) -> list[tuple[str, tuple[str, ...], tuple[str, ...]]]:
+        """Return sentence, evidence and assumptions of their claims."""
+        ...
 
 
 @dataclass(frozen=True)
@@ -76,7 +87,7 @@ class Studies:
     explained: Explained | None
     shrunk: Shrunk | None
     analysis: Analysis
-    modes: Modes | None = None
+    modes: ModesSection | None = None
     left_out: tuple[str, ...] = field(default=())
     findings: tuple[str, ...] = ()
 
@@ -152,9 +163,9 @@ def study(
     )
 
 
-def _modes(run: Run, budget: int) -> Modes:
+def _modes(run: Run, budget: int) -> ModesSection:
     assert run.problem is not None
-    return find_modes(
+    return extension("verifai_jax.reports", "modes")(
         run.problem,
         budget,
         seed=run.seed,
@@ -182,7 +193,8 @@ def _failures_to_show(run: Run, found: Analysis) -> list[tuple[int, str]]:
 
 
 def _animated(replay: Replay, left_out: list[str]) -> bytes | None:
-    if replay.problem.draw is None and not can_draw(replay.problem.system):
+    filmed = replay.problem.system.filmed(replay)
+    if replay.problem.draw is None and (filmed is None or not filmed.draws):
         return None
     animation = _attempt(f"{WORST} be animated", lambda: animate(replay), left_out)
     if animation is not None and len(animation.gif) > LARGEST_ANIMATION:

@@ -9,8 +9,8 @@ from typing import TypeAlias
 from verifai_jax.addons.rl.ppo import PPO
 from verifai_jax.addons.rl.pqn import PQN
 from verifai_jax.addons.rl.sac import SAC
-from verifai_jax.addons.rl.task.task import Action
 from verifai_jax.core.messages.errors import unknown_name
+from verifai_jax.systems.actions import Action
 
 AlgorithmClass: TypeAlias = type[PPO] | type[PQN] | type[SAC]
 """The class of a training algorithm of this package."""

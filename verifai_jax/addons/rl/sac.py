@@ -27,14 +27,6 @@ from verifai_jax.addons.rl.observations import (
     update,
 )
 from verifai_jax.addons.rl.optimizer import adam, annealed
-from verifai_jax.addons.rl.policy import (
-    ACTIVATIONS,
-    Layers,
-    Policy,
-    network,
-    new_layers,
-    scale_to_range,
-)
 from verifai_jax.addons.rl.replay_buffer import (
     ReplayBuffer,
     StoredTransitions,
@@ -42,7 +34,16 @@ from verifai_jax.addons.rl.replay_buffer import (
     empty_buffer,
     sample,
 )
-from verifai_jax.addons.rl.task.task import Continuous, Task
+from verifai_jax.addons.rl.task.task import Task
+from verifai_jax.systems.actions import Continuous
+from verifai_jax.systems.policy import (
+    ACTIVATIONS,
+    Layers,
+    Policy,
+    network,
+    new_layers,
+    scale_to_range,
+)
 
 LOG_STD = (-10.0, 2.0)
 """Bounds of the logarithm of the deviation.

@@ -221,7 +221,7 @@ class Repair(Drawn, InNotebook):
     a run records them; `changed`: a sentence if the model has changed since the given run was made.
     """
 
-    _picture = "repair", "plot_repair"
+    _picture = "verifai_jax.addons.synthesis.picture", "plot_repair"
     """The worst robustness that each attack found."""
     name: str
     before: Any

@@ -33,13 +33,14 @@ MAX_ROWS = 40
 """Policies that are listed at most."""
 
 
-def sweep_page(sweep: Sweep, about: About) -> Page:
+def sweep_page(sweep: Sweep, about: About, problem: object = None) -> Page:
     """Make the report on a sweep.
 
     **Arguments:**
     - `sweep`: the sweep; its study is not needed.
     - `about`: units and reasons of the hyper-parameters.
     """
+    about.check(sweep.space, sweep.hyperparameters)
     record = sweep.record
     model = Model.of(record.sources, None if sweep.study is None else sweep.study.sources())
     frame, safe = sweep.table, sweep.safe

@@ -30,6 +30,7 @@ def verification_page(result: Verification, about: About, problem: Problem | Non
     **Arguments:**
     - `problem`: the verified problem; None if not available.
     """
+    about.check(None, result.features)
     model = Model.of([result.sources], None if problem is None else problem.sources())
     proved, broken, undecided = result.proved, result.broken, result.undecided
     shares = [format_percent(part.mass) for part in (proved, broken, undecided)]

@@ -74,7 +74,8 @@ class Verification(Drawn, Reported, InNotebook):
     - `notes`: notes for the user; `version`; `sources`: the model's files, as a run records them.
     """
 
-    _picture = "verification", "plot_verification"
+    _report = "verifai_jax.addons.verification.report", "verification_page"
+    _picture = "verifai_jax.addons.verification.picture", "plot_verification"
     _internal = frozenset((
         "check_same", "constraint", "cut", "cut_off", "ends", "left", "loosest", "note", "of_prior",
         "scales",
@@ -412,6 +413,11 @@ def described(problem: Problem) -> dict[str, Any]:
         "formulas": {name: str(formula) for name, formula in problem.formulas.items()},
         "model": digest_of_model(problem),
     }
+
+
+def read_verification(file: Path, data: object, space: object) -> Verification:
+    """Return the result in a file, for `verifai-jax report`."""
+    return load_verification(file)
 
 
 def load_verification(path: str | Path) -> Verification:

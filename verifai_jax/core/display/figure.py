@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
+from verifai_jax.core.display.extensions import verb
 from verifai_jax.core.display.lazy import lazy_import
 
 if TYPE_CHECKING:
@@ -21,7 +22,7 @@ else:
 class Drawn:
     """A result that has a picture.
 
-    - `_picture`: a module of `verifai_jax.pictures`, and its drawing function.
+    - `_picture`: a module, and its drawing function.
     """
 
     _picture: ClassVar[tuple[str, str]]
@@ -34,11 +35,16 @@ class Drawn:
         **Returns:** the Matplotlib figure.
         """
         module, function = self._picture
-        return lazy_import(f"verifai_jax.pictures.{module}", function)(self, path)
+        return lazy_import(module, function)(self, path)
 
 
 class Reported:
-    """A result on which an evidence report can be written."""
+    """A result on which an evidence report can be written.
+
+    - `_report`: a module, and its function `(result, about, problem)` that returns the page.
+    """
+
+    _report: ClassVar[tuple[str, str]]
 
     def report(self, path: str | Path, **options: Any) -> Path:
         """Write the evidence report as one HTML file, and its claims as JSON next to it.
@@ -52,7 +58,7 @@ class Reported:
           comparison also `errors`.
         **Returns:** the path of the HTML file.
         """
-        return lazy_import("verifai_jax.addons.reports", "write_report")(self, path, **options)
+        return verb("report")(self, path, **options)
 
 
 def new_figure(**options: Any) -> Figure:

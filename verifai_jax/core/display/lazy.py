@@ -21,7 +21,7 @@ def lazy_import(module: str, name: str) -> Any:
 
 
 def attach(
-    package: str, *others: str
+    package: str, *others: str, group: str | None = None
 ) -> tuple[Callable[[str], Any], Callable[[], list[str]], list[str]]:
     """Return `__getattr__`, `__dir__` and `__all__` of a package whose names are imported lazily.
 
@@ -31,6 +31,7 @@ def attach(
     **Arguments:**
     - `package`: the name of the package that is being imported.
     - `others`: further names that it already has.
+    - `group`: a group of entry points by which other packages add names; see `extensions`.
     """
     source = sys.modules[package].__loader__.get_source(package)  # pyright: ignore
     begin = source.index("if TYPE_CHECKING:")
@@ -42,14 +43,25 @@ def attach(
 
     def get(name: str) -> Any:
         if name not in module_of:
+            from verifai_jax.core.display.extensions import extension, extensions
             from verifai_jax.core.messages.errors import nearest_names
+
+            if group is not None and not name.startswith("_") and name in extensions(group):
+                return extension(group, name)
 
             raise AttributeError(f"{package} has no {name!r}{nearest_names(name, known)}")
         module = module_of[name]
         if module == package:
             value = importlib.import_module(f"{package}.{name}")
         else:
-            value = lazy_import(module, name)
+            try:
+                value = lazy_import(module, name)
+            except ModuleNotFoundError as error:
+                if error.name is None or not f"{module}.".startswith(f"{error.name}."):
+                    raise
+                raise AttributeError(
+                    f"{package}.{name} belongs to {module}, an add-on whose files are missing"
+                ) from error
         setattr(sys.modules[package], name, value)
         return value
 

@@ -21,7 +21,7 @@ from jax.core import Tracer
 from jax.errors import TracerArrayConversionError
 from jaxtyping import Array, Bool, Int, Real
 
-from verifai_jax.core.display.lazy import lazy_import
+from verifai_jax.core.display.extensions import verb
 from verifai_jax.core.display.notebook import InNotebook
 from verifai_jax.core.messages.checks import check_count, check_name, is_number
 from verifai_jax.core.messages.text import format_seconds
@@ -188,8 +188,7 @@ class Trace(InNotebook):
         **Raises:** `ValueError` for a frame without rows, numbers or sample times, and for times
         that do not increase.
         """
-        read = lazy_import("verifai_jax.addons.monitoring.recording", "read")
-        return read(frame, time=time, dt=dt, time_unit=time_unit)
+        return verb("recording")(frame, time=time, dt=dt, time_unit=time_unit)
 
     @property
     def length(self) -> int:

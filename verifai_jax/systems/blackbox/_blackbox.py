@@ -104,6 +104,9 @@ class _RowByRow(System):
         """True if the simulator declares its step a part of the system."""
         return as_system(self.simulation.function).exact_step
 
+    def filmed(self, replay: Any) -> Any:
+        return as_system(self.simulation.function).filmed(replay)
+
     def passing(self, features: Features) -> Passing:
         """Return what passes in the loop of the simulator, if it has one that is known."""
         return as_system(self.simulation.function).passing(features)

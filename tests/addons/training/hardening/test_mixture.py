@@ -8,7 +8,7 @@ import pandas as pd
 import pytest
 
 import verifai_jax as vj
-from envs.cartpole import CartPoleTask
+from envs.cartpole_task import CartPoleTask
 from specs.cartpole import balance
 from verifai_jax.addons.rl.task.ode import OdeTask
 from verifai_jax.addons.training.hardening.collecting import collect

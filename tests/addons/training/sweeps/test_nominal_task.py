@@ -5,7 +5,7 @@ import pytest
 from checked_types import unchecked
 from drifting import Drift, Point, closed_loop
 
-from envs.cartpole import CartPoleTask
+from envs.cartpole_task import CartPoleTask
 from verifai_jax.addons.training.sweeps import Study, StudyError, Trainer, sweep
 
 

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 import verifai_jax as vj
-from envs.cartpole import CartPoleTask
+from envs.cartpole_task import CartPoleTask
 from specs.cartpole import balance_with
 from verifai_jax.addons.rl import PPO, train
 from verifai_jax.addons.training.sweeps.study import Study

@@ -59,7 +59,7 @@ class Clusters(Drawn, InNotebook):
     next, on at most 2000 rows; NaN for fewer than two clusters; `radius` of DBSCAN, else None.
     """
 
-    _picture = "clusters", "plot_clusters"
+    _picture = "verifai_jax.addons.analysis.pictures.clusters", "plot_clusters"
     """The clusters over the two columns that tell them apart best."""
     samples: Samples
     assigned: Int[np.ndarray, " n"]

@@ -8,8 +8,15 @@ from jaxtyping import Float
 from verifai_jax.addons.analysis._diverse import Diverse
 from verifai_jax.addons.analysis.clustering.clusters import Clusters
 from verifai_jax.addons.analysis.neighbours import Neighbours
+from verifai_jax.addons.analysis.pictures.rows import (
+    PALETTE,
+    draw_rows,
+    name_axes,
+    pair,
+    positions,
+    two_columns,
+)
 from verifai_jax.core.display.figure import Figure
-from verifai_jax.pictures.rows import PALETTE, draw_rows, name_axes, pair, positions, two_columns
 from verifai_jax.pictures.style import (
     BOUND,
     FAILING,

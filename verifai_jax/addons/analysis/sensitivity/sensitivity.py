@@ -39,7 +39,7 @@ class Sensitivity(Drawn, InNotebook):
     `variance` of the robustness.
     """
 
-    _picture = "overview", "plot_sensitivity"
+    _picture = "verifai_jax.addons.analysis.pictures.overview", "plot_sensitivity"
     """The indices with their intervals."""
     method: str
     problem: str

@@ -4,7 +4,7 @@ found = qualify()
 found.passed; print(found); found.save("qualification")
 
 `HAZARDS` lists possible errors of the tool, each with the oracle that detects it.
-`tests/addons/assurance/qualification/test_planted_errors.py` plants each in a copy of the package to show
+`test_planted_errors.py`, in the tests of this add-on, plants each in a copy of the package to show
 it.
 """
 
@@ -104,7 +104,7 @@ class Qualification(InNotebook):
                     (
                         paragraph(
                             "Each of these errors was planted in a copy of the package, and the "
-                            "oracle next to it fell (tests/addons/assurance/qualification of the sources)."
+                            "oracle next to it fell (the tests of this add-on)."
                         ),
                         table(
                             ["error", "what it is", "oracle", "here"],

@@ -91,6 +91,8 @@ class Comparison(Reported, InNotebook):
       has the name `"baseline"`.
     """
 
+    _report = "verifai_jax.addons.estimation.report.comparison_report", "comparison_page"
+
     baseline: str
     candidates: tuple[Compared, ...]
     simulations: int
@@ -177,7 +179,8 @@ class Transfer(Drawn, Reported, InNotebook):
     - `sources`: the files of each model, as a run records them.
     """
 
-    _picture = "transfer", "plot_transfer"
+    _report = "verifai_jax.addons.estimation.report.transfer_report", "transfer_page"
+    _picture = "verifai_jax.addons.estimation.pictures.transfer", "plot_transfer"
     """The pair that parts most, and the gaps of all by the feature that matters most."""
     names: tuple[str, str]
     table: "pd.DataFrame" = field(repr=False)

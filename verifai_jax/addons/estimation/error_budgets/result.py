@@ -97,6 +97,11 @@ class ErrorBudget(Tabular):
     prior: PriorError
     simulations: int
 
+    def on_page(self, page: Any) -> Any:
+        """Return a report's page with a section on this error, and its claim."""
+        section = lazy_import("verifai_jax.addons.estimation.report.error_section", "with_errors")
+        return section(page, self)
+
     def __getitem__(self, name: str) -> ErrorPart:
         """Return the part of this name."""
         return {part.name: part for part in self.parts}[name]

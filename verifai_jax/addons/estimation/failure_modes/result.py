@@ -132,6 +132,9 @@ class Mode(InNotebook):
         )
 
 
+SECTION = "verifai_jax.addons.estimation.report.modes_section"
+
+
 @dataclass(frozen=True, eq=False)
 class Modes(Drawn, InNotebook):
     """All failing regions that were found, the most probable first.
@@ -154,7 +157,7 @@ class Modes(Drawn, InNotebook):
     - `changed`: a sentence if the model has changed since the given run was made.
     """
 
-    _picture = "modes", "plot_modes"
+    _picture = "verifai_jax.addons.estimation.pictures.modes", "plot_modes"
     """The probabilities with their intervals, and the failures of each mode."""
     name: str
     modes: tuple[Mode, ...]
@@ -173,6 +176,14 @@ class Modes(Drawn, InNotebook):
     sources: Mapping[str, Any] = field(default_factory=dict)
     changed: str = ""
     stopped: str | None = None
+
+    def section(self, about: Any) -> Any:
+        """Return the section of a report on these modes."""
+        return lazy_import(SECTION, "modes_section")(self, about)
+
+    def claims(self) -> list[tuple[str, tuple[str, ...], tuple[str, ...]]]:
+        """Return sentence, evidence and assumptions of the claims that these modes support."""
+        return lazy_import(SECTION, "mode_claims")(self)
 
     def __len__(self) -> int:
         return len(self.modes)

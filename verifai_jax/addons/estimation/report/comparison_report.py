@@ -26,6 +26,7 @@ def comparison_page(comparison: Comparison, about: About, problem: Problem | Non
     **Arguments:**
     - `problem`: the baseline problem; None if not available.
     """
+    about.check(comparison.candidates[0].space)
     # That of one side says nothing of the files of the others.
     model = Model.of(comparison.sources.values())
     first = comparison.candidates[0]

@@ -27,6 +27,7 @@ def estimate_page(estimate: Estimate, about: About, problem: Problem | None) -> 
     **Arguments:**
     - `problem`: the problem of the estimate; None if not available.
     """
+    about.check(None if problem is None else problem.space)
     model = Model.of([estimate.sources], None if problem is None else problem.sources())
     sure = format_percent(estimate.confidence)
     interval = f"{estimate.low:z.3g} to {estimate.high:z.3g}"

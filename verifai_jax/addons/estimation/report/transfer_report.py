@@ -18,8 +18,9 @@ MAX_PAIRS = 10
 """Pairs with different verdicts that are listed."""
 
 
-def transfer_page(result: Transfer, about: About) -> Page:
+def transfer_page(result: Transfer, about: About, problem: object = None) -> Page:
     """Make the report on one policy in two engines."""
+    about.check(result.space)
     model = Model.of(result.sources.values())
     a, b = result.names
     pairs: Any = result.table

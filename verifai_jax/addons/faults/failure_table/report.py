@@ -21,9 +21,11 @@ def failure_table_page(found: FailureTable, about: About, problem: Problem | Non
     """Make the report on a failure table.
 
     **Arguments:**
-    - `problem`: the problem with its faults; None if not available.
+    - `problem`: the problem with its faults, unless the table has a run.
     """
     run, sure = found.run, format_percent(found.confidence)
+    problem = problem if run is None else run.problem
+    about.check(None if problem is None else problem.space)
     model = Model.of(() if run is None else run.sources, problem and problem.sources())
     failing = [each for each in found if each.fails]
     assumed = (MODEL, NOMINAL, SAMPLED, *([] if found.rate is None else [INDEPENDENT]))

@@ -111,7 +111,8 @@ class FailureTable(Drawn, Reported, Tabular):
     - `seconds`: wall-clock time.
     """
 
-    _picture = "failure_table", "plot_failure_table"
+    _report = "verifai_jax.addons.faults.failure_table.report", "failure_table_page"
+    _picture = "verifai_jax.addons.faults.failure_table.picture", "plot_failure_table"
     """The probability of each row with its interval."""
     name: str
     effects: tuple[Effect, ...]

@@ -15,7 +15,7 @@ from verifai_jax.cli.json_output import give_result
 from verifai_jax.core.messages.text import printable
 
 if TYPE_CHECKING:
-    from verifai_jax.mtl import Judgement, Requirement
+    from verifai_jax.addons.monitoring import Judgement, Requirement
 Command = TypeVar("Command", bound=Callable[..., object])
 
 

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, UInt32
 
-from verifai_jax.addons.native import machine_code
+from verifai_jax.addons.native.native_code import machine_code
 from verifai_jax.addons.native.native_code.source import OTHERS, PRELUDE
 from verifai_jax.core.compute.remembered import remembered_as
 from verifai_jax.core.store.atomic_files import replacing

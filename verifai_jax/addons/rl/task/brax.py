@@ -16,13 +16,13 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Key
 
 from verifai_jax.addons.rl.task.stepping import ObservedState, flat_observation, match_types
-from verifai_jax.addons.rl.task.task import Continuous
 from verifai_jax.addons.simulators.environments._brax import Brax, brax
 from verifai_jax.addons.simulators.environments._playground import loaded
 from verifai_jax.addons.simulators.environments.brax_model import Env as PlaygroundEnv
 from verifai_jax.addons.simulators.environments.brax_model import explain_errors
 from verifai_jax.core.messages.checks import check_count
 from verifai_jax.core.messages.errors import suggests_options
+from verifai_jax.systems.actions import Continuous
 
 if TYPE_CHECKING:
     from brax.envs.base import Env

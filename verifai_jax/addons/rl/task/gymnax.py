@@ -19,9 +19,9 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Key, PyTree, Shaped
 
 from verifai_jax.addons.rl.task import stepping
-from verifai_jax.addons.rl.task.task import Action
 from verifai_jax.addons.simulators.environments._gymnax import Gymnax, gymnax
 from verifai_jax.core.messages.errors import suggests_options
+from verifai_jax.systems.actions import Action
 from verifai_jax.systems.pytree_checks import outline
 
 if TYPE_CHECKING:

@@ -22,10 +22,10 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Float, Key, Shaped
 
 from verifai_jax.addons.rl.task.stepping import abstract_action
-from verifai_jax.addons.rl.task.task import Action, Continuous
 from verifai_jax.addons.simulators.mujoco.model import load
 from verifai_jax.core.messages.checks import check_count
 from verifai_jax.core.messages.errors import check_names, require, suggests_options
+from verifai_jax.systems.actions import Action, Continuous
 from verifai_jax.systems.pytree_checks import outline
 
 MjModel: TypeAlias = Any

@@ -21,10 +21,10 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Float, Key, PyTree, Shaped
 
 from verifai_jax.addons.rl.task.stepping import abstract_action
-from verifai_jax.addons.rl.task.task import Action, Continuous, Discrete
 from verifai_jax.core.messages.checks import check_count, is_number
 from verifai_jax.core.messages.errors import suggests_options
 from verifai_jax.core.user_code.user_errors import check_called_with, defined_at, explain_user_error
+from verifai_jax.systems.actions import Action, Continuous, Discrete
 from verifai_jax.systems.ode.closed_loop import Ode, substep, updated
 from verifai_jax.systems.pytree_checks import as_floating, outline
 

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, DTypeLike, Float, PyTree, Shaped
 
-from verifai_jax.addons.rl.task.task import Action, Continuous, Discrete
+from verifai_jax.systems.actions import Action, Continuous, Discrete
 from verifai_jax.systems.pytree_checks import outline
 
 

@@ -24,6 +24,7 @@ from verifai_jax.addons.simulators.environments.policy_loop import (
     loop_options,
 )
 from verifai_jax.core.compute.compilation import XlaOptimization
+from verifai_jax.core.display.lazy import lazy_import
 from verifai_jax.core.messages.errors import require, suggests_options, unknown_name
 from verifai_jax.systems.base import Features
 from verifai_jax.systems.delays import DelayOption
@@ -62,6 +63,11 @@ class Brax(PolicyLoop):
     def traced_factor(self) -> bool:
         """True if JAX may trace the factor of `refined`."""
         return not self.exact_step and brax_model.steps_plainly(self.env)
+
+    def filmed(self, replay: Any) -> Any:
+        return lazy_import("verifai_jax.addons.simulators.pictures.mujoco_film", "filmed")(
+            self, replay
+        )
 
     def refined(self, factor: int | Int[Array, ""]) -> "Brax":
         """Return the same episode with a step divided by `factor`; samples and decisions stay.

@@ -40,6 +40,7 @@ from verifai_jax.addons.simulators.environments.spaces import (
     no_action,
 )
 from verifai_jax.core.compute.purity import why_differs
+from verifai_jax.core.display.lazy import lazy_import
 from verifai_jax.core.messages.checks import check_count
 from verifai_jax.core.messages.errors import require, suggests_options, unknown_name
 from verifai_jax.core.user_code.kept_state import changed, state_of
@@ -126,6 +127,12 @@ class EpisodeFunction:
 
     def __repr__(self) -> str:
         return self.name
+
+    def filmed(self, replay: Any) -> Any:
+        """Return the film of a replay, as `System.filmed` does."""
+        return lazy_import("verifai_jax.addons.simulators.pictures.gymnasium_film", "EpisodeFilm")(
+            self, replay
+        )
 
     def renewed(self) -> "EpisodeFunction":
         """Return the same function with a new environment."""

@@ -28,6 +28,7 @@ from verifai_jax.addons.simulators.mujoco.mjx_rollout import (
 from verifai_jax.addons.simulators.mujoco.model import ModelSource, load
 from verifai_jax.addons.simulators.mujoco.native_rollout import Native
 from verifai_jax.core.compute.fingerprint import used_inputs
+from verifai_jax.core.display.lazy import lazy_import
 from verifai_jax.core.messages.checks import check_count
 from verifai_jax.core.messages.errors import require, suggests_options, unknown_name
 from verifai_jax.core.values.trace import Trace
@@ -38,6 +39,7 @@ from verifai_jax.systems.clock import count_periods
 from verifai_jax.systems.delays import DelayOption, as_delay, joined, links_of
 from verifai_jax.systems.ode.integrators import check_factor
 
+FILM = "verifai_jax.addons.simulators.pictures.mujoco_film"
 BACKENDS = ("native", "mjx")
 
 
@@ -94,6 +96,9 @@ class MuJoCo(System):
             if isinstance(value, np.ndarray) and value.dtype.kind == "f":
                 found[name] = value
         return found
+
+    def filmed(self, replay: Any) -> Any:
+        return lazy_import(FILM, "filmed")(self, replay)
 
     def why_slow_to_compile(self, gradient: bool) -> str:
         compiled = self.loop.compiled

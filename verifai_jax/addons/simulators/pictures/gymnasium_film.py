@@ -1,13 +1,13 @@
 """Films of environments of Gymnasium, which draw themselves (`render_mode="rgb_array"`)."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import UInt8
 
 from verifai_jax.addons.simulators.environments import EpisodeFunction
-from verifai_jax.core.store.atomic_files import replacing
 from verifai_jax.evaluation.replay import Replay
 from verifai_jax.pictures import film
 from verifai_jax.systems.blackbox._blackbox import plain_leaves, seed_of
@@ -15,26 +15,48 @@ from verifai_jax.systems.blackbox._blackbox import plain_leaves, seed_of
 FRAMES_PER_SECOND = 20
 
 
-def episode_of(system: object) -> EpisodeFunction | None:
-    """Return the episodes of a system made by `vj.gymnasium`; None for any other."""
-    function = getattr(getattr(system, "simulation", None), "function", None)
-    return function if isinstance(function, EpisodeFunction) else None
+@dataclass(frozen=True)
+class EpisodeFilm:
+    """Pictures of a replay by its environment of Gymnasium."""
+
+    episode: EpisodeFunction
+    replay: Replay
+    has_cameras = False
+
+    @property
+    def draws(self) -> bool:
+        """Whether the environment was made with `render_mode="rgb_array"`."""
+        return self.episode.draws
+
+    def gif(
+        self,
+        size: Sequence[int] | None = None,
+        camera: str | None = None,
+        fps: float | None = None,
+    ) -> bytes:
+        """Return an animated GIF."""
+        return film_episode(self.episode, self.replay, size, fps)
+
+    def strip(self, path: Path) -> None:
+        """Write nothing: an environment has no strip of frames."""
 
 
 def film_episode(
-    replay: Replay, size: Sequence[int] | None = None, fps: float | None = None
+    episode: EpisodeFunction,
+    replay: Replay,
+    size: Sequence[int] | None = None,
+    fps: float | None = None,
 ) -> bytes:
     """Simulate an episode again in this process, and return the environment's pictures as a GIF.
 
     **Arguments:**
+    - `episode`: the episodes of the replay's system.
     - `replay`: the replay of a problem with a Gymnasium environment.
     - `size`: width and height in pixels; by default those of the environment.
     - `fps`: frames per second; `FRAMES_PER_SECOND` when left out.
     **Raises:** `ValueError` for an environment that draws no pictures.
     """
     film.check_film(size, fps)
-    episode = episode_of(replay.problem.system)
-    assert episode is not None
     clock = np.asarray(replay.trace.clock(), np.float64)
     samples, shown = film.film_samples(clock, fps, FRAMES_PER_SECOND)
     features, seed = plain_leaves(replay.features), seed_of(replay.key)
@@ -51,13 +73,6 @@ def film_episode(
             )
         )
     return film.gif(frames, shown)
-
-
-def write_episode(replay: Replay, path: Path) -> Path:
-    """Write the film of an episode; returns the path."""
-    with replacing(path) as partial:
-        partial.write_bytes(film_episode(replay))
-    return path
 
 
 def _resized(

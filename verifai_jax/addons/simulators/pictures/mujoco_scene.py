@@ -25,7 +25,15 @@ from jaxtyping import Bool, Float, Int, UInt8
 from verifai_jax.addons.simulators.pictures.mujoco_motion import Motion
 from verifai_jax.core.messages.errors import require, unknown_name
 from verifai_jax.core.store.atomic_files import replacing
-from verifai_jax.pictures.film import BACKGROUND, Frame, check_film, film_samples, gif, labelled
+from verifai_jax.pictures.film import (
+    BACKGROUND,
+    Frame,
+    NoRenderer,
+    check_film,
+    film_samples,
+    gif,
+    labelled,
+)
 
 FRAMES_PER_SECOND = 20
 SIZE = (480, 320)
@@ -33,10 +41,6 @@ SIZE = (480, 320)
 AMBIENT = 0.35
 """Ambient light at least, from 0 to 1."""
 ARROW = np.array([0.82, 0.2, 0.3, 1.0], np.float32)
-
-
-class NoRenderer(RuntimeError):
-    """An error if there is no OpenGL for drawing; the message says what to install or set."""
 
 
 def film(

@@ -18,11 +18,12 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Key, PyTree, Shaped
 
 from verifai_jax.addons.rl.batched_training import StaticTask, numbers_of
-from verifai_jax.addons.rl.task.task import Action, State, Task
+from verifai_jax.addons.rl.task.task import State, Task
 from verifai_jax.core.messages.text import format_error
 from verifai_jax.counterexamples.nominal import Nominal
 from verifai_jax.features import FeatureSpace
 from verifai_jax.problem.problem import Problem
+from verifai_jax.systems.actions import Action
 
 CAPACITY = 256
 """Maximum number of neighbourhoods in a mixture; the newest are kept."""

@@ -46,7 +46,7 @@ class Hardening(Drawn, Tabular):
       time; `version`: the version of verifai_jax.
     """
 
-    _picture = "hardening", "plot_hardening"
+    _picture = "verifai_jax.addons.training.pictures.hardening", "plot_hardening"
     """Failure probability and return of each round."""
     problem: str
     table: pd.DataFrame

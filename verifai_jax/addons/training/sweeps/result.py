@@ -73,7 +73,8 @@ class Sweep(Drawn, Reported):
       cached before, and of all; empty for a loaded sweep.
     """
 
-    _picture = "sweep", "plot_sweep"
+    _report = "verifai_jax.addons.training.sweep_report", "sweep_page"
+    _picture = "verifai_jax.addons.training.pictures.sweep", "plot_sweep"
     """Return against failure probability, learning curves and importances."""
     record: SweepRecord
     study: Study | None = None
@@ -401,8 +402,8 @@ def load_sweep(folder: str | Path, study: Study | str | None = None) -> Sweep:
 
     **Arguments:**
     - `folder`: the folder.
-    - `study`: the study or its target, such as `"specs/cartpole.py:safe_training"`; needed for
-      `.problem(i)` and further counterexamples. The files never name code to run.
+    - `study`: the study or its target, such as `"specs/cartpole_training.py:safe_training"`; it is
+      needed for `.problem(i)` and further counterexamples. The files never name code to run.
     **Raises:** `FileNotFoundError` for a folder without a sweep; `SweepFileError` for a damaged
     one, one of another format, or a study of another name or with other hyper-parameters.
     """

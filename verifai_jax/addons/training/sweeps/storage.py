@@ -19,7 +19,6 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from verifai_jax.addons.rl.policies import policy as load
-from verifai_jax.addons.rl.policy import Policy, save_policy
 from verifai_jax.addons.training.sweeps.record import Curve, SweepRecord, TrainedPolicy
 from verifai_jax.core.messages.text import one_line
 from verifai_jax.core.store import files
@@ -27,6 +26,7 @@ from verifai_jax.core.store.files import DamagedError, checksum, plain
 from verifai_jax.core.store.locks import write_lock
 from verifai_jax.core.user_code.sources import Sources
 from verifai_jax.features import FeatureSpace
+from verifai_jax.systems.policy import Policy, save_policy
 
 if TYPE_CHECKING:
     import pandas as pd

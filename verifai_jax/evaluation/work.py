@@ -1,12 +1,14 @@
 """The counted work of a program, which decides whether native compilation pays."""
 
-import numpy as np
+from typing import Any
 
-from verifai_jax.addons.native.native_code.values import Program
+import numpy as np
+from jax.extend.core import Jaxpr
+
 from verifai_jax.core.compute.fingerprint import programs_in
 
 
-def work_of(program: Program) -> int:
+def work_of(program: Jaxpr) -> int:
     """Count the scalar operations of a `Jaxpr`; those in loops count as often as they run.
 
     For a loop with a condition one iteration counts, for a conditional all branches.
@@ -17,5 +19,6 @@ def work_of(program: Program) -> int:
         if inside:
             count += inside * int(step.params.get("length", 1))
         else:
-            count += sum(int(np.prod(np.shape(each.aval))) for each in step.outvars)
+            shapes: list[Any] = [each.aval for each in step.outvars]
+            count += sum(int(np.prod(each.shape)) for each in shapes)
     return count

@@ -7,12 +7,13 @@ import numpy as np
 import pytest
 
 from envs import cartpole as cp
+from envs.cartpole_task import CartPoleTask
 from specs.cartpole import balance_with
 from verifai_jax.addons.rl import Discrete, Policy, evaluate, load_policy
-from verifai_jax.addons.rl.policy import new_layers
 from verifai_jax.core.messages.errors import UnknownNameError
 from verifai_jax.core.values.trace import Status
 from verifai_jax.evaluation.verdicts import trace_verdict
+from verifai_jax.systems.policy import new_layers
 
 KEY = jax.random.key(0)
 
@@ -123,7 +124,7 @@ def test_finer_step_converges():
 
 
 def test_shipped_network_balances_cartpole_v1():
-    returns = evaluate(cp.CartPoleTask(), load_policy(cp.POLICY_FILE), seed=5, episodes=300)
+    returns = evaluate(CartPoleTask(), load_policy(cp.POLICY_FILE), seed=5, episodes=300)
     assert returns.mean() >= 475
 
 
@@ -151,7 +152,7 @@ def test_shipped_network_fails_off_nominal():
 def test_task_steps_like_gymnasium():
     env = gymnasium.make("CartPole-v1").unwrapped
     env.reset(seed=0)
-    task = cp.CartPoleTask()
+    task = CartPoleTask()
     state = cp.Episode(cp.State(*(jnp.float32(v) for v in env.state)), {})
     step = jax.jit(task.step)
     for action in [1, 0, 0] + [1] * 20:
@@ -167,7 +168,7 @@ def test_task_steps_like_gymnasium():
 
 @pytest.mark.thorough
 def test_an_episode_has_its_own_pole_and_start():
-    task = cp.CartPoleTask(masspole_range=1.0, length_range=0.5, x0_range=1.0, theta0_range=0.1)
+    task = CartPoleTask(masspole_range=1.0, length_range=0.5, x0_range=1.0, theta0_range=0.1)
     assert len(jax.tree.leaves(task)) == 5
     episodes = jax.vmap(task.reset)(jax.random.split(KEY, 4000))
     for name, least, most in (("masspole", 0.05, 0.2), ("length", 1 / 3, 0.75)):
@@ -190,7 +191,7 @@ def test_an_episode_has_its_own_pole_and_start():
 
 
 def test_shaping_sums_to_the_difference_of_potentials():
-    task = cp.CartPoleTask(potential=3.0, shaping_discount=0.9)
+    task = CartPoleTask(potential=3.0, shaping_discount=0.9)
     state = cp.State(*(jnp.float32(v) for v in (1.2, 0.0, cp.THETA_LIMIT / 2, 0.0)))
     episode, total, weight, over = cp.Episode(state, {}), 0.0, 1.0, False
     step = jax.jit(task.step)
@@ -203,9 +204,9 @@ def test_shaping_sums_to_the_difference_of_potentials():
 
 def test_task_refuses_numbers_out_of_range():
     with pytest.raises(ValueError, match=r"CartPoleTask's x0_range must be between 0 and 2.4; got"):
-        cp.CartPoleTask(x0_range=3.0)
+        CartPoleTask(x0_range=3.0)
     with pytest.raises(ValueError, match="length_range must be at least 0; got -1"):
-        cp.CartPoleTask(length_range=-1)
+        CartPoleTask(length_range=-1)
 
 
 @pytest.mark.slow

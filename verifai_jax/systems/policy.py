@@ -23,13 +23,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Int, Key
 
-from verifai_jax.addons.rl.task.task import Action, Continuous, Discrete
-from verifai_jax.core.display.lazy import lazy_import
+from verifai_jax.core.display.extensions import verb
 from verifai_jax.core.messages.checks import check_count, is_number
 from verifai_jax.core.messages.errors import check_names
 from verifai_jax.core.messages.text import one_line
 from verifai_jax.core.store.atomic_files import replacing
 from verifai_jax.core.user_code.source_collection import made_here, sources_of
+from verifai_jax.systems.actions import Action, Continuous, Discrete
 
 Layer = tuple[Float[Array | np.ndarray, "... _ _"], Float[Array | np.ndarray, "... _"]]
 Layers = tuple[Layer, ...]
@@ -109,13 +109,11 @@ class Policy:
             save_policy(self, path)
             return Path(path)
         graph, arrays, start = self.as_graph()
-        return lazy_import("verifai_jax.addons.rl.policies.base", "write")(
-            graph, arrays, start, Path(path)
-        )
+        return verb("policies").write(graph, arrays, start, Path(path))
 
     def as_graph(self, observation: object = None) -> tuple[Any, Any, Any]:
         """Return the policy as a graph of ONNX operators, like policies of other frameworks."""
-        as_any = lazy_import("verifai_jax.addons.rl.policies.base", "Policy")(self, _act)
+        as_any = verb("policies").Policy(self, _act)
         return as_any.as_graph(np.zeros(self.layers[0][0].shape[0]))
 
 

@@ -23,7 +23,7 @@ from verifai_jax.evaluation.layout import chunks_and_lanes
 from verifai_jax.mtl import _robustness as lane_chunks
 from verifai_jax.mtl import parallel, sequential, windows
 
-ROOT = Path(__file__).parents[2]
+ROOT = Path(__file__).parents[3]
 
 
 def line(features, key):
