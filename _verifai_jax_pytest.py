@@ -200,8 +200,8 @@ def _tell(item: pytest.Item, now: Any) -> None:
 
     for outcome in now.outcomes:
         item.user_properties += list(outcome.properties.items())
-    if now.outcomes and hasattr(item, "function"):
-        item.user_properties.append(("vj_source", source_hash(item.function)))
+    if now.outcomes and (function := getattr(item, "function", None)) is not None:
+        item.user_properties.append(("vj_source", source_hash(function)))
 
 
 def _failure(item: pytest.Item, found: Any, target: str | None) -> str:

@@ -169,9 +169,8 @@ def falsify(
     as_wanted(engine)
     ends = Ending(started, budget, max_seconds, stop_after, stop_when)
     of_rest: tuple[str, ...] = ()
-    proof: Proof | None = None
-    if proved is not None:
-        proof = verb("proof")(proved)
+    proof: Proof | None = None if proved is None else verb("proof")(proved)
+    if proof is not None:
         problem, of_rest = proof.rest(problem, precision), (proof.note,)
     default = search == AUTO
     usual = "cross_entropy" if objective == "likelihood" else "portfolio"

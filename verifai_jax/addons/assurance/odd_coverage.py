@@ -19,6 +19,7 @@ from jaxtyping import Int
 from verifai_jax.addons.analysis.data.samples import Samples, Source
 from verifai_jax.addons.assurance.odd_conditions import Attribute
 from verifai_jax.addons.assurance.operational_domain import OperationalDomain, choices_of, words
+from verifai_jax.core.display.lazy import lazy_import
 from verifai_jax.core.display.notebook import Tabular
 from verifai_jax.core.messages.checks import check_count
 from verifai_jax.core.messages.text import format_percent

@@ -140,7 +140,7 @@ class LimitState:
         self.simulations = self.evaluated = self.failures = self.no_verdict = 0
         self.pilot: tuple[int, int, int] = (0, 0, 0)
         # Independent searches that were made, and those that found failures.
-        self.searches = (0, 0)
+        self.searches: tuple[int, int] = (0, 0)
         """Simulations, failures and missing verdicts of the first samples of the prior."""
         self.own_chance = ""
         """A sentence on memory or chance that does not come from the random key; empty if none."""

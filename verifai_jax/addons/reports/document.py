@@ -20,7 +20,7 @@ from verifai_jax.core.display.lazy import lazy_import
 from verifai_jax.core.display.progress import shows_progress
 from verifai_jax.core.messages.checks import check_count
 from verifai_jax.core.store.atomic_files import replacing
-from verifai_jax.core.user_code.sources import file_hash, hashed_files
+from verifai_jax.core.user_code.sources import Source, file_hash, hashed_files
 from verifai_jax.falsification.run import Run
 from verifai_jax.problem.problem import Problem
 
@@ -46,6 +46,11 @@ class DesignDomain(Protocol):
     @property
     def reasons(self) -> Mapping[str, str]:
         """The reasons for the ranges of its attributes."""
+        ...
+
+    @property
+    def files(self) -> Sequence[Source]:
+        """The files that it was read from, with their hashes."""
         ...
 
     def coverage(self, run: Any) -> AddedSection:

@@ -1,11 +1,12 @@
 """Sections common to reports on all kinds of results: claims, inputs, versions, the question."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 from verifai_jax.addons.reports.claims import Claim, claims_json
 from verifai_jax.addons.reports.markup import Child, Markup, bullets, element, paragraph, table
-from verifai_jax.addons.reports.page import Page, Section
+from verifai_jax.addons.reports.page import Page, Section, before_limits
 from verifai_jax.addons.reports.provenance import Input, Link, Model, chained, versions
 from verifai_jax.addons.reports.run_question import About, property_content, space_table
 from verifai_jax.problem.problem import Problem

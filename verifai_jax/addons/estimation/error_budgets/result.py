@@ -7,8 +7,9 @@ budget.low, budget.high; budget["step"].low; budget.prior.radius
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
+from verifai_jax.core.display.lazy import lazy_import
 from verifai_jax.core.display.notebook import Tabular
 from verifai_jax.core.messages.text import format_percent
 

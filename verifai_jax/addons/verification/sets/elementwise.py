@@ -181,7 +181,8 @@ def _convert(t: Interpreter, step: Equation, inputs: list[Value]) -> list[Value]
         if dtype == np.bool_:
             return [whole.compared("ne", np.sign(value.low), np.sign(value.high))]
         if value.is_point:
-            return [Whole(*[value.low.astype(dtype).astype(np.int64)] * 2, dtype)]
+            exact = value.low.astype(dtype).astype(np.int64)
+            return [Whole(exact, exact, dtype)]
         return [Whole(value.low, value.high, dtype)]
     low, high = value.bounds()
     if dtype == np.bool_:
@@ -189,8 +190,8 @@ def _convert(t: Interpreter, step: Equation, inputs: list[Value]) -> list[Value]
     # Of what does not fit the machine may make any number, as of integers that leave their type.
     far = ~((np.abs(low) < whole.FAR) & (np.abs(high) < whole.FAR))
     ends = zip(whole.limits(np.dtype(np.int64)), (low, high), strict=True)
-    ends = (np.where(far, upper, np.trunc(end).astype(np.int64)) for upper, end in ends)
-    return [Whole(*ends, dtype)]
+    first, last = (np.where(far, upper, np.trunc(end).astype(np.int64)) for upper, end in ends)
+    return [Whole(first, last, dtype)]
 
 
 @rule(

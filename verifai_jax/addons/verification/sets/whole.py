@@ -172,14 +172,15 @@ OPERATIONS: dict[str, Callable[[Whole, Whole], Whole]] = {
 def total(a: Whole, axes: Sequence[int]) -> Whole:
     """Return the sum over axes."""
     lead = tuple(axis + 1 for axis in axes)
-    ends = (exactly(lambda end: end.sum(lead), end) for end in (a.low, a.high))
-    return Whole(*ends, a.dtype)
+    low, high = (exactly(lambda end: end.sum(lead), end) for end in (a.low, a.high))
+    return Whole(low, high, a.dtype)
 
 
 def power(a: Whole, n: int) -> Whole:
     """Return `a ** n`, for `n` of 0 or more."""
     size = _absolute(a) if n % 2 == 0 else a
-    return Whole(*(exactly(lambda end: end**n, end) for end in (size.low, size.high)), a.dtype)
+    low, high = (exactly(lambda end: end**n, end) for end in (size.low, size.high))
+    return Whole(low, high, a.dtype)
 
 
 def _absolute(a: Whole) -> Whole:
