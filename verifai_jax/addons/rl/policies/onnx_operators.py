@@ -98,7 +98,7 @@ def _gemm(node: Node, a: Value, b: Value, c: Value | None = None) -> Value:
     alpha, beta = node.get("alpha", 1.0), node.get("beta", 1.0)
     if whole(a):
         odd = alpha != int(alpha) or beta != int(beta)
-        node.refuse(odd, f"has alpha={alpha:g} and beta={beta:g} for whole numbers")
+        node.refuse(odd, f"has alpha={alpha:zg} and beta={beta:zg} for whole numbers")
         alpha, beta = int(alpha), int(beta)
     product = jnp.matmul(a, b)
     product = product if alpha == 1 else alpha * product

@@ -94,8 +94,7 @@ def limits(dtype: np.dtype) -> tuple[int, int]:
 def exactly(operation: Callable[..., Numbers], *ends: Numbers) -> Numbers:
     """Compute in whole numbers; what is `FAR`, or not defined, becomes an end of 64 bits.
 
-    **Arguments:**
-    - `operation`: a function of whole numbers that also takes real ones, to know its size.
+    The operation is applied to real numbers, too, to know the size of its result.
     """
     size, result = operation(*(np.asarray(end, float) for end in ends)), operation(*ends)
     far = ~(np.abs(size) < FAR)
@@ -106,11 +105,7 @@ def exactly(operation: Callable[..., Numbers], *ends: Numbers) -> Numbers:
 def by_corners(
     operation: Callable[..., Numbers], a: Whole, b: Whole, *others: Numbers, dtype: np.dtype
 ) -> Whole:
-    """Return the results of an operation that is monotone in each of its operands.
-
-    **Arguments:**
-    - `others`: further numbers of the second operand at which it is evaluated.
-    """
+    """Return the results of an operation that is monotone between corners, and `others` of `b`."""
     values = [exactly(operation, x, y) for x in (a.low, a.high) for y in (b.low, b.high, *others)]
     return Whole(np.minimum.reduce(values), np.maximum.reduce(values), dtype)
 
