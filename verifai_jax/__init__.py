@@ -16,8 +16,8 @@ if TYPE_CHECKING:
     from verifai_jax.addons import perception as perception
     from verifai_jax.addons import rl as rl
     from verifai_jax.addons.analysis import boundary as boundary
-    from verifai_jax.addons.analysis import odd_of as odd_of
-    from verifai_jax.addons.analysis import read_odd as read_odd
+    from verifai_jax.addons.assurance.odd_files import odd_of as odd_of
+    from verifai_jax.addons.assurance.odd_files import read_odd as read_odd
     from verifai_jax.addons.assurance.qualification import qualify as qualify
     from verifai_jax.addons.assurance.traceability import TraceMatrix as TraceMatrix
     from verifai_jax.addons.assurance.traceability import trace_matrix as trace_matrix
