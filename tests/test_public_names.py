@@ -97,10 +97,14 @@ def signature_text(function: Callable[..., Any]) -> str:
     return f"({', '.join(parts)}){result}"
 
 
-def members(kind: type) -> Iterator[str]:
-    """Yield a line for each public attribute and method that a class of this package has."""
+def members(kind: type, known: set[type]) -> Iterator[str]:
+    """Yield a line for each public attribute and method of a class, each where it is defined.
+
+    - `known`: the public classes; what is inherited from them is listed there.
+    """
     ours = [base for base in kind.__mro__ if base.__module__.startswith("verifai_jax")]
-    names = {name for base in ours for name in vars(base) if not name.startswith("_")}
+    own = [base for base in ours if base is kind or base not in known]
+    names = {name for base in own for name in vars(base) if not name.startswith("_")}
     for name in sorted(names):
         value = inspect.getattr_static(kind, name)
         if isinstance(value, staticmethod | classmethod):
@@ -113,15 +117,19 @@ def members(kind: type) -> Iterator[str]:
             yield name
 
 
-def listing(module: types.ModuleType, prefix: str) -> Iterator[str]:
-    """Yield the lines of a module's public names."""
+def listing(
+    module: types.ModuleType, prefix: str, known: set[type], listed: set[type]
+) -> Iterator[str]:
+    """Yield the lines of a module's public names; members of a class under its first name."""
     for name in sorted(dir(module)):
         value = getattr(module, name)
         if isinstance(value, types.ModuleType) or name == "__version__":
             yield f"{prefix}.{name}"
         elif isinstance(value, type):
             yield f"class {prefix}.{name}{signature_text(value)}"
-            yield from (f"    {line}" for line in members(value))
+            if value not in listed:
+                yield from (f"    {line}" for line in members(value, known))
+            listed.add(value)
         elif callable(value):
             yield f"{prefix}.{name}{signature_text(value)}"
         else:
@@ -132,7 +140,11 @@ def public_names() -> str:
     """Return the text of the snapshot."""
     vj = importlib.import_module("verifai_jax")
     modules = {"vj": vj} | {f"vj.{room}": getattr(vj, room) for room in ROOMS}
-    return "\n".join(line for prefix in modules for line in listing(modules[prefix], prefix)) + "\n"
+    every = [getattr(module, name) for module in modules.values() for name in dir(module)]
+    known = {value for value in every if isinstance(value, type)}
+    listed: set[type] = set()
+    found = (listing(module, prefix, known, listed) for prefix, module in modules.items())
+    return "\n".join(line for lines in found for line in lines) + "\n"
 
 
 def test_names_and_signatures_are_those_of_the_list():

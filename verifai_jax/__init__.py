@@ -5,7 +5,6 @@ from typing import TYPE_CHECKING
 from verifai_jax._version import __version__ as __version__
 from verifai_jax.core.compute.cores import claim_cores as _claim_cores
 from verifai_jax.core.display.lazy import attach as _attach
-from verifai_jax.core.user_code.reads import watch as _watch
 
 if TYPE_CHECKING:
     from verifai_jax import mtl as mtl
@@ -154,4 +153,3 @@ if TYPE_CHECKING:
 # Imported when first used (PEP 562), so that importing this package takes milliseconds.
 __getattr__, __dir__, __all__ = _attach(__name__, "__version__", group="verifai_jax.systems")
 _claim_cores()
-_watch()

@@ -9,16 +9,20 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
+import jax
+import numpy as np
 import pytest
+from checked_types import unchecked
 
 import verifai_jax as vj
+from verifai_jax.addons.simulators.mujoco.model import files_referred_to
 from verifai_jax.core.user_code.revisions import load_at_revision
-from verifai_jax.core.user_code.source_collection import files_of_model, scan
-from verifai_jax.core.user_code.source_objects import is_user_file
-from verifai_jax.core.user_code.sources import Sources, file_hash, list_changes
+from verifai_jax.core.user_code.sources import Sources, list_changes
 from verifai_jax.core.user_code.targets import load_target
+from verifai_jax.core.user_code.user_files import file_hash, is_user_file
 
 SPEC = """
+from pathlib import Path
 import numpy as np
 import verifai_jax as vj
 from plant import car
@@ -28,7 +32,7 @@ def helper_of_results(values):
     np.savez("result.npz", values=values)
     open("log.txt", "w").write("done")
 
-system = vj.blackbox(car.simulate)
+system = vj.blackbox(car.simulate, files=sorted((Path(__file__).parent / "data").iterdir()))
 space = {"a": vj.Box(0.0, 1.0)}
 drive = vj.Problem("drive", space, system, f"always x < {LIMIT}", nominal={"a": 0.1})
 """
@@ -43,7 +47,6 @@ from . import gains as _gains
 FOLDER = Path(__file__).parent.parent / "data"
 TABLE = np.loadtxt(FOLDER / "table.csv", delimiter=",")
 SETTINGS = json.loads((FOLDER / f"settings{_gains.NUMBER}.json").read_text())
-MESH = "data/shape.stl"
 
 def simulate(features):
     from plant.late import factor
@@ -63,7 +66,6 @@ def project(tmp_path, monkeypatch):
         "plant/unused.py": "",
         "data/table.csv": "1.0,2.0\n",
         "data/settings7.json": "{}",
-        "data/shape.stl": "solid",
         "result.npz": "of an earlier run",
         "log.txt": "of an earlier run",
     }
@@ -102,9 +104,8 @@ def test_the_files_of_a_problem_are_the_users_alone(project):
         "plant/gains.py": "imported",
         "plant/limits.py": "imported",
         "plant/late.py": "imported",
-        "data/table.csv": "read",
-        "data/settings7.json": "read",
-        "data/shape.stl": "named in a program",
+        "data/table.csv": "declared",
+        "data/settings7.json": "declared",
     }
     hashes = {file.name: file.sha256 for file in sources.files}
     assert hashes["spec.py"] == hashlib.sha256((project / "spec.py").read_bytes()).hexdigest()
@@ -115,7 +116,7 @@ def test_the_files_of_a_problem_are_the_users_alone(project):
 @pytest.mark.parametrize(
     "name",
     ["spec.py", "plant/car.py", "plant/gains.py", "plant/limits.py", "plant/late.py",
-     "data/table.csv", "data/settings7.json", "data/shape.stl"],
+     "data/table.csv", "data/settings7.json"],
 )  # fmt: skip
 def test_an_edit_of_any_of_them_is_found(project, name):
     before = loaded().sources()
@@ -234,9 +235,23 @@ def test_a_revision_of_git_has_its_own_files(project):
     forget()
     with load_at_revision("spec.py:drive@HEAD", vj.Problem) as problem:
         sources = problem.sources()
-    assert {file.name: file.sha256 for file in sources.files} == then
-    assert len(sources.commit) == 40
+    found = {file.name: file.sha256 for file in sources.files if not file.name.startswith("data/")}
+    assert {"spec.py", "plant/car.py"} <= set(found)
+    assert found.items() <= then.items()
+    assert len(sources.revision) == 40
     assert sources.changes() == ()
+
+
+def test_the_commit_is_recorded_and_whether_files_differ_from_it(project):
+    assert loaded().sources().commit == ""
+    who = ("-c", "user.name=a", "-c", "user.email=a@example.org")
+    for command in (("init", "-q"), ("add", "-A"), (*who, "commit", "-qm", "first")):
+        subprocess.run(["git", *command], check=True)
+    head = subprocess.run(["git", "rev-parse", "HEAD"], capture_output=True, text=True).stdout
+    clean = loaded().sources()
+    assert (clean.commit, clean.dirty) == (head.strip(), False)
+    edit("plant/unused.py", "x = 1\n")
+    assert loaded().sources().dirty
 
 
 def test_a_model_of_mujoco_has_its_includes_and_meshes(tmp_path):
@@ -248,23 +263,9 @@ def test_a_model_of_mujoco_has_its_includes_and_meshes(tmp_path):
         '<mujoco><asset><mesh name="palm" file="palm.obj"/><texture file="none.png"/></asset>'
     )
     (tmp_path / "parts" / "meshes" / "palm.obj").write_text("v 0 0 0\n")
-    found = {path.relative_to(tmp_path).as_posix() for path in files_of_model(tmp_path / "arm.xml")}
-    assert found == {"parts/hand.xml", "parts/meshes/palm.obj"}
-    assert files_of_model(tmp_path / "parts" / "meshes" / "palm.obj") == []
-
-
-def test_names_of_files_are_told_from_other_texts():
-    found = scan(
-        b'open(HERE / "data" / "a.csv")\nnp.load(join(HERE, "b.npz"))\nread(f"{HERE}/c.json")\n'
-        b'frame.to_csv("d.csv")\nopen("e.txt", "w")\nprint("a sentence. And more")\n'
-        b"from .. import near\nimport far.away\n"
-    )
-    assert {"data/a.csv", "b.npz", "c.json"} <= set(found.texts)
-    assert not {"d.csv", "e.txt"} & set(found.texts)
-    assert [(each.level, each.module, each.names) for each in found.imports] == [
-        (0, "far.away", ()), (2, "", ("near",))
-    ]  # fmt: skip
-    assert scan(b"def (:").imports == ()
+    found = [path.relative_to(tmp_path) for path in files_referred_to(tmp_path / "arm.xml")]
+    assert {*map(Path.as_posix, found)} == {"parts/hand.xml", "parts/meshes/palm.obj"}
+    assert files_referred_to(tmp_path / "parts" / "meshes" / "palm.obj") == []
 
 
 def test_the_record_is_plain_data(project):
@@ -305,7 +306,7 @@ def test_a_problem_in_mujoco_has_the_files_that_it_was_loaded_from(tmp_path, mon
     problem = load_target("arm.py:swing", vj.Problem)
     before = problem.sources()
     assert [file[:2] for file in before.files] == [
-        ("arm.py", "the problem"), ("arm.xml", "part of a model"), ("body.xml", "part of a model")
+        ("arm.py", "the problem"), ("arm.xml", "declared"), ("body.xml", "declared")
     ]  # fmt: skip
     assert "mujoco" in before.versions
     (tmp_path / "body.xml").write_text(body.format(size=0.2))
@@ -322,3 +323,49 @@ def test_functions_that_a_decorator_makes_are_no_part(project):
         "w", problem.space, vj.blackbox(scope["made"](problem.check)), "always x<1"
     )
     assert not [file for file in wrapped.sources().files if file.role == "a function"]
+
+
+TRACED = """
+import numpy as np
+import verifai_jax as vj
+
+GAINS = np.load("gains.npy")
+
+def simulate(features, key):
+    return vj.Trace({"x": GAINS * features["a"]}, dt=0.1)
+
+drive = vj.Problem("drive", {"a": vj.Box(0.0, 1.0)}, simulate, "always x < 2")
+"""
+
+
+def test_a_traced_system_is_known_by_its_program_with_its_constants(project):
+    np.save("gains.npy", np.ones(3))
+    edit("traced.py", TRACED)
+    before = loaded("traced.py:drive").sources()
+    assert [file.role for file in before.files] == ["the problem", "the traced program"]
+    assert before.changes(loaded("traced.py:drive").sources()) == ()
+    # Who asks in another precision asks for the same.
+    with jax.enable_x64(True):
+        assert before.changes(loaded("traced.py:drive").sources()) == ()
+    np.save("gains.npy", np.full(3, 1.5))
+    (change,) = before.changes(loaded("traced.py:drive").sources())
+    assert change.name == "the traced program"
+    # Another version of JAX traces otherwise, which says nothing of the model.
+    older = replace(before, versions={**before.versions, "jax": "0.0.1"})
+    assert older.changes(loaded("traced.py:drive").sources()) == ()
+
+
+def test_declared_files_have_to_be_there():
+    with pytest.raises(FileNotFoundError, match=r"files names 'none\.csv', which is no file"):
+        vj.blackbox(print, files=["none.csv"])
+    with unchecked(), pytest.raises(ValueError, match=r"a list of files, files=\['a\.csv'\]"):
+        vj.blackbox(print, files="a.csv")
+
+
+def test_importing_the_package_installs_no_audit_hook_and_runs_no_git(project):
+    program = (
+        "import sys; hooks = []; sys.addaudithook(lambda event, a: hooks.append(event)); "
+        "import verifai_jax; verifai_jax.Box; "
+        "assert not {'sys.addaudithook', 'subprocess.Popen'} & set(hooks), set(hooks)"
+    )
+    subprocess.run([sys.executable, "-c", program], check=True)

@@ -1,14 +1,13 @@
 """Runs whose model changes: what goes on, what is refused, and rows that give other numbers."""
 
 import json
-import sqlite3
 import sys
-from contextlib import closing
 from dataclasses import replace
 from importlib.machinery import EXTENSION_SUFFIXES
 
 import numpy as np
 import pytest
+from checked_types import unchecked
 
 import verifai_jax as vj
 from verifai_jax.core.store.files import sealed
@@ -51,7 +50,9 @@ def with_table(features):
 space = {"a": vj.Box(0.0, 1.0)}
 memory = vj.Problem("memory", space, vj.blackbox(with_memory), "always x < 0.5")
 counter = vj.Problem("counter", space, vj.blackbox(with_counter), "always x < 0.5")
-table = vj.Problem("table", space, vj.blackbox(with_table), "always x < 0.5")
+
+def table():
+    return vj.Problem("table", space, vj.blackbox(with_table, files=["gain.txt"]), "always x < 0.5")
 """
 
 
@@ -187,24 +188,35 @@ def test_a_simulation_that_ends_otherwise_is_a_finding(folder):
     assert failing != STEEPER
 
 
-def test_state_in_a_file_is_no_part_of_the_model_and_data_are(project):
+def test_state_in_a_file_is_no_part_of_the_model_and_declared_data_are(project):
     (project / "counter.txt").write_text("0")
     (project / "gain.txt").write_text("1.0")
-    problem = load_target("counting.py:counter", vj.Problem)
-    run = falsified(problem)
+    run = falsified(load_target("counting.py:counter", vj.Problem))
     assert not [file for file in run.sources[0]["files"] if file[0] == "counter.txt"]
-    assert run.sources[0]["without_file"] == [
-        "counter.txt was written in the meantime, and is not recorded"
-    ]
     assert vj.resume(run, budget=12, progress=False).simulations == 12
     assert "state of its own" in run.replay(0).finding
-    # It is read for the first time when the simulations have begun.
-    run = falsified(load_target("counting.py:table", vj.Problem))
-    assert ["gain.txt", "read"] in [file[:2] for file in run.sources[0]["files"]]
+    counting = sys.modules["_target_counting"]
+    run = falsified(counting.table(), folder=project / "table")
+    assert ["gain.txt", "declared"] in [file[:2] for file in run.sources[0]["files"]]
     (project / "gain.txt").write_text("2.0")
-    assert [change.name for change in run.changes()] == ["gain.txt"]
+    changed = counting.table()
+    assert [c.name for c in vj.load(project / "table", changed).changes()] == ["gain.txt"]
     with pytest.raises(ValueError, match=r"gain\.txt"):
-        vj.resume(run, budget=12, progress=False)
+        vj.resume(project / "table", changed, budget=12, progress=False)
+
+
+def test_a_run_without_a_folder_asks_for_its_model_when_somebody_does(monkeypatch):
+    asked = []
+    sources = vj.Problem.sources
+    monkeypatch.setattr(
+        vj.Problem, "sources", lambda self, first=0: asked.append(1) or sources(self, first)
+    )
+    with unchecked():  # The annotations are checked by looking at a part.
+        run = falsified(slope(), confirm=True)
+        assert str(run)
+    assert not asked
+    assert [file[0] for file in run.sources[0]["files"]] == ["spec.py"]
+    assert asked
 
 
 @pytest.mark.slow
@@ -248,77 +260,32 @@ def test_a_counterexample_that_gives_another_number_of_itself(tmp_path):
     assert "it does not give its number again, though no file of its model has changed" in one.note
 
 
-DYNAMIC = """
-import importlib, importlib.util, sqlite3
-from contextlib import closing
-from pathlib import Path
+LATE = """
 import numpy as np
 import verifai_jax as vj
 
-HERE = Path(__file__).parent
+def simulate(features):
+    from late_gain import GAIN
+    return vj.Trace({"x": np.full(3, GAIN * features["a"])}, dt=0.1)
 
-def late_gain():
-    return importlib.import_module("late_" + "gain").GAIN
-
-def placed_gain():
-    spec = importlib.util.spec_from_file_location("placed", HERE / ("placed_gain" + ".py"))
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module.GAIN
-
-def stored_gain():
-    with closing(sqlite3.connect(HERE / ("gain" + ".db"))) as base:
-        return base.execute("SELECT value FROM gain").fetchone()[0]
-
-def problem(gain):
-    def simulate(features):
-        return vj.Trace({"x": np.full(3, gain() * features["a"])}, dt=0.1)
-    return vj.Problem(gain.__name__, {"a": vj.Box(0.0, 1.0)}, vj.blackbox(simulate), "always x < 3")
-
-late, placed, stored = map(problem, (late_gain, placed_gain, stored_gain))
+late = vj.Problem("late", {"a": vj.Box(0.0, 1.0)}, vj.blackbox(simulate), "always x < 3")
 """
 
 
-def store_gain(file, value):
-    with closing(sqlite3.connect(file)) as base, base:
-        base.execute("CREATE TABLE IF NOT EXISTS gain (value REAL)")
-        base.execute("DELETE FROM gain")
-        base.execute("INSERT INTO gain VALUES (?)", (value,))
-
-
-@pytest.mark.parametrize("name", ["late", "placed", "stored"])
-def test_what_is_found_while_it_runs_is_part_of_the_model(project, monkeypatch, name):
+def test_what_is_imported_while_it_runs_is_part_of_the_model(project, monkeypatch):
     monkeypatch.setattr(sys, "dont_write_bytecode", True)
-    (project / "dynamic.py").write_text(DYNAMIC)
-    for gain in (1.0, 2.0):
-        sys.modules.pop("late_gain", None)
-        for module in ("late_gain.py", "placed_gain.py"):
-            (project / module).write_text(f"GAIN = {gain}\n")
-        store_gain(project / "gain.db", gain)
-        problem = load_target(f"dynamic.py:{name}", vj.Problem)
-        if gain == 1.0:
-            run = falsified(problem)
+    (project / "late.py").write_text(LATE)
+    (project / "late_gain.py").write_text("GAIN = 1.0\n")
+    run = falsified(load_target("late.py:late", vj.Problem), folder=project / "run")
+    assert "late_gain.py" in [file[0] for file in run.sources[0]["files"]]
     sys.modules.pop("late_gain", None)
-    file = {"late": "late_gain.py", "placed": "placed_gain.py", "stored": "gain.db"}[name]
-    assert [change.name for change in replace(run, problem=problem).changes()] == [file]
+    (project / "late_gain.py").write_text("GAIN = 2.0\n")
+    again = vj.load(project / "run", load_target("late.py:late", vj.Problem))
+    assert [change.name for change in again.changes()] == ["late_gain.py"]
+    sys.modules.pop("late_gain", None)
 
 
 def test_a_compiled_module_is_part_of_the_model(project):
     (project / f"plant{EXTENSION_SUFFIXES[0]}").write_bytes(b"\0as built\0")
     problem = slope("try:\n    import plant\nexcept ImportError:\n    pass\n" + SPEC)
     assert f"plant{EXTENSION_SUFFIXES[0]}" in [name for name, *_ in problem.sources().files]
-
-
-def test_a_run_that_is_killed_knows_what_its_simulations_read(project):
-    (project / "gain.txt").write_text("1.0")
-    records = []
-
-    def look(rows, numbers):
-        records.append((project / "run" / "run.json").read_text())
-
-    problem = load_target("counting.py:table", vj.Problem)
-    falsified(problem, 12, folder=project / "run", callbacks=[look])
-    # After its first round, of which there are three.
-    named = [[name for name, *_ in json.loads(each)["sources"][0]["files"]] for each in records]
-    assert "gain.txt" not in named[0]
-    assert "gain.txt" in named[1]

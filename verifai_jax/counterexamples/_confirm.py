@@ -93,7 +93,7 @@ def confirm(
 
 
 def _with_changes(run: Run, found: Confirmation) -> Confirmation:
-    """Return a confirmation that says whether the model, or the number of the row, is another."""
+    """Return a confirmation that notes a changed model or a robustness that does not come again."""
     if found.row is None:
         return found
     changed = run.changed_since(found.row)

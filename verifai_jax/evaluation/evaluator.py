@@ -227,9 +227,7 @@ class Evaluator:
         if self._host is not None and not self._host.system.can_simulate_batch:
             # One by one, which is worth more the longer a simulation takes.
             self._host.journal = kept.journal
-            verdicts = simulate()
-            kept.settle()
-            return verdicts
+            return simulate()
         return kept.recall_or(
             np.asarray(points), np.arange(first, first + len(points)), temperature, simulate
         )

@@ -12,7 +12,6 @@ otherwise the work begins again.
 
 import contextlib
 import shutil
-import time
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -44,7 +43,6 @@ class Unfinished:
     def __init__(self, cache: Cache, folder: Path) -> None:
         self.done = False
         self.cache, self.folder = cache, folder
-        self.begun = time.time()
         self._parts = 0
         self._keeps = True
 
@@ -69,7 +67,7 @@ class Unfinished:
         if known is not None:
             then = Sources.from_json(known["sources"])
             changes = then.changes(sources)
-            if changes or known["about"] != about or then.commit != sources.commit:
+            if changes or known["about"] != about or then.revision != sources.revision:
                 why = list_changes(changes) or "it asks for other simulations"
                 write_line(f"note: begun anew, since the model has changed since then: {why}")
                 self.cache.clear()
@@ -80,14 +78,6 @@ class Unfinished:
             with self.writing():
                 self.cache.note(name, {"about": about, "sources": sources.to_json()})
         return Part(self, number, jax.tree.structure(problem.space.feature_form))
-
-    def settle(self, number: int) -> None:
-        """Record which files a part has read so far, and which it has written."""
-        name = f"part/{number}"
-        noted = self.cache.note(name)
-        if noted is not None:
-            settled = Sources.from_json(noted["sources"]).settled(self.begun).to_json()
-            self.cache.note(name, {**noted, "sources": settled})
 
     @contextlib.contextmanager
     def writing(self) -> Iterator[None]:
@@ -120,7 +110,6 @@ class Part:
             for arrays in of.cache.entries(f"{number}/")
             for i, key in enumerate(_keys(arrays))
         }
-        self._settled = False
 
     def recall_or(
         self,
@@ -147,7 +136,6 @@ class Part:
                 }
             },
         )
-        self.settle()
         return verdicts
 
     def recall(
@@ -163,13 +151,6 @@ class Part:
         if not all(found):
             return None
         return Verdicts.concatenate([_verdict(*one, self._form) for one in found if one])
-
-    def settle(self) -> None:
-        """Record which files the first simulations have read."""
-        if not self._settled:
-            self._settled = True
-            with self.of.writing():
-                self.of.settle(self.number)
 
 
 class _Rows(Journal):

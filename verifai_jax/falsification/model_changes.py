@@ -7,6 +7,7 @@ A run records its model for each part that was simulated without interruption.
 """
 
 from collections.abc import Mapping, Sequence
+from functools import cached_property
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
@@ -27,6 +28,27 @@ NEAR = 1e-3
 """The same for a replay in another precision; above it, the run's own precision is tried."""
 EVEN = "even_if_changed=True (--even-if-changed) continues regardless, and notes it in the record"
 """Advice on continuing with another model."""
+
+
+class SourcesWhenAsked(Sequence[Mapping[str, Any]]):
+    """The record of the model of a run without a folder, made when somebody asks for it.
+
+    Modules are hashed as they were imported, and declared files as they were read, so it is the
+    same then.
+    """
+
+    def __init__(self, problem: Problem) -> None:
+        self._problem = problem
+
+    @cached_property
+    def _parts(self) -> tuple[Mapping[str, Any], ...]:
+        return (self._problem.sources().to_json(),)
+
+    def __len__(self) -> int:
+        return 1
+
+    def __getitem__(self, index: Any) -> Any:
+        return self._parts[index]
 
 
 def sources_of_row(recorded: Sequence[Mapping[str, Any]], row: int) -> Sources | None:
@@ -93,6 +115,8 @@ def continued_with(
 
 def has_several_models(recorded: Sequence[Mapping[str, Any]]) -> bool:
     """Return whether rows of a run come from several models, so that they sample no single one."""
+    if len(recorded) < 2:
+        return False
     parts = [Sources.from_json(part) for part in recorded]
     return any(before.changes(after) for before, after in pairwise(parts))
 

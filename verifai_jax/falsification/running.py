@@ -22,10 +22,10 @@ from verifai_jax.core.display.progress import SimulationProgress, write_line
 from verifai_jax.core.messages.text import one_line
 from verifai_jax.core.store.locks import writing
 from verifai_jax.core.user_code.callbacks import Callback, notify
-from verifai_jax.core.user_code.sources import Sources
 from verifai_jax.core.user_code.user_errors import explain_user_error, format_user_error
 from verifai_jax.evaluation.backends import Choice
 from verifai_jax.falsification.loop import COMPILE, CONFIRM, REST, SEARCH, SIMULATE, Rounds
+from verifai_jax.falsification.model_changes import SourcesWhenAsked
 from verifai_jax.falsification.run import Run
 from verifai_jax.falsification.run_folder import write_record
 from verifai_jax.falsification.silent_mistakes import cut_short_note, nominal_note, notes_after
@@ -134,7 +134,7 @@ class Running:
     resumed: bool = False
     warm: bool = False
     keep_going: bool = False
-    _models: tuple[Mapping[str, Any], ...] = field(default=(), init=False)
+    _models: Sequence[Mapping[str, Any]] = field(default=(), init=False)
     _model: str = field(default="", init=False)
 
     def play(
@@ -144,10 +144,14 @@ class Running:
 
         **Raises:** `RunError` with the finished part.
         """
-        rounds, begun = self.rounds, time.time()
+        rounds = self.rounds
         rounds.only_budget_ends = self.ends.only_budget
-        now = self.sources
-        self._models = (rounds.problem.sources().to_json(),) if now is None else tuple(now)
+        if self.sources is not None:
+            self._models = self.sources
+        elif rounds.folder is None:
+            self._models = SourcesWhenAsked(rounds.problem)
+        else:
+            self._models = (rounds.problem.sources().to_json(),)
         # Tracing once more is for those who ask which claims a change concerns.
         self._model = digest_of_model(rounds.problem) if rounds.problem.requirements else ""
         # Checking and tracing are part of what a second run of the problem does not repeat.
@@ -157,13 +161,12 @@ class Running:
         try:
             with SimulationProgress(rounds.problem.name, self.ends.budget, progress) as bar:
                 self._begin(bar, progress, prepare)
-                stopped = self._play_rounds(bar, callbacks, begun)
+                stopped = self._play_rounds(bar, callbacks)
         except KeyboardInterrupt:
             stopped = "interrupted"
         except Exception as error:
             stopped, cause = format_user_error(error), error
         rounds.close()
-        self._settle(begun)
         result = self._with_notes_after(self.result(stopped))
         try:
             rounds.table.close()
@@ -204,11 +207,9 @@ class Running:
             for note in (*rounds.chosen, *rounds.notes):
                 bar.note(note)
 
-    def _play_rounds(
-        self, bar: SimulationProgress, callbacks: Sequence[Callback], begun: float
-    ) -> str:
+    def _play_rounds(self, bar: SimulationProgress, callbacks: Sequence[Callback]) -> str:
         """Run rounds; return the condition that ended them."""
-        rounds, budget, settled = self.rounds, self.ends.budget, False
+        rounds, budget = self.rounds, self.ends.budget
         rounds.stop_after = self.ends.stop_after or 0
         stopped = "exhausted" if rounds.exhausted else None
         if self._is_hopeless:
@@ -222,20 +223,9 @@ class Running:
                 stopped = self.ends.reached(rounds)
                 if stopped is None and self._is_hopeless:
                     stopped = RAISES
-                if rounds.folder is not None and not settled:
-                    # A run that is killed knows what its first simulations read, too.
-                    settled = True
-                    self._settle(begun)
-                    write_record(self.result("running"), rounds.folder)
                 if stopped is None:
                     rounds.save(seldom=True)
         return stopped
-
-    def _settle(self, begun: float) -> None:
-        """Record the files that the simulations have read so far."""
-        if self._models:
-            last = Sources.from_json(self._models[-1]).settled(begun)
-            self._models = (*self._models[:-1], last.to_json())
 
     @property
     def _is_hopeless(self) -> bool:

@@ -1,6 +1,6 @@
 """Facts of the table columns of a domain, known before any row: their order, bounds and choices.
 
-Box(0, 2).facts("x")       # {"x": {"ordered": True, "bounds": (0, 2), "range": (0, 2), ...}}
+    Box(0, 2).facts("x")       # {"x": {"ordered": True, "bounds": (0, 2), "range": (0, 2), ...}}
 
 The facts of a column are `ordered` and, of numbers, `bounds` (of the domain), `range` (what is
 scaled to `[0, 1]`), `integer`, `uniform` and `length` (the column counts items); of others,

@@ -208,7 +208,7 @@ def _habit(text: str, position: int, operand: bool) -> str:
 
 
 def _misspelt_word(before: str) -> str:
-    """Ask whether the name at the end of a text was to be an operator, with or without interval."""
+    """Suggest the operator that was probably meant by the name at the end of a text."""
     name = re.search(r"([A-Za-z_]\w*)\s*(\[[^\]]*\]?)?\s*$", before)
     if name is None or name[1] in RESERVED:
         return ""

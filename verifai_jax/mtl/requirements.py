@@ -8,7 +8,6 @@ write_requirements(requirements, "requirements.csv")
 """
 
 import csv
-import os
 import tomllib
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -20,7 +19,6 @@ from reprlib import repr as shown
 from verifai_jax.core.messages.errors import check_names
 from verifai_jax.core.store.atomic_files import replacing
 from verifai_jax.core.store.foreign_files import read_text, read_yaml
-from verifai_jax.core.user_code.reads import documents
 from verifai_jax.mtl._parse import parse
 from verifai_jax.mtl.formula import Formula
 from verifai_jax.mtl.reqif import links_of, read_reqif, reqif_document
@@ -137,7 +135,6 @@ def read_requirements(
             f"a file of requirements ends with {', '.join(ENDINGS)}; got {path.name}: write each "
             'as a table of TOML, [[requirement]] with id = "..." and formula = "..."'
         )
-    documents.add(os.path.abspath(path))
     numbers, parts = dict(constants or {}), dict(definitions or {})
     entries: Sequence[Mapping[str, object]]
     if suffix == ".csv":

@@ -156,7 +156,8 @@ def _held(replay: Replay) -> set[str]:
         if is_waveform(value) and value.hold in HELD
     }
     with suppress(Exception):  # A user's functions may take only what they took in the simulation.
-        named = replay.problem.system.held_signals(replay.features)
+        ask = getattr(replay.problem.system, "held_signals", lambda features: ("action",))
+        named = ask(replay.features)
         held |= {n for n in replay.trace.signals if n in named or n.split(".")[0] in named}
     return held
 

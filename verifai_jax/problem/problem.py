@@ -8,6 +8,7 @@
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from html import escape
 from itertools import pairwise
 from pathlib import Path
@@ -44,7 +45,7 @@ from verifai_jax.mtl.semantics import Semantics
 from verifai_jax.problem.behaviour import Behaviour
 from verifai_jax.problem.guide import Guide, Term
 from verifai_jax.problem.rulebook import Rulebook
-from verifai_jax.problem.tracing import traced_by_default, why_not_batched
+from verifai_jax.problem.tracing import fingerprint_of, traced_by_default, why_not_batched
 from verifai_jax.systems.base import System, as_system
 
 
@@ -185,7 +186,9 @@ class Problem(InNotebook):
         **Arguments:**
         - `first`: the first row of the table to which they apply.
         """
-        return sources_of(self, made=self.made_in or (), first=first)
+        traced = partial(fingerprint_of, self.system, self.space.feature_form)
+        program = self.programs.get(FINGERPRINT, None, traced)
+        return sources_of(self, made=self.made_in or (), first=first, program=program)
 
     def requirement_entries(self) -> dict[str, dict[str, str]]:
         """Return the content of the formulas' requirements, by identifier, as plain data."""
@@ -407,6 +410,8 @@ KEPT: Slot[None, tuple[str, ...]] = Slot("kept")
 """What each call of a problem's system changes, in words."""
 FORM: Slot[None, Trace | None] = Slot("form")
 """The form of the traces of a problem's system."""
+FINGERPRINT: Slot[None, str] = Slot("fingerprint")
+"""The fingerprint of the system's program."""
 BACKENDS: Slot[str, Problem] = Slot("backends")
 """The same problem on each backend of its system."""
 

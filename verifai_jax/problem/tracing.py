@@ -4,9 +4,13 @@ traced_by_default(system)                           # whether JAX traces the sys
 why_not_batched(program)                            # what jax.vmap refuses, and the remedy
 """
 
+from collections.abc import Mapping
 from typing import Any
 
-from verifai_jax.core.compute.fingerprint import alone_only, describe_step
+import jax
+
+from verifai_jax.core.compute.fingerprint import alone_only, describe_step, fingerprint
+from verifai_jax.core.compute.precision import reproducible_settings, truncate_silently
 from verifai_jax.systems.base import System
 
 
@@ -37,3 +41,23 @@ def why_not_batched(program: Any) -> str | None:
             "system a vj.blackbox, which JAX does not trace"
         )
     return None
+
+
+@reproducible_settings()
+@truncate_silently()
+def fingerprint_of(system: System, features: Mapping[str, Any]) -> str:
+    """Return the fingerprint of a system's program, with all of its constants.
+
+    Empty for a system that is not traced for its form, and for one that raises, of which
+    `Problem.check` says why.
+
+    - `features`: the form of the features.
+    """
+    if system.black_box or not traced_by_default(system):
+        return ""
+    try:
+        # Traced already, for its form.
+        program = jax.make_jaxpr(system)(features, jax.eval_shape(lambda: jax.random.key(0)))
+    except Exception:
+        return ""
+    return fingerprint(program, derivatives=False) or ""

@@ -85,8 +85,8 @@ class System(ForUsers):
     _internal = frozenset((
         "abstract", "backend", "backends", "black_box", "can_fold", "can_refine",
         "can_simulate_batch", "can_simulate_each", "constants", "derived", "effort", "exact_step",
-        "filmed", "fold", "forward_up_to", "held_signals", "known_signals", "lanes", "likely",
-        "links", "may_draw", "passing", "refined", "renewed", "reverse_hint", "simulate_batch",
+        "filmed", "fold", "forward_up_to", "known_signals", "lanes", "likely", "links",
+        "may_draw", "passing", "refined", "renewed", "reverse_hint", "simulate_batch",
         "simulate_each", "switches", "traced_factor", "unroll", "why_error", "why_not",
         "with_backend", "with_domains", "with_links", "workers",
     ))  # fmt: skip
@@ -233,14 +233,6 @@ class System(ForUsers):
             "by_simulator=True)"
         )
 
-    def held_signals(self, features: Features) -> tuple[str, ...]:
-        """Return the names of signals that keep their value from each sample to the next.
-
-        **Arguments:**
-        - `features`: `jax.ShapeDtypeStruct`s.
-        """
-        return ("action",)
-
     def with_links(self, links: tuple[Link, ...]) -> "System":
         """Return the same system with faults between it and its policy; see `passing`."""
         raise NotImplementedError(f"{self!r} has no with_links(links)")
@@ -356,10 +348,6 @@ class FunctionSystem(System):
 
     def filmed(self, replay: Any) -> Any:
         return self._method("filmed")(replay)
-
-    def held_signals(self, features: Features) -> tuple[str, ...]:
-        own = self._offers("held_signals")
-        return self._method("held_signals")(features) if own else super().held_signals(features)
 
     def renewed(self) -> System:
         return as_system(self._method("renewed")()) if self._offers("renewed") else self

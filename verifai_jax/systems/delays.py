@@ -1,7 +1,7 @@
 """Delays between a system and its policy, in whole steps, fixed or by a feature.
 
-brax("hopper", policy, action_delay=2)
-brax("hopper", policy, observation_delay={"latency": 5})    # the feature `latency`, at most 5
+    brax("hopper", policy, action_delay=2)
+    brax("hopper", policy, observation_delay={"latency": 5})    # the feature `latency`, at most 5
 
 With a delay of `n` steps a policy receives the observation of `n` steps ago, or before that the
 first one. An action takes effect `n` steps after its decision; until then the system receives

@@ -69,7 +69,7 @@ def test_files_of_another_kind(tmp_path):
         assert file.read_text() == content
     file.unlink()
     Log(file).put({"trials": {"number": np.arange(3)}})
-    with pytest.raises(CacheError, match="is damaged: it does not say what its work is of"):
+    with pytest.raises(CacheError, match="is damaged: it lacks the record that identifies"):
         Cache(tmp_path).claim(ABOUT)
     file.unlink()
     Cache(tmp_path).claim(ABOUT)
@@ -122,7 +122,7 @@ def test_a_cache_that_does_not_say_what_it_is_of_is_refused(tmp_path, what):
     cache.claim(ABOUT)
     cache.put({"one": {"x": np.zeros(3)}})
     changed(tmp_path / "augmentation.cache", what, what.upper())
-    told = r"augmentation\.cache is damaged: it does not say what its work is of"
+    told = r"augmentation\.cache is damaged: it lacks the record that identifies its computation"
     with pytest.raises(CacheError, match=told):
         Cache(tmp_path, "augmentation").claim(ABOUT)
 

@@ -20,7 +20,7 @@ import click
 
 from verifai_jax._version import __version__
 from verifai_jax.cli.exit_codes import CommandError
-from verifai_jax.core.user_code.source_objects import FENCE
+from verifai_jax.core.user_code.user_files import FENCE
 
 VERSIONS = ("2025-11-25", "2025-06-18", "2025-03-26", "2024-11-05")
 """Versions of the protocol, the newest first."""

@@ -1,9 +1,9 @@
 """The probability of a failure at any point of the space, learned from the rows of a table.
 
-found = boundary(run)
-found.probability({"speed": 17.0, "grip": 5.5})     # 0.93
-found.sampled({"speed": 17.0, "grip": 5.5})         # True: rows lie that close
-found.next_points(8)                                # where a simulation would say most
+    found = boundary(run)
+    found.probability({"speed": 17.0, "grip": 5.5})     # 0.93
+    found.sampled({"speed": 17.0, "grip": 5.5})         # True: rows lie that close
+    found.next_points(8)                                # where a simulation would say most
 
 Four models are trained: polynomials of the robustness and of the odds, boosted trees, a Gaussian
 process. A logistic regression on their predictions for held-out rows gives the probability

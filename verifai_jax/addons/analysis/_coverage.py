@@ -1,8 +1,8 @@
 """Coverage of the feature space: evenness of the samples, holes, and untried values.
 
-found = coverage(run)
-found.hole                  features in the middle of the largest hole
-found.untried               values and pairs of values that no row has
+    found = coverage(run)
+    found.hole                  features in the middle of the largest hole
+    found.untried               values and pairs of values that no row has
 
 The radius of the largest hole is the dispersion of the points: Niederreiter, Random number
 generation and quasi-Monte Carlo methods (1992).

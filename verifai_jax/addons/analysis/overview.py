@@ -24,7 +24,7 @@ from verifai_jax.addons.analysis._pca import pca
 from verifai_jax.addons.analysis._rules import rules
 from verifai_jax.addons.analysis.clustering.clusters import clusters
 from verifai_jax.addons.analysis.data.samples import Samples
-from verifai_jax.addons.analysis.data.verdicts import claimed, refused
+from verifai_jax.addons.analysis.data.verdicts import standing
 from verifai_jax.core.display.figure import Drawn
 from verifai_jax.core.display.progress import shows_progress
 from verifai_jax.core.messages.errors import unknown_name
@@ -195,12 +195,12 @@ def _part(name: str, reason: str, analysis: Callable[[], Any]) -> Part:
 
 def _describe_failures(source: object, samples: Samples) -> str:
     rows, failures = len(samples.table), int(samples.failing.sum())
-    doubtful, sure = (int(part(samples.table).sum()) for part in (refused, claimed))
+    _, doubtful, left = (int(part.sum()) for part in standing(samples.table)[0])
     lines = [f"{failures + doubtful:,} of {rows:,} simulations violate the property"]
     if doubtful:
         lines[0] += f"; {doubtful:,} of them are not claimed, as closer replays disagree"
-    if sure < failures:
-        lines[0] += f"; {failures - sure:,} are not claimed, as they were not replayed"
+    if left:
+        lines[0] += f"; {left:,} are not claimed, as they were not replayed"
     if len(samples) + doubtful < rows:
         lines[0] += f"; {rows - len(samples) - doubtful:,} have no verdict"
     if isinstance(source, Run):

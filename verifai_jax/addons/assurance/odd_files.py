@@ -25,7 +25,6 @@ from verifai_jax.addons.assurance.odd_conditions import (
 from verifai_jax.addons.assurance.operational_domain import OperationalDomain
 from verifai_jax.core.messages.errors import check_names, unknown_name
 from verifai_jax.core.store.foreign_files import read_text, read_yaml
-from verifai_jax.core.user_code.reads import documents
 from verifai_jax.core.user_code.sources import hashed_files
 from verifai_jax.features import FeatureSpace
 
@@ -258,7 +257,6 @@ def _refuse_circles(name: str, above: tuple[str, ...], uses: Mapping[str, set[st
 def _mapping(path: Path, files: dict[Path, None]) -> dict[str, Any]:
     if not path.exists():
         raise FileNotFoundError(f"there is no file of an operational design domain {path}")
-    documents.add(str(path.resolve()))
     files[path] = None
     text = read_text(path)
     try:

@@ -138,7 +138,7 @@ def estimate(
     batch = min(chains if batch is None else batch, budget)
     choice = resolved(problem, batch=batch, budget=budget, precision=precision, wanted=backend)
     choice.problem.check()
-    sources, begun = problem.sources(), time.time()
+    sources = problem.sources()
     rest = None
     if proved is not None:
         from verifai_jax.addons.verification.result import as_verification
@@ -188,7 +188,7 @@ def estimate(
     )
     if rest is not None:
         found = _with_decided(found, rest, limit_state, seed)
-    return replace(found, sources=sources.settled(begun).to_json())
+    return replace(found, sources=sources.to_json())
 
 
 _METHODS = {

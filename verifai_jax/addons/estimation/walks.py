@@ -1,6 +1,6 @@
 """Walks of chains among failures, each by moves that leave the prior invariant.
 
-states, nearest = walk_among_failures(limit_state, rng, z, deciding, groups, steps=24)
+    states, nearest = walk_among_failures(limit_state, rng, z, deciding, groups, steps=24)
 
 A move is `z' = sqrt(1 - s^2) z + s xi`, reversible for the standard normal, and accepted if the new
 point fails. The deciding coordinates and all others move in turn, since a joint move could only be

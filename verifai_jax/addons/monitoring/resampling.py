@@ -1,6 +1,6 @@
 """Recordings on an even clock that keep every recorded sample.
 
-resample(Trace({"x": xs}, times=ts), dt=0.1, method="hold")
+    resample(Trace({"x": xs}, times=ts), dt=0.1, method="hold")
 
 Samples recorded between two samples of the new clock are kept (`Trace.between`) and used for
 verdicts, so a spike between two samples is not lost.

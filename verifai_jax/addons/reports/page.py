@@ -1,7 +1,7 @@
 """A page from its sections: one self-contained HTML file, usable with or without JavaScript.
 
-render(page)                                        # the text of the file
-write_page(page, "report.html")
+    render(page)                                        # the text of the file
+    write_page(page, "report.html")
 
 Its content security policy allows only embedded pictures, and one style sheet and one script by
 their hashes: nothing is loaded or sent, and no inserted text can run.

@@ -75,7 +75,7 @@ class Model(NamedTuple):
         found = {}
         for part in self.parts:
             for file in part.files:
-                name = f"{file.name} at {part.commit}" if part.commit else file.name
+                name = f"{file.name} at {part.revision}" if part.revision else file.name
                 found[name, file.sha256] = Input(name, file.role, file.sha256)
         return list(found.values())
 

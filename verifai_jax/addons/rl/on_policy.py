@@ -1,6 +1,6 @@
 """Learning from one stretch of experience: a few passes over it in shuffled minibatches.
 
-weights, moments = minibatch_epochs(loss, (weights, moments), batch, key, optimizer, rate, 4, 8)
+    weights, moments = minibatch_epochs(loss, (weights, moments), batch, key, optimizer, rate, 4, 8)
 
 The permutations are those of `jax.random.permutation`, computed faster on a CPU.
 """

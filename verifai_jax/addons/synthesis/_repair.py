@@ -121,7 +121,7 @@ def repair(
             whole, parameters, nominal, gradient, batch, budget, precision, backend, seed
         )
     search = arguments.attack_search(whole, attack, loop)
-    sources, begun = sources_of(whole, system_of, made=whole.made_in or ()), time.time()
+    sources = sources_of(whole, system_of, made=whole.made_in or ())
     limits, checking = split_budget(lambda: loop.simulations, budget, started, max_seconds)
     region = region_of(loop, mass)
     if aim == "probability":
@@ -168,7 +168,7 @@ def repair(
         notes=tuple(work.notes),
         make=lambda: loop.with_parameters(theta),
         make_nominal=lambda: loop.with_parameters(start),
-        sources=sources.settled(begun).to_json(),
+        sources=sources.to_json(),
         changed="" if run is None else run.changed_since(),
     )
 

@@ -111,7 +111,7 @@ def synthesize(
         from verifai_jax.addons.verification.enclosure import enclosable
 
         enclosed = enclosable(loop.problem, precision)
-    sources, begun = problem.sources(), time.time()
+    sources = problem.sources()
     limits, checking = split_budget(lambda: loop.simulations, budget, started, max_seconds)
     region = region_of(loop, mass)
     if aim == "probability":
@@ -167,7 +167,7 @@ def synthesize(
         seed=seed,
         varied="" if region is None else region.describe(),
         counted=None if work.counts is None else (work.counts.failing, work.counts.samples),
-        sources=sources.settled(begun).to_json(),
+        sources=sources.to_json(),
         proved=proved,
         proof_seconds=prove,
     )

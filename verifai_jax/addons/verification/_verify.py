@@ -86,7 +86,7 @@ def verify(
     before = None if resume is None else as_verification(resume)
     if before is not None:
         before.check_same(problem, precision, continuous)
-    sources, begun = problem.sources(), time.time()
+    sources = problem.sources()
     enclosure = Enclosure(about, precision)
     found = Boxes.whole(enclosure) if before is None else before.boxes.copy()
     work = BranchAndBound(problem, enclosure, found, seed)
@@ -119,5 +119,5 @@ def verify(
         ),
         continuous=continuous,
         version=__version__,
-        sources=sources.settled(begun).to_json(),
+        sources=sources.to_json(),
     )  # fmt: skip

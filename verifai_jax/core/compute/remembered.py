@@ -26,7 +26,7 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from verifai_jax.core.compute.devices import cache_folder
 from verifai_jax.core.compute.fingerprint import identity
 from verifai_jax.core.store.atomic_files import replacing
-from verifai_jax.core.user_code.source_objects import PACKAGE
+from verifai_jax.core.user_code.user_files import PACKAGE
 
 MAX_BYTES = 64 * 2**20
 """Size of a program that is kept at most."""

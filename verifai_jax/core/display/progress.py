@@ -254,7 +254,7 @@ def shows_progress(
     **Arguments:**
     - `doing`: the word before the name of the first argument: "comparing".
     - `unit`: the name of the units.
-    - `of_budget`: whether its option `budget` is the total, not that of a part.
+    - `of_budget`: whether its option `budget` is the total; false if it covers only one stage.
     """
 
     def decorate(function: Callable[P, R]) -> Callable[P, R]:

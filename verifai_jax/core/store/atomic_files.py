@@ -1,7 +1,7 @@
 """Atomic files: complete or absent, whatever ends the process that writes them.
 
-with replacing("report.html") as partial:
-partial.write_text(page)                    # takes the place of report.html at the end
+    with replacing("report.html") as partial:
+        partial.write_text(page)                # takes the place of report.html at the end
 
 All files of results are written by it: tables, records, pictures, films, policies, reports.
 """

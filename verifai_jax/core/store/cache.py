@@ -82,7 +82,9 @@ class Cache:
         about = self.note(_ABOUT)
         if about is None:
             if self.names():
-                raise CacheError(f"{self.path} is damaged: it does not say what its work is of")
+                raise CacheError(
+                    f"{self.path} is damaged: it lacks the record that identifies its computation"
+                )
             about = self.note(_ABOUT, {"work": given, "sources": []})
         differences = list(_differences(given, about["work"]))
         if differences:

@@ -23,7 +23,7 @@ import jax
 import jax.core
 import numpy as np
 
-from verifai_jax.core.user_code.source_objects import is_user_file
+from verifai_jax.core.user_code.user_files import is_user_file
 
 MAX_ITEMS = 1000
 """Items of a container that are compared."""

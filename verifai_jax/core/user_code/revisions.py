@@ -19,9 +19,9 @@ import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
-from verifai_jax.core.user_code.source_objects import is_user_file
 from verifai_jax.core.user_code.sources import add_tree, remove_tree
 from verifai_jax.core.user_code.targets import Kind, TargetError, load_target
+from verifai_jax.core.user_code.user_files import is_user_file
 
 _AT = re.compile(r"(?P<target>.+?\.py(?::[^@]*)?)@(?P<revision>.+)", re.DOTALL)
 _OWN = "verifai_jax"

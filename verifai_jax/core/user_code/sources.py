@@ -1,11 +1,10 @@
-"""The record of the origins of a result: hashes of its model's files, and versions.
+"""The record of the origins of a result: hashes of its model's files, its program, and versions.
 
     then.changes(now)                                   # which files are others by now
 
-The files are those of the user: the module that makes the problem, modules of the user that it
-imports and that its functions come from, and the data that they open or name. The hash of a module
-is that of the file as it was imported, so an edit without a new import does not change it. Python,
-this package and installed packages are recorded by their versions.
+`source_collection.py` says which files these are. A system that JAX traces is also recorded by the
+fingerprint of its program, which contains all of its constants. Python, this package and installed
+packages are recorded by their versions.
 """
 
 import hashlib
@@ -13,31 +12,19 @@ import os
 import platform
 import sys
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
-from functools import lru_cache
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from verifai_jax.core.user_code.reads import files_read_by, modules_loaded_by
+from verifai_jax.core.user_code.user_files import file_hash
 
 PACKAGES = (
-    *(
-        "verifai_jax",
-        "jax",
-        "jaxlib",
-        "numpy",
-        "scipy",
-        "pandas",
-        "sklearn",
-        "mujoco",
-        "brax",
-        "gymnax",
-    ),
-    *("gymnasium", "diffrax", "scenic", "torch"),
+    *("verifai_jax", "jax", "jaxlib", "numpy", "scipy", "pandas", "sklearn", "mujoco", "brax"),
+    *("gymnax", "gymnasium", "diffrax", "scenic", "torch"),
 )
 """Packages whose versions decide numbers; the version of one that is imported is recorded."""
 PROBLEM, CALLER, IMPORTED = "the problem", "calls what makes the problem", "imported"
-FUNCTION, READ, NAMED, MODEL = "a function", "read", "named in a program", "part of a model"
+FUNCTION, DECLARED, PROGRAM = "a function", "declared", "the traced program"
 """Roles of a file. That of a caller counts only where the same caller makes the problem again."""
 SHOWN = 12
 """Digits of a hash in a sentence."""
@@ -50,7 +37,8 @@ tree_commits: dict[Path, str] = {}
 class Source(NamedTuple):
     """A file by its name, its role, and the SHA-256 of its content.
 
-    The name is relative to the working directory, or absolute if the file lies elsewhere.
+    The name is relative to the working directory, or absolute if the file lies elsewhere. Functions
+    that are in no file and the traced program are recorded like files.
     """
 
     name: str
@@ -89,7 +77,9 @@ class Sources:
     - `without_file`: parts of the model that are in no file, such as notebook cells.
     - `root`: the working directory, to which names of files are relative.
     - `first`: the first row of the table to which they apply.
-    - `commit`: the git commit of the files; empty for those of the working directory.
+    - `commit`: the git commit that is checked out; empty outside of a repository.
+    - `dirty`: whether tracked files differ from that commit.
+    - `revision`: the commit from which the files were taken; empty for the working directory.
     """
 
     files: tuple[Source, ...]
@@ -98,6 +88,8 @@ class Sources:
     root: str = ""
     first: int = 0
     commit: str = ""
+    dirty: bool = False
+    revision: str = ""
 
     def to_json(self) -> dict[str, Any]:
         """Return it as plain data."""
@@ -105,6 +97,8 @@ class Sources:
             "first": self.first,
             "root": self.root,
             "commit": self.commit,
+            "dirty": self.dirty,
+            "revision": self.revision,
             "files": [list(file) for file in self.files],
             "without_file": list(self.without_file),
             "versions": dict(self.versions),
@@ -121,54 +115,16 @@ class Sources:
             versions = {str(name): str(value) for name, value in data["versions"].items()}
             without = tuple(map(str, data["without_file"]))
             root, first, commit = str(data["root"]), int(data["first"]), str(data["commit"])
-            return cls(files, versions, without, root, first, commit)
+            dirty, revision = bool(data["dirty"]), str(data["revision"])
+            return cls(files, versions, without, root, first, commit, dirty, revision)
         except (KeyError, TypeError, AttributeError, ValueError) as error:
             raise ValueError("the record of the files of a model has another form") from error
 
-    def settled(self, begun: float) -> "Sources":
-        """Return the record as it should be at the end of the work.
-
-        Data files written since the work began are its results, such as the state of a simulator,
-        and not part of the model. Files read and modules imported meanwhile are added.
-
-        **Arguments:**
-        - `begun`: seconds since the epoch.
-        """
-        files = {file.name: file for file in self.files}
-        waiting = [file.name for file in self.files if file.role in (PROBLEM, IMPORTED)]
-        while waiting:
-            module = os.path.join(self.root, waiting.pop())
-            opened = ((modules_loaded_by(module), IMPORTED), (files_read_by(module), READ))
-            for path, role in ((path, role) for paths, role in opened for path in sorted(paths)):
-                if os.path.isfile(path) and (name := shown_path(path)) not in files:
-                    files[name] = Source(name, role, file_hash(Path(path)))
-                    waiting += [name] * (role == IMPORTED)
-        written = {
-            file.name
-            for file in files.values()
-            if file.role in (READ, NAMED) and not self._is_older(file.name, begun)
-        }
-        without = [f"{name} was written in the meantime, and is not recorded" for name in written]
-        return replace(
-            self,
-            files=tuple(file for name, file in files.items() if name not in written),
-            without_file=tuple(dict.fromkeys((*self.without_file, *sorted(without)))),
-        )
-
-    def _is_older(self, name: str, moment: float) -> bool:
-        try:
-            return os.stat(os.path.join(self.root, name)).st_mtime < moment
-        except OSError:
-            return False
-
     @property
     def code(self) -> str:
-        """A common hash of the modules, functions and models.
-
-        It does not include data files that these read or name: they may be results written there.
-        """
-        roles = (PROBLEM, IMPORTED, FUNCTION, MODEL)
-        hashes = sorted(file.sha256 for file in self.files if file.role in roles)
+        """A common hash of the modules, functions, declared files and the program."""
+        hashes = sorted(file.sha256 for file in self.files if file.role != CALLER)
+        hashes.append(self.revision)
         return hashlib.sha256("\n".join(hashes).encode()).hexdigest()
 
     def changes(self, now: "Sources | None" = None) -> tuple[Change, ...]:
@@ -178,7 +134,7 @@ class Sources:
         - `now`: the present sources of the problem. When left out, and for files that these do not
           include, the files on disk are compared.
         """
-        if self.commit:
+        if self.revision:
             return ()  # It stays what it is.
         found = []
         present = {} if now is None else {file.name: file for file in now.files}
@@ -186,8 +142,11 @@ class Sources:
             match = _same_name(file.name, present)
             if match is None and file.role == CALLER:
                 continue  # Somebody else may call what makes the problem.
-            if match is None and file.role == FUNCTION and now is None:
-                continue  # It lies nowhere but in the problem.
+            if now is None:
+                if file.role in (FUNCTION, PROGRAM):
+                    continue  # It lies nowhere but in the problem.
+            elif file.role == PROGRAM and (match is None or self.other_versions(now)):
+                continue  # Other versions trace otherwise, and a backend on the host not at all.
             sha256 = self._on_disk(file.name) if match is None else present[match].sha256
             if sha256 != file.sha256:
                 found.append(Change(file.name, file.sha256, sha256))
@@ -223,21 +182,6 @@ def list_changes(changes: Sequence[Change]) -> str:
     listed = ", ".join(map(str, changes[:MAX_SHOWN]))
     more = len(changes) - MAX_SHOWN
     return f"{listed} and {more} more" if more > 0 else listed
-
-
-"""Hashes of modules as they were first seen, by their specs, which a reload replaces."""
-
-
-def file_hash(file: Path) -> str:
-    """Return the SHA-256 of a file; it is read again only if its size or time has changed."""
-    about = os.stat(file)
-    return _hash(os.path.abspath(file), about.st_mtime_ns, about.st_size, about.st_ino)
-
-
-@lru_cache(maxsize=4096)
-def _hash(file: str, changed: int, size: int, number: int) -> str:
-    with open(file, "rb") as opened:
-        return hashlib.file_digest(opened, "sha256").hexdigest()
 
 
 def hashed_files(paths: Iterable[Path], role: str) -> list[Source]:

@@ -16,8 +16,8 @@ from types import ModuleType
 from typing import Protocol, TypeVar
 
 from verifai_jax.core.messages.errors import MissingExtra, unknown_name
-from verifai_jax.core.user_code.source_objects import FENCE
 from verifai_jax.core.user_code.user_errors import explain_user_error
+from verifai_jax.core.user_code.user_files import FENCE
 
 
 class Named(Protocol):

@@ -25,7 +25,7 @@ import jax
 
 from verifai_jax.core.messages.errors import nearest_names
 from verifai_jax.core.messages.text import storable
-from verifai_jax.core.user_code.source_objects import is_notebook_cell, is_user_file
+from verifai_jax.core.user_code.user_files import is_notebook_cell, is_user_file
 from verifai_jax.core.values.waveform import IS_CALLED
 
 MAX_CODE = 80

@@ -9,8 +9,9 @@ A simulation that raises, hangs or kills its process becomes a row with a messag
 the run.
 """
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any, ClassVar
 
 import jax
@@ -20,6 +21,7 @@ from jaxtyping import Array, Key
 
 from verifai_jax.core.messages.errors import suggests_options
 from verifai_jax.core.user_code.forks import returning_once
+from verifai_jax.core.user_code.user_files import declared_files
 from verifai_jax.core.values.gaps import has_truths, with_gaps
 from verifai_jax.core.values.trace import Status, Trace, check_code
 from verifai_jax.features.domain import Domain
@@ -291,6 +293,7 @@ def blackbox(
     signals: SignalNames | None = None,
     dt: float | None = None,
     length: int | None = None,
+    files: Iterable[str | Path] = (),
 ) -> BlackBox | PooledBlackBox | VectorisedBlackBox:
     """Mark a Python function as a system that runs on the host.
 
@@ -311,14 +314,16 @@ def blackbox(
       `stack_traces`.
     - `signals`, `dt`, `length`: the form of every trace; see `TraceForm`. A trace of another form
       becomes a row with status `error`.
+    - `files`: files of data that the simulator reads. Their hashes are recorded with the modules of
+      the model, and `resume` refuses to continue if one has changed.
     **Returns:** a `VectorisedBlackBox` if `vectorised`, a `PooledBlackBox` if `workers` are given,
     otherwise a `BlackBox`.
     **Raises:** `ValueError` for an object that cannot be called, or that workers cannot import, and
-    for incompatible options.
+    for incompatible options; `FileNotFoundError` for a missing file.
     """
     if not callable(function):
         raise ValueError(f"blackbox needs a function (features) -> Trace; got {function!r}")
-    declared = TraceForm(signals, dt, length)
+    declared = TraceForm(signals, dt, length, declared_files(files))
     if vectorised and workers is not None:
         raise ValueError(
             f"blackbox runs either vectorised or in workers; got (vectorised=True, {workers=})"

@@ -1,8 +1,8 @@
-"""The form of its traces that a simulator declares, checked for each trace."""
+"""The form of its traces that a simulator declares, checked for each trace, and its files."""
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import jax
@@ -16,18 +16,20 @@ SignalNames = Sequence[str] | Mapping[str, int]
 
 @dataclass(frozen=True)
 class TraceForm:
-    """The required form of a simulator's traces; None means no requirement.
+    """The required form of a simulator's traces, None without a requirement, and its files.
 
     **Arguments:**
     - `signals`: names of scalars, or names with their number of components (1 for a scalar).
     - `dt`: sampling period in seconds.
     - `length`: number of samples.
+    - `source_files`: the files that it reads, with their hashes when they were declared.
     **Raises:** `ValueError` for requirements that no trace can meet.
     """
 
     signals: SignalNames | None = None
     dt: float | None = None
     length: int | None = None
+    source_files: Mapping[str, str] = field(default_factory=dict, repr=False)
 
     def __post_init__(self) -> None:
         signals, dt, length = self.signals, self.dt, self.length

@@ -16,7 +16,14 @@ from verifai_jax.systems.channels import Channels, Link, Passing, States, first_
 from verifai_jax.systems.checkpointing import checkpointed_scan
 from verifai_jax.systems.delays import joined
 from verifai_jax.systems.ode.delay_line import DelayLine
-from verifai_jax.systems.ode.integrators import Integrator, Step, Time, check_factor, integrator
+from verifai_jax.systems.ode.integrators import (
+    Integrator,
+    Step,
+    Time,
+    check_factor,
+    edge,
+    integrator,
+)
 from verifai_jax.systems.ode.switching import Inputs, Switch, switched_step
 from verifai_jax.systems.pytree_checks import (
     as_floating,
@@ -27,11 +34,6 @@ from verifai_jax.systems.pytree_checks import (
     in_working_precision,
     outline,
 )
-
-SPREAD = (0.7548776662466927, 0.5698402909980532)
-"""Numbers whose multiples, modulo 1, fill the unit square evenly (the plastic ratio's powers)."""
-LONGER = 0.4
-"""Share by which the first and the last of an odd number of steps are longer, at most."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -322,21 +324,11 @@ class _Rollout:
         count = self.loop.substeps
         if isinstance(count, int) and count == 1:
             return substep(self.loop, self.features, control, time, state, self.loop.dt)
-        fine: Any = jnp.asarray(self.loop.dt / count, _dtype(state))
-        sample = jnp.asarray(time, fine.dtype) / self.loop.dt
-        # The outer steps are longer than the others, by as much as differs from sample to sample:
-        # what happens at samples alone weighs the more, and not the same as with other counts.
-        odd = (count % 2 == 1) & (count > 1)
-        first, last = (jnp.where(odd, LONGER * (sample * spread % 1), 0) for spread in SPREAD)
-
-        def edge(j: Int[Array, ""]) -> Any:
-            inner = jnp.clip(j, 1, count - 1)
-            moved = first - (first + last) * (inner - 1) / jnp.maximum(count - 2, 1)
-            return (j + jnp.where(inner == j, moved, 0)) * fine
+        time = jnp.asarray(time, _dtype(state))
 
         def advance(j: Int[Array, ""], state: PyTree) -> Any:
-            begin, length = edge(j), edge(j + 1) - edge(j)
-            return substep(self.loop, self.features, control, time + begin, state, length)
+            begin, end = (edge(time, self.loop.dt, count, at) for at in (j, j + 1))
+            return substep(self.loop, self.features, control, time + begin, state, end - begin)
 
         return jax.lax.fori_loop(0, count, advance, state)
 

@@ -23,6 +23,10 @@ Derivative: TypeAlias = Callable[[Time, PyTree], PyTree]
 """A function `(time, state) -> d state / d time`."""
 Integrator: TypeAlias = Callable[[Derivative, Time, PyTree, Step], PyTree]
 """A function `(derivative, time, state, dt) -> state` at `time + dt`."""
+SPREAD = (0.7548776662466927, 0.5698402909980532)
+"""Numbers whose multiples, modulo 1, fill the unit square evenly (the plastic ratio's powers)."""
+LONGER = 0.4
+"""Share by which the first and the last of an odd number of steps are longer, at most."""
 
 
 def euler(derivative: Derivative, time: Time, state: PyTree, dt: Step) -> PyTree:
@@ -93,6 +97,19 @@ def integrator(method: str | Integrator) -> Integrator:
     if method not in METHODS:
         raise unknown_name("method", method, METHODS)
     return METHODS[method]
+
+
+def edge(time: Any, dt: float, count: Any, j: Any) -> Any:
+    """Return the seconds after a sample at which step `j` of `count` steps to the next begins.
+
+    Of an odd count the first and the last step are longer, by as much as differs from sample to
+    sample: what happens at samples alone weighs more then, and not as much as with other counts.
+    """
+    odd = (count % 2 == 1) & (count > 1)
+    first, last = (jnp.where(odd, LONGER * (time / dt * spread % 1), 0) for spread in SPREAD)
+    inner = jnp.clip(j, 1, count - 1)
+    moved = first - (first + last) * (inner - 1) / jnp.maximum(count - 2, 1)
+    return (j + jnp.where(inner == j, moved, 0)) * jnp.asarray(dt / count, time.dtype)
 
 
 def check_factor(factor: object) -> None:

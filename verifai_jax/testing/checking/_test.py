@@ -5,7 +5,7 @@ def test_balance(): ...
 
 @vj.test("specs/cartpole.py:balance", budget=5000, max_failure_probability=0.01)
 def test_balance_is_rarely_lost(run):
-assert run.best["rho"] > -0.5                    # further demands on the run
+    assert run.best["rho"] > -0.5                    # further demands on the run
 """
 
 import contextlib

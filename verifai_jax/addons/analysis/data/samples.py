@@ -21,7 +21,7 @@ import pandas as pd
 from jaxtyping import Bool, Float, Int
 
 from verifai_jax.addons.analysis.data.columns import Column, describe_columns, feature_columns
-from verifai_jax.addons.analysis.data.verdicts import claimed, explain_empty, select_rows, verdicts
+from verifai_jax.addons.analysis.data.verdicts import explain_empty, select_rows, standing, verdicts
 from verifai_jax.core.messages.checks import check_count
 from verifai_jax.core.messages.errors import check_names
 from verifai_jax.falsification.run import Run
@@ -198,9 +198,9 @@ class Samples:
             "counterexamples": ("counterexample", "counterexamples"),
         }
         one, several = nouns[self.which]
-        sure = int(np.sum(claimed(self.frame))) if self.which == "counterexamples" else len(self)
-        if sure < len(self):
-            return f"{len(self):,} failing rows of {self.name}, {sure:,} of them replayed"
+        left = int(np.sum(standing(self.frame)[0].not_replayed))
+        if left and self.which == "counterexamples":
+            return f"{len(self):,} failing rows of {self.name}, {left:,} of them not replayed"
         words = one if len(self) == 1 else several
         return f"{len(self):,} {words} of {self.name}"
 

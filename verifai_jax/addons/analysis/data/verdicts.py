@@ -13,21 +13,12 @@ def verdicts(table: pd.DataFrame) -> tuple[Bool[np.ndarray, " n"], Bool[np.ndarr
     What the failing rows have in common shows in those, too, that were not replayed. A violating
     row that closer replays refused is in neither.
     """
-    stands, safe = _standing(table)
+    stands, safe = standing(table)
     return stands.claimed | stands.not_replayed, safe
 
 
-def refused(table: pd.DataFrame) -> Bool[np.ndarray, " n"]:
-    """Return the rows that violate the property, which closer replays do not confirm."""
-    return _standing(table)[0].refused
-
-
-def claimed(table: pd.DataFrame) -> Bool[np.ndarray, " n"]:
-    """Return the rows that are claimed as counterexamples."""
-    return _standing(table)[0].claimed
-
-
-def _standing(table: pd.DataFrame) -> tuple[Standing, Bool[np.ndarray, " n"]]:
+def standing(table: pd.DataFrame) -> tuple[Standing, Bool[np.ndarray, " n"]]:
+    """Return the standing of the rows that violate the property, and the rows that keep it."""
     ended = np.ones(len(table), bool)
     if "status" in table:
         ended = np.asarray(table["status"] == "ok", bool)
@@ -52,7 +43,7 @@ def select_rows(table: pd.DataFrame, which: str) -> Bool[np.ndarray, " n"]:
         return safe
     if which == "all":
         return violating | safe
-    return ~(violating | safe | refused(table))
+    return ~(violating | safe | standing(table)[0].refused)
 
 
 def explain_empty(table: pd.DataFrame, which: str) -> str:
@@ -60,7 +51,7 @@ def explain_empty(table: pd.DataFrame, which: str) -> str:
     if not len(table):
         return "the table is empty: there are no simulations to analyse"
     violating, safe = (int(part.sum()) for part in verdicts(table))
-    doubtful = int(refused(table).sum())
+    doubtful = int(standing(table)[0].refused.sum())
     more = f"{doubtful:,} not claimed, " if doubtful else ""
     what = {"safe": "safe rows", "failed": "rows without a verdict", "all": "rows with a verdict"}
     return (

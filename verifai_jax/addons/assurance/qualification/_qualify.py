@@ -20,7 +20,7 @@ from verifai_jax.addons.assurance.qualification.result import Outcome, Qualifica
 from verifai_jax.addons.reports.provenance import versions
 from verifai_jax.core.messages.errors import check_names
 from verifai_jax.core.messages.text import one_line
-from verifai_jax.core.user_code.source_objects import PACKAGE
+from verifai_jax.core.user_code.user_files import PACKAGE
 
 
 def qualify(only: Sequence[str] | None = None) -> Qualification:

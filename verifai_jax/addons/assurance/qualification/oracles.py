@@ -1,6 +1,6 @@
 """Oracles: results of the tool, compared with independent definitions.
 
-for name, check in ORACLES.items(): check()             # AssertionError where it is wrong
+    for name, check in ORACLES.items(): check()             # AssertionError where it is wrong
 
 Each uses a definition, a closed form or another library, and takes seconds.
 """

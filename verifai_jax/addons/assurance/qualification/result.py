@@ -1,7 +1,7 @@
 """The record of a qualification: oracles, outcomes, versions and a hash of the files.
 
-found = qualify()
-found.passed; print(found); found.save("qualification")
+    found = qualify()
+    found.passed; print(found); found.save("qualification")
 
 `HAZARDS` lists possible errors of the tool, each with the oracle that detects it.
 `test_planted_errors.py`, in the tests of this add-on, plants each in a copy of the package to show

@@ -1,8 +1,8 @@
 """Certificates of the safety of many policies: an attack first, then bounds from fresh samples.
 
-certificates = certify(problem_of, policies, p=0.01)
-print(certificates)
-certificates.safest, certificates[3].verdict, certificates.counterexamples(3)
+    certificates = certify(problem_of, policies, p=0.01)
+    print(certificates)
+    certificates.safest, certificates[3].verdict, certificates.counterexamples(3)
 
 Failures of policies on the host are simulated once more before a certificate shows them. A failure
 that does not recur was caused by state left by earlier simulations, or by random numbers that do
@@ -129,7 +129,6 @@ def certify(
         devices=devices,
         executor=executor,
     )
-    begun = time.time()
     attacker = check_attack(blocks.problem, attack)
     rounds = -(-attack_simulations // lanes)
     if tie is None:
@@ -182,7 +181,7 @@ def certify(
             *blocks.notes,
             *_chance(blocks.problem, rows),
         ),
-        sources=blocks.sources.settled(begun).to_json(),
+        sources=blocks.sources.to_json(),
     )
 
 

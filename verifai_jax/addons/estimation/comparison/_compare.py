@@ -136,7 +136,7 @@ def _compare(
         )
     notes = _notes(baseline, named)
     sides = {"baseline": baseline, **named}
-    sources, begun = {name: side.sources() for name, side in sides.items()}, time.time()
+    sources = {name: side.sources() for name, side in sides.items()}
     each = 1 - (1 - confidence) / len(named)
     tallies = {name: _Tally() for name in named}
     open_ones, stopped, size, first = set(named), "budget", FIRST, 0
@@ -175,7 +175,7 @@ def _compare(
         time.perf_counter() - started,
         seed,
         notes,
-        {name: made.settled(begun).to_json() for name, made in sources.items()},
+        {name: made.to_json() for name, made in sources.items()},
     )
 
 

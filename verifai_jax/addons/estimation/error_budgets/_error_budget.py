@@ -1,7 +1,7 @@
 """The error of a probability: by its samples, step, precision, solver, seeds and prior.
 
-budget = vj.error_budget(problem, vj.estimate(problem), pairs=20_000)
-budget = vj.error_budget(candidate, comparison["candidate"], baseline=problem)
+    budget = vj.error_budget(problem, vj.estimate(problem), pairs=20_000)
+    budget = vj.error_budget(candidate, comparison["candidate"], baseline=problem)
 
 A part is measured on pairs with the same features and random numbers, simulated once unchanged and
 once with the change, so that common errors cancel. Its interval is that of the difference in

@@ -103,7 +103,7 @@ def modes(
     if not isinstance(source, Problem | Run):
         raise TypeError(f"modes needs a Problem or a run of one; got {type(source).__name__}")
     problem = problem_of(source) if isinstance(source, Run) else source
-    sources, begun = problem.sources(), time.time()
+    sources = problem.sources()
     changed = source.changed_since() if isinstance(source, Run) else ""
     check_options(budget, 1 if batch is None else batch, seed, max_seconds, None)
     check_fraction("confidence", confidence)
@@ -185,7 +185,7 @@ def modes(
         notes=tuple(dict.fromkeys(notes)),
         run=run,
         seconds=time.perf_counter() - started,
-        sources=sources.settled(begun).to_json(),
+        sources=sources.to_json(),
         changed=changed,
         stopped=limit_state.ended,
     )

@@ -141,7 +141,5 @@ def compare_trials(
         sum(None in pair for pair in pairs),
     )
     firsts = table.loc[[name == baseline for name in names]]
-    notes = copies(firsts.drop(columns=["pair", "policy", FAILED]))
-    return TrialComparison(
-        baseline, candidate, rates, pairs.count((True, True)), margin, tuple(notes)
-    )
+    notes = tuple(copies(firsts.drop(columns=["pair", "policy", FAILED])))
+    return TrialComparison(baseline, candidate, rates, pairs.count((True, True)), margin, notes)

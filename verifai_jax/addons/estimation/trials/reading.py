@@ -75,17 +75,15 @@ def copies(features: "pd.DataFrame") -> list[str]:
     """
     real = features.select_dtypes("floating")
     real = real.loc[:, real.nunique() > 1]
-    if not real.shape[1]:
-        return []
-    groups = real.groupby([*real.columns], dropna=False, sort=False).indices.values()
+    names = list(real.columns)
+    groups = real.groupby(names, dropna=False, sort=False).indices.values() if names else ()
     same = [", ".join(map(str, rows)) for rows in groups if len(rows) > 1]
-    if not same:
-        return []
-    return [
-        f"trials that agree in every digit of all real features ({listed(list(real.columns))}) "
-        f"count as separate ones: rows {'; '.join(same[:SHOWN])}{'; ...' * (len(same) > SHOWN)}. "
-        "If they are copies, the interval is too narrow"
-    ]
+    note = (
+        f"trials that agree in every digit of all real features ({listed(names)}) count as "
+        f"separate ones: rows {'; '.join(same[:SHOWN])}{'; ...' * (len(same) > SHOWN)}. If they "
+        "are copies, the interval is too narrow"
+    )
+    return [note] * bool(same)
 
 
 def table_of(trials: TrialTable) -> "tuple[pd.DataFrame, Path]":

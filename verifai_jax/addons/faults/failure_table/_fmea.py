@@ -1,6 +1,6 @@
 """Failure modes and effects of single faults, and of pairs whose faults cause no failure alone.
 
-print(fmea(problem, [vj.faults.Dropout("gyro", onset=vj.Box(0, 3), duration=vj.Box(0, 1))]))
+    print(fmea(problem, [vj.faults.Dropout("gyro", onset=vj.Box(0, 3), duration=vj.Box(0, 1))]))
 
 All faults are features of one problem, so one program simulates every row. In a row all other
 faults are off.

@@ -1,7 +1,8 @@
 """The function that loads policies trained with any framework.
 
-policy("ppo.zip")                                       # Stable-Baselines3 policy("walk.onnx")
-# whatever exports ONNX policy("actor.safetensors", activation="elu")           # weights of an MLP
+policy("ppo.zip")                                       # Stable-Baselines3
+policy("walk.onnx")                                     # whatever exports ONNX
+policy("actor.safetensors", activation="elu")           # weights of an MLP
 policy(torch_module, observation=np.zeros(48))
 """
 

@@ -1,6 +1,6 @@
 """Graphs of ONNX as pure functions of JAX.
 
-policy = read_onnx("walk.onnx")
+    policy = read_onnx("walk.onnx")
 
 Weights are a pytree; integers for shapes and indices stay constants, so that JAX compiles with
 fixed shapes. Source: the ONNX specification, `docs/IR.md` and `docs/Operators.md`.

@@ -1,6 +1,6 @@
 """Weights of a file that PyTorch has written, without PyTorch and without unpickling.
 
-weights = read_state(archive_bytes)          # {"mlp.0.weight": [out, in], ...}
+    weights = read_state(archive_bytes)          # {"mlp.0.weight": [out, in], ...}
 
 A file of `torch.save` is an archive with one pickle, `data.pkl`, that refers to one file a storage.
 Source: `torch/serialization.py` of PyTorch 2.

@@ -1,6 +1,6 @@
 """Pure functions of JAX as graphs of ONNX operators.
 
-graph, weights, memory = traced(policy.compute, policy.weights, np.zeros(4), None)
+    graph, weights, memory = traced(policy.compute, policy.weights, np.zeros(4), None)
 
 A function is traced, and each operation of JAX becomes operators of ONNX. This covers networks of
 flax and equinox, policies of Brax, scales, squashing and memory. The existing jax2onnx is not used,

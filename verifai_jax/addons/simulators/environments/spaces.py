@@ -1,7 +1,7 @@
 """Conversion and checks of actions and observations by the class of their Gymnasium space.
 
-fit(env.action_space, action, clip=True)            # as the environment takes it, or a Misfit
-named_numbers("action", action)                     # {"action": ...}, or {"action.grip": ...}
+    fit(env.action_space, action, clip=True)            # as the environment takes it, or a Misfit
+    named_numbers("action", action)                     # {"action": ...}, or {"action.grip": ...}
 
 Classes are recognised by their names, because Gymnasium is an optional package and older packages
 use the same names.

@@ -1,8 +1,8 @@
 """An FMU as a system: parameters and start values from features, inputs, controllers, outputs.
 
-system = vj.fmu("suspension.fmu", duration=4.0, dt=0.01)
-system = vj.fmu("plant.fmu", duration=4.0, dt=0.01, controller=control, workers=4)
-ranges = vj.fmu_ranges("suspension.fmu", ["m", "k"])    # for vj.Box(*ranges["m"])
+    system = vj.fmu("suspension.fmu", duration=4.0, dt=0.01)
+    system = vj.fmu("plant.fmu", duration=4.0, dt=0.01, controller=control, workers=4)
+    ranges = vj.fmu_ranges("suspension.fmu", ["m", "k"])    # for vj.Box(*ranges["m"])
 
 Each simulation runs in a worker process, which keeps its instance of the FMU for the next one. An
 FMU that crashes ends only its worker and costs one row.
@@ -314,7 +314,8 @@ def fmu(
         description.file, duration, dt, dict(bind or {}), named, controller, reuse, description
     )
     form = {"signals": tuple(named), "dt": dt, "length": steps + 1}
-    return blackbox(simulation, workers=workers, timeout=timeout, **form)
+    files = [description.file]
+    return blackbox(simulation, workers=workers, timeout=timeout, files=files, **form)
 
 
 def fmu_variables(file: str | Path) -> "pd.DataFrame":

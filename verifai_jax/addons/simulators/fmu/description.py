@@ -1,7 +1,7 @@
 """The description of an FMU: its variables with types, units and ranges, and its capabilities.
 
-description = read_description("model.fmu")
-description.variables["m"].unit, description.identifier
+    description = read_description("model.fmu")
+    description.variables["m"].unit, description.identifier
 
 A document type declaration is refused, since it could make XML read files or grow without bound.
 """

@@ -1,6 +1,6 @@
 """FMUs for model exchange, which contain equations and events but no solver: both are solved here.
 
-instance = ExchangeInstance(description, folder)     # begin, set, step and get as of `Instance`
+    instance = ExchangeInstance(description, folder)     # begin, set, step and get as of `Instance`
 
 LSODA integrates, with implicit steps if the equations are stiff; samples within its steps are
 interpolated. Events occur when an indicator changes its sign (located within the step), at times

@@ -1,8 +1,8 @@
 """The binary of an FMU, called through ctypes: instances of FMI 2 and 3, here for co-simulation.
 
-instance = Instance(description, folder)            # folder: where the FMU is unpacked
-instance.begin({"m": 2.0}, duration=4.0)
-instance.set({"force": 1.0}); instance.step(0.0, 0.02); instance.get(["x", "v"])
+    instance = Instance(description, folder)            # folder: where the FMU is unpacked
+    instance.begin({"m": 2.0}, duration=4.0)
+    instance.set({"force": 1.0}); instance.step(0.0, 0.02); instance.get(["x", "v"])
 
 An FMU runs inside this process, so a crash ends the simulation's worker.
 """

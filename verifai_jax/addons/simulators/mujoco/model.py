@@ -8,6 +8,7 @@ MuJoCo is imported when a model is loaded, not before.
 import contextlib
 import copy
 import io
+import re
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -18,8 +19,14 @@ import numpy as np
 
 from verifai_jax.addons.simulators.mujoco.part_paths import MjModel, names
 from verifai_jax.core.messages.errors import require, unknown_name
-from verifai_jax.core.user_code.source_collection import files_of_model
-from verifai_jax.core.user_code.sources import file_hash
+from verifai_jax.core.user_code.user_files import file_hash
+
+MAX_FILES = 200
+"""Files of one model at most."""
+_MODELS = (".xml", ".mjcf", ".urdf")
+"""Endings of files that describe a model and refer to further files."""
+_REFERENCE = re.compile(r"""\b(?:file|file\w+|filename)\s*=\s*["']([^"']+)["']""")
+_FOLDER = re.compile(r"""\b(?:meshdir|texturedir|assetdir)\s*=\s*["']([^"']+)["']""")
 
 ModelSource: TypeAlias = Any
 """The path of an MJCF file, its text, a `mujoco.MjSpec` or a `mujoco.MjModel`."""
@@ -141,7 +148,7 @@ def _hashes_of_files(source: ModelSource) -> dict[str, str]:
     if not isinstance(source, str | Path) or "<" in str(source):
         return {}
     file = Path(source).absolute()
-    return {str(each): file_hash(each) for each in (file, *files_of_model(file))}
+    return {str(each): file_hash(each) for each in (file, *files_referred_to(file))}
 
 
 def free_centres_of_mass(model: Model, bodies: Collection[int]) -> Model:
@@ -232,3 +239,32 @@ def _contact_geoms(model: MjModel, path: str) -> tuple[str, str | None]:
             return first, second
     wrong = next((part for part in parts if part not in known), path)
     raise unknown_name(f"geom in {path!r}: geom", wrong, known)
+
+
+def files_referred_to(model: Path) -> list[Path]:
+    """Return the files to which an XML model refers: includes, meshes, textures, height fields.
+
+    **Arguments:**
+    - `model`: the model's file; a file that is not a model refers to none.
+    """
+    found: dict[Path, None] = {}
+    waiting, folders = [model.resolve()], {model.resolve().parent: None}
+    while waiting and len(found) < MAX_FILES:
+        file = waiting.pop()
+        if file.suffix.lower() not in _MODELS:
+            continue
+        try:
+            text = file.read_text(encoding="utf-8", errors="replace")
+        except OSError:
+            continue
+        folders[file.parent] = None
+        for name in _FOLDER.findall(text):
+            folders[(file.parent / name).resolve()] = None
+        for name in _REFERENCE.findall(text):
+            name = name.removeprefix("package://").removeprefix("file://")
+            for folder in tuple(folders):
+                path = (folder / name).resolve()
+                if path != model.resolve() and path not in found and path.is_file():
+                    found[path] = None
+                    waiting.append(path)
+    return list(found)

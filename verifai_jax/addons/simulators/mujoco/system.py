@@ -1,8 +1,8 @@
 """A MuJoCo model in a closed loop as a system `(features, key) -> Trace`, on one of two engines.
 
 mujoco("envs/mujoco_cartpole.xml", duration=4.0, control_period=0.02,
-bind={"masspole": "body/pole/mass", "x0": "joint/slider/qpos"},
-controller=policy, signals={"x": "joint/slider/qpos"})
+       bind={"masspole": "body/pole/mass", "x0": "joint/slider/qpos"},
+       controller=policy, signals={"x": "joint/slider/qpos"})
 mjx(...)                              # the same in JAX: vmap, gradients, GPU
 native(...)                           # the same in C: all cores, a batch in lock-step
 """

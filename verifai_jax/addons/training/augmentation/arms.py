@@ -1,6 +1,6 @@
 """The arms of an augmentation: one way each of choosing what is added to the initial set.
 
-ARMS["counterexamples"](base)           # an Addition
+    ARMS["counterexamples"](base)           # an Addition
 
 A new arm is a function of a `Base` here, and an entry of `ARMS`.
 """

@@ -1,7 +1,7 @@
 """Policies of hardening at each stage, in two arms: with counterexamples, and with the prior.
 
-arms.mix(1, [mixture, prior])                       # what the episodes up to stage 1 are drawn from
-arms.policies(1)                                    # trained up to the second stage, or cached
+    arms.mix(1, [mixture, prior])                   # what the episodes up to stage 1 are drawn from
+    arms.policies(1)                                    # trained up to the second stage, or cached
 
 Arms share the training seed, so they are one training up to the first stage. Afterwards all take
 the same number of environment steps.

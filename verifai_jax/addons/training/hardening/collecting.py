@@ -1,8 +1,8 @@
 """Failures of a stage's policy, as points for the next training to concentrate on.
 
-found = collect(problem, failing, earlier, seed=3, added=64, table=512, shrunk=4)
-found.points, found.sources                 # [n, d], and for each where it comes from
-found.kept                                  # which earlier points stay
+    found = collect(problem, failing, earlier, seed=3, added=64, table=512, shrunk=4)
+    found.points, found.sources                 # [n, d], and for each where it comes from
+    found.kept                                  # which earlier points stay
 
 Failures of the certificate and of its attack, earlier points and samples of the prior are simulated
 together. This table yields rules, and some of its failures are shrunk. Failing samples come first,

@@ -1,7 +1,7 @@
 """Trainings by a user's function, with each call in a separate process.
 
-runs = FunctionRuns(study, cache, clock)
-runs.train([runs.add(values, seed=0)], rung=0)
+    runs = FunctionRuns(study, cache, clock)
+    runs.train([runs.add(values, seed=0)], rung=0)
 
 Each process is new and its global random numbers are seeded, so a policy depends only on the
 arguments of the call. A function with an argument `resume` gets a folder with a copy of the files

@@ -59,7 +59,7 @@ class Interpreter:
         """The last step of a differential equation: what it was made of, and its results."""
 
     def __call__(self, program: Program, inputs: Sequence[Value]) -> list[Value]:
-        """Evaluate a traced program; what is not defined becomes a set that is everything.
+        """Evaluate a traced program; what is not defined is bounded by (-inf, inf).
 
         **Raises:** `MissingRule` for an operation without a rule, with its name and its line.
         """
