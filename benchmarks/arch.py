@@ -33,9 +33,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pandas as pd
-from seeds import FirstFailures, first_failures
 
 import verifai_jax as vj
+from benchmarks.seeds import FirstFailures, first_failures
 from specs.arch.lstm import from_folder
 
 MODELS = (

@@ -21,9 +21,9 @@ import numpy as np
 from arch import BUDGETS, ratio, requirements
 from landscapes import LANDSCAPES
 from mixed_spaces import FRESH, PROBLEMS, SHARES
-from seeds import first_failures
 
 import verifai_jax as vj
+from benchmarks.seeds import first_failures
 
 ARCH = (
     *("at1", "at2", "at6a", "cc1", "cc2", "cc3", "cc4", "cc5", "ccx", "nn", "f16a", "afc27"),

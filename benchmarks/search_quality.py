@@ -19,9 +19,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from landscapes import LANDSCAPES, tell_of
-from seeds import first_failures
 
 import verifai_jax as vj
+from benchmarks.seeds import first_failures
 from verifai_jax.core.user_code.targets import load_target
 
 BATCH = {"uniform": 512, "halton": 512, "sobol": 512, "gradient": 8, "bayes": 8}

@@ -21,7 +21,7 @@ SHARED = {"conftest.py", "checked_types.py", "xla_flags.py"}
 EVERYTHING = {"pyproject.toml", "constraints.txt", "_verifai_jax_pytest.py"}
 LAWS = ("test_architecture.py", "test_language.py", "test_public_names.py")
 """Tests that read the whole package, and run whenever a file of it changes."""
-ELSEWHERE = {"_version": "cli", "remote_client": "systems/remote"}
+ELSEWHERE = {"_version": "cli", "remote_client": "addons/simulators/remote"}
 """Tests of files at the root."""
 
 
@@ -87,7 +87,7 @@ def paths_for(files: Iterable[str]) -> list[str]:
             if (ROOT / path).exists():
                 chosen.add(name if path.name.startswith("test_") else str(path.parent))
         elif path.parts[0] in ("envs", "specs"):
-            chosen |= {"tests/envs", "tests/addons/rl"}
+            chosen |= {"tests/envs", "tests/addons/envs", "tests/addons/rl"}
         elif path.parts[0] == "docs" or path.suffix == ".md":
             chosen.add("tests/test_documents.py")
         elif path.parts[0] == "notebooks":

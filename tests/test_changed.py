@@ -8,12 +8,8 @@ LAWS = ["tests/test_architecture.py", "tests/test_language.py", "tests/test_publ
 
 def test_a_file_calls_for_its_room_and_for_those_that_import_it():
     found = paths_for(["verifai_jax/pictures/replay.py"])
-    assert found == [
-        "tests/cli",
-        "tests/addons/reports",
-        *LAWS,
-        "tests/addons/assurance/traceability",
-    ]
+    assert {"tests/addons/reports", "tests/cli", "tests/pictures", *LAWS} <= set(found)
+    assert {"tests/mtl", "tests/evaluation", "tests/addons/native"}.isdisjoint(found)
 
 
 def test_importers_go_through_others():
@@ -24,7 +20,7 @@ def test_importers_go_through_others():
 
 def test_a_file_that_is_gone_calls_for_all_that_its_room_does():
     gone = set(paths_for(["verifai_jax/addons/estimation/comparison/gone.py"]))
-    assert {"tests/addons/estimation/comparison", "tests/cli"} <= gone
+    assert {"tests/addons/estimation", "tests/cli"} <= gone
     assert "tests/mtl" not in gone
 
 
@@ -38,7 +34,7 @@ def test_a_file_that_is_gone_calls_for_all_that_its_room_does():
         ("pyproject.toml", ["tests"]),
         ("docs/formulas.md", ["tests/test_documents.py"]),
         ("README.md", ["tests/test_documents.py"]),
-        ("specs/cartpole.py", ["tests/envs", "tests/addons/rl"]),
+        ("specs/cartpole.py", ["tests/addons/envs", "tests/addons/rl", "tests/envs"]),
         ("verifai_jax/remote_client.py", ["tests/addons/simulators/remote", *LAWS]),
         ("LICENSE", []),
     ],

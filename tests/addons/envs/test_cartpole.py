@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from envs import cartpole as cp
-from envs.cartpole_task import CartPoleTask
+from envs.cartpole_task import CartPoleTask, Episode
 from specs.cartpole import balance_with
 from verifai_jax.addons.rl import Discrete, Policy, evaluate, load_policy
 from verifai_jax.core.messages.errors import UnknownNameError
@@ -153,7 +153,7 @@ def test_task_steps_like_gymnasium():
     env = gymnasium.make("CartPole-v1").unwrapped
     env.reset(seed=0)
     task = CartPoleTask()
-    state = cp.Episode(cp.State(*(jnp.float32(v) for v in env.state)), {})
+    state = Episode(cp.State(*(jnp.float32(v) for v in env.state)), {})
     step = jax.jit(task.step)
     for action in [1, 0, 0] + [1] * 20:
         observed, reward, over, _, _ = env.step(action)
@@ -193,7 +193,7 @@ def test_an_episode_has_its_own_pole_and_start():
 def test_shaping_sums_to_the_difference_of_potentials():
     task = CartPoleTask(potential=3.0, shaping_discount=0.9)
     state = cp.State(*(jnp.float32(v) for v in (1.2, 0.0, cp.THETA_LIMIT / 2, 0.0)))
-    episode, total, weight, over = cp.Episode(state, {}), 0.0, 1.0, False
+    episode, total, weight, over = Episode(state, {}), 0.0, 1.0, False
     step = jax.jit(task.step)
     while not over:
         episode, reward, over = step(KEY, episode, 1)

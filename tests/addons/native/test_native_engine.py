@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 import verifai_jax as vj
-from verifai_jax.addons.native.native_code import machine_code, native_engine, native_program
+from verifai_jax.addons.native import native_engine, native_program
+from verifai_jax.addons.native.native_code import machine_code
 from verifai_jax.addons.native.native_engine import FIRST, NativeEngine
 from verifai_jax.core.compute.keys import run_keys
 from verifai_jax.core.messages.errors import UnknownNameError

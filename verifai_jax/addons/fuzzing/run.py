@@ -73,7 +73,7 @@ def as_fuzz_run(run: Run) -> FuzzRun:
 
 
 class Fuzzing:
-    """What `vj.load` and `vj.resume` need to know of a run of `fuzz`."""
+    """The functions by which `vj.load` and `vj.resume` make a run of `fuzz`."""
 
     @staticmethod
     def derive(problem: Problem, derived: Mapping[str, Any]) -> Problem:

@@ -27,7 +27,7 @@ from verifai_jax.problem.problem import Problem
 
 @runtime_checkable
 class AddedSection(Protocol):
-    """What adds a section to a report: an error budget, a covered design domain, one of yours."""
+    """An object that adds a section to a report: an error budget, a covered domain, yours."""
 
     def on_page(self, page: Page) -> Page:
         """Return the page with the section."""

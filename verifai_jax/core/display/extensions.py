@@ -92,8 +92,8 @@ def _exists(module: str) -> bool:
         found = importlib.util.find_spec(root)
     except (ImportError, ValueError):
         return False
-    places = found.submodule_search_locations if found is not None else None
-    if places is None or not parts:
+    folders = found.submodule_search_locations if found is not None else None
+    if folders is None or not parts:
         return found is not None
-    files = [Path(place, *parts) for place in places]
+    files = [Path(folder, *parts) for folder in folders]
     return any(file.is_dir() or file.with_suffix(".py").is_file() for file in files)

@@ -52,7 +52,7 @@ def trace(arguments: list[str]):
 
 @pytest.mark.parametrize("name", CHANGES)
 def test_each_requirement_has_a_formula_and_a_test(name, monkeypatch):
-    monkeypatch.chdir(CASES.parents[2])
+    monkeypatch.chdir(CASES.parents[1])
     monkeypatch.setattr(sys, "path", [*sys.path])
     words = commands(name)[-1]
     asked = words[: words.index("--runs")]

@@ -47,7 +47,7 @@ def test_what_is_wrong_is_said_before_anything_trains():
 
 
 def test_a_policy_of_another_form_than_the_examples():
-    trained = vj.policy(HERE.parents[2] / "rl" / "policies" / "files" / "mlp.onnx")
+    trained = vj.policy(HERE.parents[1] / "rl" / "policies" / "files" / "mlp.onnx")
     for size, words in ((2, None), (3, "actions of shape [2], and example= of the trainer, with")):
         trainer = vj.Trainer(train, steps=8, example=lambda o, size=size: jnp.zeros(size))
         why = FunctionRuns._why_not_of_the_form(SimpleNamespace(_trainer=trainer), trained)

@@ -25,7 +25,7 @@ class EpisodeFilm:
 
     @property
     def draws(self) -> bool:
-        """Whether the environment was made with `render_mode="rgb_array"`."""
+        """True for an environment that was made with `render_mode="rgb_array"`."""
         return self.episode.draws
 
     def gif(
