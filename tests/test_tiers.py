@@ -28,7 +28,7 @@ for names in (vj, vj.mtl):
 def core(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A checkout without add-ons."""
     folder = tmp_path_factory.mktemp("core")
-    for name in ("verifai_jax", "specs", "envs", "tests", "docs"):
+    for name in ("verifai_jax", "specs", "envs", "tests", "docs", "benchmarks"):
         ignored = shutil.ignore_patterns("addons", "__pycache__")
         shutil.copytree(ROOT / name, folder / name, ignore=ignored)
     for name in ("pyproject.toml", "README.md", "_verifai_jax_pytest.py", "Makefile"):

@@ -15,7 +15,6 @@ import pytest
 from checked_types import unchecked
 
 import verifai_jax as vj
-from verifai_jax.addons.simulators.mujoco.model import files_referred_to
 from verifai_jax.core.user_code.revisions import load_at_revision
 from verifai_jax.core.user_code.sources import Sources, list_changes
 from verifai_jax.core.user_code.targets import load_target
@@ -254,7 +253,10 @@ def test_the_commit_is_recorded_and_whether_files_differ_from_it(project):
     assert loaded().sources().dirty
 
 
+@pytest.mark.addons
 def test_a_model_of_mujoco_has_its_includes_and_meshes(tmp_path):
+    from verifai_jax.addons.simulators.mujoco.model import files_referred_to
+
     (tmp_path / "parts" / "meshes").mkdir(parents=True)
     (tmp_path / "arm.xml").write_text(
         '<mujoco><compiler meshdir="parts/meshes"/><include file="parts/hand.xml"/></mujoco>'
