@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 import verifai_jax as vj
-from verifai_jax.addons.reports.view import view_data
 from verifai_jax.cli.json_output import describe_run
 from verifai_jax.counterexamples.selection import select_row
 from verifai_jax.evaluation import confirmer
@@ -261,6 +260,7 @@ def test_the_analysis_counts_the_same(run):
 @pytest.mark.addons
 def test_everything_that_counts_claims_counts_the_same(run):
     from verifai_jax.addons.reports.run_findings import number_rows
+    from verifai_jax.addons.reports.view import view_data
 
     """One run, and its table, JSON, gate, evidence and analysis."""
     table, counts = run.table.all, run.table.counts
