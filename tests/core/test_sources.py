@@ -140,6 +140,17 @@ def test_results_and_files_that_are_not_imported_have_no_part(project):
     assert before.changes(loaded().sources()) == ()
 
 
+def test_packages_without_a_file_are_followed_though_they_are_not_imported(project):
+    (project / "wide" / "deep").mkdir(parents=True)
+    (project / "wide" / "deep" / "gain.py").write_text("GAIN = 1.0\n")
+    text = SPEC.replace("system =", "def late():\n    import wide.deep.gain\n\nsystem =")
+    edit("spec.py", text)
+    before = loaded().sources()
+    assert "wide/deep/gain.py" in {file.name for file in before.files}
+    edit("wide/deep/gain.py")
+    assert [change.name for change in before.changes(loaded().sources())] == ["wide/deep/gain.py"]
+
+
 def test_a_module_is_what_it_was_imported_as(project):
     problem = loaded()
     before = problem.sources()

@@ -217,6 +217,7 @@ def test_a_run_without_a_folder_asks_for_its_model_when_somebody_does(monkeypatc
     assert not asked
     assert [file[0] for file in run.sources[0]["files"]] == ["spec.py"]
     assert asked
+    assert list(vj.load(run.save("saved")).sources) == list(run.sources)
 
 
 @pytest.mark.slow

@@ -233,8 +233,9 @@ def write_record(run: Run, folder: Path) -> int:
 
 
 def _as_record(run: Run) -> dict[str, Any]:
-    features = {"features": list(run.table.features)}
-    return features | {name: getattr(run, name) for name in RECORDED}
+    record = {"features": list(run.table.features)}
+    record |= {name: getattr(run, name) for name in RECORDED}
+    return record | {"sources": list(run.sources)}
 
 
 def read_record(folder: Path) -> dict[str, Any]:

@@ -179,27 +179,37 @@ def _imports(module: _Module) -> Iterator[_Module]:
     except OSError:
         return
     for name in names:
-        parts, path = name.split("."), None
+        parts, folders = name.split("."), None
         for count in range(1, len(parts) + 1):
             whole = ".".join(parts[:count])
-            loaded = _variables(sys.modules.get(whole))
-            if loaded:
-                found, path = _module(loaded), loaded.get("__path__")
-                if found is None and loaded.get("__file__"):
+            found = _find(parts[count - 1], sys.path if folders is None else folders)
+            if loaded := _variables(sys.modules.get(whole)):
+                known = _module(loaded)
+                if known is None and loaded.get("__file__"):
                     break  # An installed package, of which no file is looked for.
-            else:
-                spec = importlib.machinery.PathFinder.find_spec(whole, path)
-                if spec is None:
+                if known is not None:
+                    yield known
+                if isinstance(path := loaded.get("__path__"), list):
+                    found = None, path
+            elif found[0] is not None:
+                if not is_user_file(found[0]):
                     break
-                path = spec.submodule_search_locations
-                parent = whole if path is not None else whole.rpartition(".")[0]
-                found = None
-                if spec.has_location and spec.origin and is_user_file(spec.origin):
-                    found = _Module(os.path.abspath(spec.origin), parent, None)
-            if found is not None:
-                yield found
-            if path is None:
+                package = whole if found[1] else whole.rpartition(".")[0]
+                yield _Module(os.path.abspath(found[0]), package, None)
+            folders = found[1]
+            if not folders:
                 break
+
+
+def _find(name: str, folders: Sequence[str]) -> tuple[str | None, list[str]]:
+    """Return the file of a module in folders, and the folders of a package; nothing is imported."""
+    bases = [os.path.join(folder or os.curdir, name) for folder in folders]
+    package = f"{os.sep}__init__.py"
+    for base in bases:
+        for ending in (package, ".py", *importlib.machinery.EXTENSION_SUFFIXES):
+            if os.path.isfile(base + ending):
+                return base + ending, [base] if ending == package else []
+    return None, [base for base in bases if os.path.isdir(base)]
 
 
 @functools.lru_cache(maxsize=512)
