@@ -36,9 +36,8 @@ Program: TypeAlias = Any
 
 @dataclass(frozen=True)
 class Watched:
-    """A traced function with what was seen of its memory.
+    """The result of the first tracing of a function, with what was seen of its memory.
 
-    - `result`: the result of the first tracing.
     - `kept`: what each call changes, in words.
     - `why_impure`: why the program is not that of each call; None for a function that is pure.
     """

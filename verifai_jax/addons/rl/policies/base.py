@@ -27,6 +27,7 @@ from verifai_jax.core.store.atomic_files import replacing
 
 Compute = Callable[[PyTree, PyTree, PyTree], tuple[Any, PyTree]]
 """A pure function `(weights, observation, memory) -> (outputs, memory)`."""
+Arrays = Mapping[str, np.ndarray]
 ACTIONS = {
     "outputs": "the outputs themselves",
     "argmax": "the index of the greatest output",
@@ -272,9 +273,7 @@ def bounds(values: object, name: str) -> tuple[float, ...]:
     return tuple(array.tolist())
 
 
-def write(
-    graph: Graph, arrays: Mapping[str, np.ndarray], start: Sequence[np.ndarray], path: Path
-) -> Path:
+def write(graph: Graph, arrays: Arrays, start: Sequence[np.ndarray], path: Path) -> Path:
     """Write a graph that was `traced` with its arrays and its first memory.
 
     **Raises:** `PolicyError` for an ending other than `.onnx`, `.safetensors` and `.npz`, and for
@@ -302,29 +301,20 @@ def write(
     return path
 
 
-def _as_onnx(
-    graph: Graph, arrays: Mapping[str, np.ndarray], memory: Mapping[str, np.ndarray]
-) -> bytes:
+def _as_onnx(graph: Graph, arrays: Arrays, memory: Arrays) -> bytes:
     onnx = require("onnx", extra="policies")
-    helper, kinds = onnx.helper, onnx.TensorProto
-    nodes = [
-        helper.make_node(n.operator, n.inputs, n.outputs, name=n.name, **n.attributes)
-        for n in graph.nodes
-    ]
-    inputs = [helper.make_tensor_value_info(n, kinds.FLOAT, s) for n, s in graph.inputs.items()]
-    inputs += [
-        helper.make_tensor_value_info(name, number_type(first.dtype), first.shape)
-        for name, first in memory.items()
-    ]
+    helper = onnx.helper
+    node, info = helper.make_node, helper.make_tensor_value_info
+    nodes = [node(n.operator, n.inputs, n.outputs, n.name, **n.attributes) for n in graph.nodes]
+    inputs = [info(name, onnx.TensorProto.FLOAT, shape) for name, shape in graph.inputs.items()]
+    inputs += [info(name, number_type(a.dtype), a.shape) for name, a in memory.items()]
     names = (graph.output, *(after for _, after in graph.memory))
     outputs = [onnx.ValueInfoProto(name=name) for name in names]
     tensors = [onnx.numpy_helper.from_array(array, name) for name, array in arrays.items()]
     model = helper.make_model(
         helper.make_graph(nodes, "policy", inputs, outputs, tensors),
-        opset_imports=[helper.make_opsetid("", OPSET)],
-        ir_version=9,
-        producer_name="verifai_jax",
-    )
+        opset_imports=[helper.make_opsetid("", OPSET)], ir_version=9, producer_name="verifai_jax",
+    )  # fmt: skip
     model = onnx.shape_inference.infer_shapes(model, strict_mode=True, data_prop=True)
     onnx.checker.check_model(model)
     return model.SerializeToString()

@@ -106,10 +106,7 @@ def fitting(what: object, value: Value) -> Value:
 
 
 def static(node: Node, value: Value) -> tuple[int, ...]:
-    """Return concrete numbers for a shape, axes or indices.
-
-    **Raises:** `PolicyError` if they depend on the observation.
-    """
+    """Return concrete numbers for a shape or indices, which no observation may change."""
     node.refuse(not known(value), "has a shape that depends on the observation")
     return tuple(int(n) for n in np.ravel(value))
 
