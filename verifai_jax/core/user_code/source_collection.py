@@ -120,16 +120,9 @@ def sources_of(
     files += [Source(PROGRAM, PROGRAM, program)] if program else []
     tree = next((tree for tree in map(tree_of, modules) if tree is not None), None)
     commit, dirty = _checked_out() if tree is None else ("", False)
-    return Sources(
-        files=tuple(files),
-        versions=versions(),
-        without_file=tuple(without),
-        root=Path.cwd().as_posix(),
-        first=first,
-        commit=commit,
-        dirty=dirty,
-        revision="" if tree is None else tree_commits[tree],
-    )
+    root, revision = Path.cwd().as_posix(), "" if tree is None else tree_commits[tree]
+    without_file = tuple(without)
+    return Sources(tuple(files), versions(), without_file, root, first, commit, dirty, revision)
 
 
 def _checked_out() -> tuple[str, bool]:

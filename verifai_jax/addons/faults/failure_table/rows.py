@@ -126,13 +126,13 @@ class Rows:
 
         **Returns:** the points, and whether a search below the lowest found nothing that fails.
         """
-        faults = self.faults
-        index = np.array([
-            self.groups[name][list(faults[name].domains).index(faults[name].grade)] for name in names
-        ])  # fmt: skip
+        own = {name: self.faults[name] for name in names}
+        index = np.array(
+            [self.groups[name][list(one.domains).index(one.grade)] for name, one in own.items()]
+        )
         # Where chance decides, no severity is an edge: a few failing points are tried many times.
-        others = any(fault.draws for fault in faults.values())
-        draws = self.draws and (not others or any(faults[name].draws for name in names))
+        others = any(fault.draws for fault in self.faults.values())
+        draws = self.draws and (not others or any(fault.draws for fault in own.values()))
 
         failing = self._ordered(failing, index)
         lowest = self._ordered(self._on_lines(names, index, failing[:FOLLOWED]), index)
