@@ -106,10 +106,7 @@ def _program(result: Any) -> Program:
 
 
 def difference(one: Program, other: Program) -> tuple[bool, str | None]:
-    """Return whether two programs use different constants, and the source line where known.
-
-    Compares operations, constants among their operands, and plain parameters.
-    """
+    """Return whether two programs have different constants, and the source line if known."""
     for a, b in zip_longest(_steps(one), _steps(other), fillvalue=(None, None)):
         if a[1] != b[1]:
             step = a[0] or b[0]

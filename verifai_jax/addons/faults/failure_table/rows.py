@@ -122,10 +122,7 @@ class Rows:
         return self.cache.remember(f"search/{'+'.join(names)}", searched)["points"]
 
     def _lowered(self, names: Sequence[str], failing: Points, budget: int) -> tuple[Points, bool]:
-        """Return failing points with their severity lowered as far as they fail, lowest first.
-
-        **Returns:** the points, and whether a search below the lowest found nothing that fails.
-        """
+        """Return failing points, the least severe first, and whether a search below found none."""
         own = {name: self.faults[name] for name in names}
         index = np.array(
             [self.groups[name][list(one.domains).index(one.grade)] for name, one in own.items()]
@@ -183,10 +180,7 @@ class Rows:
     def _below(
         self, names: Sequence[str], index: Index, lowest: Points, budget: int
     ) -> tuple[Points, bool]:
-        """Search all numbers of some faults for failures just below the lowest severity.
-
-        **Returns:** the failing points, lowest first, and whether the last rounds found none below.
-        """
+        """Search below the lowest severity; return failing points, and if the last rounds met none."""
         misses = 0
         own = np.concatenate([self.groups[name] for name in names])
         good = lowest[:FOLLOWED]

@@ -22,10 +22,7 @@ Layers = tuple[tuple[Float[Array, "inputs outputs"], Float[Array, " outputs"]], 
 
 
 def activation_name(name: str) -> str:
-    """Return the name in `ACTIVATIONS` of an activation, such as `LeakyReLU`.
-
-    **Raises:** `UnknownNameError`.
-    """
+    """Return the name in `ACTIVATIONS` of an activation, such as `LeakyReLU`; refuse others."""
     plain = name.lower().replace("_", "")
     check_names("activation", [plain], ACTIVATIONS)
     return plain

@@ -36,10 +36,7 @@ log = logging.getLogger("verifai_jax.policies")
 
 
 def from_object(source: Any, observation: ArrayLike | None, batched: bool) -> Policy:
-    """Return the policy of a model or function; see `policy` for the arguments.
-
-    **Raises:** `PolicyError` for an object that is not a policy.
-    """
+    """Return the policy of a model or function, as `policy` does; refuse any other object."""
     root = type(source).__module__.partition(".")[0]
     if root in ("stable_baselines3", "sb3_contrib"):
         return _of_sb3(source)
@@ -262,10 +259,7 @@ def _of_torch(module: Any, observation: ArrayLike | None, batched: bool) -> Poli
 def _translated(
     torch: Any, module: Any, example: np.ndarray, on_host: Callable[..., Any]
 ) -> Policy:
-    """Return a module of PyTorch in JAX, if its outputs are PyTorch's for some observations.
-
-    An exporter follows only one branch of a condition.
-    """
+    """Return a module of PyTorch in JAX if both agree: an exporter follows one branch only."""
     file = io.BytesIO()
     # It prints the whole graph where it fails.
     with warnings.catch_warnings(), contextlib.redirect_stdout(io.StringIO()):
@@ -286,10 +280,7 @@ def _translated(
 
 
 def read_brax(folder: Path) -> Policy:
-    """Return the deterministic policy of a PPO checkpoint of Brax or Playground.
-
-    **Raises:** `PolicyError` for a folder without one.
-    """
+    """Return the deterministic policy of a PPO checkpoint of Brax or Playground."""
     networks = require("brax.training.agents.ppo.networks", extra="brax")
     known = require("brax.training.networks", extra="brax").ACTIVATION
     statistics = require("brax.training.acme.running_statistics", extra="brax")

@@ -82,10 +82,7 @@ class Graph:
         return next(iter(zeros.values())) if len(zeros) == 1 else zeros
 
     def to_json(self) -> dict[str, Any]:
-        """Return the graph as plain data, for `read_graph`.
-
-        Only for graphs of `writing.traced`, whose attributes are numbers and texts.
-        """
+        """Return a graph of `traced`, whose attributes are numbers and texts, for `read_graph`."""
         nodes = [[n.operator, n.inputs, n.outputs, n.attributes] for n in self.nodes]
         inputs = {name: list(shape) for name, shape in self.inputs.items()}
         return {"nodes": nodes, "inputs": inputs, "memory": self.memory, "output": self.output}
@@ -259,10 +256,7 @@ def _sorted_out(arrays: Mapping[str, np.ndarray]) -> tuple[dict[str, Array], dic
 
 
 def read_graph(data: Mapping[str, Any], arrays: Mapping[str, np.ndarray], what: str) -> Read:
-    """Return the result of `read_onnx`, from `Graph.to_json` and all arrays by name.
-
-    **Raises:** `PolicyError` for data that do not describe a graph.
-    """
+    """Return the result of `read_onnx`, from `Graph.to_json`, which is checked, and all arrays."""
     with refused(f"{what} is damaged: its graph is not valid", repr):
         nodes = tuple(
             Node(operator, outputs[0], tuple(inputs), tuple(outputs), {

@@ -92,10 +92,7 @@ def like(made: Value, x: Value) -> Any:
 
 
 def fitting(what: object, value: Value) -> Value:
-    """Return values for JAX, which has no whole numbers of 64 bits in its usual precision.
-
-    **Raises:** `PolicyError` for whole numbers that would be changed.
-    """
+    """Return values for JAX without 64 bits; refuse whole numbers that would be changed."""
     kind = jax.dtypes.canonicalize_dtype(value.dtype) if known(value) else None
     if kind in (np.int32, np.uint32) and np.any(changed := value != value.astype(kind)):
         raise PolicyError(

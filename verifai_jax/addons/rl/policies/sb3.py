@@ -41,12 +41,7 @@ EXPORT = "export it as ONNX, and load that"
 
 
 def read_sb3(data: bytes, what: str) -> Policy:
-    """Return the deterministic policy of a model of Stable-Baselines3.
-
-    It returns the same actions as `model.predict(observation, deterministic=True)`.
-
-    **Raises:** `PolicyError` for a file without a model, or with one of an unsupported form.
-    """
+    """Return a model of Stable-Baselines3, which acts as its `predict(..., deterministic=True)`."""
     archive = open_archive(data, what)
     if "data" not in archive.namelist() or "policy.pth" not in archive.namelist():
         raise PolicyError(
@@ -73,10 +68,7 @@ def read_sb3(data: bytes, what: str) -> Policy:
 
 
 def read_normaliser(data: bytes, what: str) -> Normaliser:
-    """Return the normalisation of observations from a file of `VecNormalize.save`.
-
-    **Raises:** `PolicyError` for another file, and for dictionary observations.
-    """
+    """Return the normalisation of observations, not by name, of `VecNormalize.save`."""
     record = read_pickle(data, what)
     state = record.state if isinstance(record, Record) else None
     if isinstance(state, Mapping) and state.get("norm_obs") is False:

@@ -46,10 +46,7 @@ class Tensors(dict[str, np.ndarray]):
         return super().__getitem__(name)
 
     def ignore(self, names: Iterable[str]) -> None:
-        """Count tensors as read; a name stands for all that begin with it.
-
-        **Raises:** `UnknownNameError` for a name that no tensor begins with.
-        """
+        """Count tensors as read, by names or their beginnings, of which each must exist."""
         for name in names:
             found = [n for n in self if f"{n}.".startswith(f"{name.rstrip('.')}.")]
             if not found:
@@ -136,10 +133,7 @@ def normaliser_of(tensors: Tensors, size: int) -> Normaliser | None:
 
 
 def layer_names(tensors: Tensors) -> list[str]:
-    """Return the names of the layers of an actor that is an MLP, in the order of computation.
-
-    **Raises:** `PolicyError` if names and shapes do not determine the order.
-    """
+    """Return the layers of an MLP in order, or refuse names and shapes that leave it open."""
     every = [name.removesuffix(".weight") for name in tensors if name.endswith(".weight")]
     actor = [name for name in every if not ASIDE.search(name)] or every
     if not actor:
@@ -167,10 +161,7 @@ def _fit(tensors: Tensors, names: Sequence[str]) -> bool:
 
 
 def linear_layers(weights: Tensors, names: Sequence[str], what: str) -> Layers:
-    """Return the PyTorch layers with these names as `([in, out], [out])`, in this order.
-
-    **Raises:** `PolicyError` for a layer that is missing or does not fit its predecessor.
-    """
+    """Return PyTorch's layers as `([in, out], [out])`, each of which must fit the one before."""
     layers, before = [], None
     for name in names:
         if f"{name}.weight" not in weights:

@@ -27,10 +27,7 @@ _STORAGES: dict[str, Any] = {
 
 
 def open_archive(data: bytes, what: str) -> zipfile.ZipFile:
-    """Open an archive.
-
-    **Raises:** `PolicyError` for another file, and for one larger than `MAX_BYTES` when unpacked.
-    """
+    """Open an archive; refuse one larger than `MAX_BYTES` when unpacked."""
     with refused(f"{what} is not an archive, or is damaged"):
         archive = zipfile.ZipFile(io.BytesIO(data))
     size = sum(entry.file_size for entry in archive.infolist())
@@ -43,10 +40,7 @@ def open_archive(data: bytes, what: str) -> zipfile.ZipFile:
 
 
 def read_member(archive: zipfile.ZipFile, name: str, what: str) -> bytes:
-    """Return the bytes of a member of an archive.
-
-    **Raises:** `PolicyError` for a member that is missing, damaged, or larger than stated.
-    """
+    """Return the bytes of a member of an archive; refuse one larger than stated."""
     with refused(f"{what} has no readable {name}"), archive.open(name) as file:
         size = archive.getinfo(name).file_size
         data = file.read(size + 1)
@@ -56,12 +50,7 @@ def read_member(archive: zipfile.ZipFile, name: str, what: str) -> bytes:
 
 
 def read_state(data: bytes, what: str) -> dict[str, np.ndarray]:
-    """Return the tensors in a file of `torch.save`, by their names.
-
-    Names of nested dictionaries are joined by dots. Values that are not tensors are left out.
-
-    **Raises:** `PolicyError` for a file without tensors, or with damaged ones.
-    """
+    """Return the tensors in a file of `torch.save`; dots join names of nested dictionaries."""
     archive = open_archive(data, what)
     pickles = [n for n in archive.namelist() if n.rpartition("/")[2] == "data.pkl"]
     if len(pickles) != 1:

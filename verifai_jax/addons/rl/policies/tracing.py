@@ -207,10 +207,7 @@ class _Translation:
     def operation(
         self, kind: str, given: list[Value], options: Options, form: Jaxpr, shapes: list[Jaxpr]
     ) -> str:
-        """Return the output of an operation that is not a call.
-
-        **Raises:** `NotImplementedError` for an operation without a translation.
-        """
+        """Return the output of an operation; `NotImplementedError` for an unknown one."""
         node, x = self.node, given[0]
         real = shapes[0].dtype
         if kind in ("and", "or", "xor", "not") and real.kind != "b":

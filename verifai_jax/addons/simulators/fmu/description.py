@@ -126,10 +126,7 @@ class Description:
     asks_after_steps: bool = True
 
     def variable(self, name: str) -> Variable:
-        """Return a scalar variable.
-
-        **Raises:** `ValueError` for a variable that does not exist, or is an array or a text.
-        """
+        """Return a variable; refuse one that does not exist, or is an array or a text."""
         if name not in self.variables:
             raise missing_name(f"the FMU {self.file.name}", "variable", name, list(self.variables))
         found = self.variables[name]
@@ -140,10 +137,7 @@ class Description:
 
     @property
     def binary(self) -> str:
-        """Path in the archive of the binary for this machine.
-
-        **Raises:** `ValueError` if there is none.
-        """
+        """Path in the archive of the binary for this machine; `ValueError` if there is none."""
         system = {"linux": "linux", "darwin": "darwin", "win32": "win"}.get(sys.platform, "linux")
         ending = {"linux": "so", "darwin": "dylib", "win": "dll"}[system]
         machine = platform.machine()

@@ -83,10 +83,7 @@ class ExchangeInstance(Instance):
             self._settle()
 
     def step(self, time: float, size: float) -> bool:
-        """Integrate up to the next communication time; False if the FMU ended its simulation.
-
-        **Raises:** `FMUError`, also if the integration fails or events do not end.
-        """
+        """Integrate up to the next communication time; False if the FMU ended its simulation."""
         end, events = time + size, 0
         for _ in range(MAX_STEPS):
             if self._time >= end or self._ended:

@@ -55,10 +55,7 @@ class FMUError(RuntimeError):
 
 
 class Instance:
-    """An instance of an FMU that is unpacked in `folder`; `begin` may be called again afterwards.
-
-    **Raises:** `FMUError` if the binary cannot be loaded or does not make an instance.
-    """
+    """An instance of an FMU unpacked in `folder`; `begin` may be called again afterwards."""
 
     def __init__(self, description: Description, folder: Path) -> None:
         self.description, self.messages = description, []
@@ -124,10 +121,7 @@ class Instance:
         return self._do_step() != DISCARD and not self._flags[1]
 
     def set(self, values: Mapping[str, object]) -> None:
-        """Set variables by name.
-
-        **Raises:** the errors of `Variable.number`; `ValueError` for a number beyond its type.
-        """
+        """Set variables by name; refuse numbers beyond their types."""
         given = list(values.values())
         for group in self._grouped(tuple(values)):
             for i, (index, variable) in enumerate(group.variables.items()):
