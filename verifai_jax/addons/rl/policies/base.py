@@ -63,7 +63,6 @@ class Actions:
         bounded = self.kind in ("clip", "scale", "tanh")
         pairs = list(zip(self.low, self.high, strict=False))
         got = f"got {self.low} and {self.high}"
-        got = f"got {self.low} and {self.high}"
         if len(self.low) != len(self.high) or bool(self.low) != bounded:
             what = "needs low= and high= of one size" if bounded else "takes no low= and high="
             raise PolicyError(f"action={self.kind!r} {what}; {got}")

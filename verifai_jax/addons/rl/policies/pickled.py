@@ -28,13 +28,7 @@ class Name:
 
 @dataclass(eq=False)
 class Record:
-    """A record of an object that a pickle would make by a call.
-
-    - `function`: the function that would be called.
-    - `arguments`: the arguments of the call.
-    - `state`: the state that would be set on the object afterwards, or None.
-    - `items`: the items that would be added to it, for example to a dictionary.
-    """
+    """An object that a pickle would make by a call, then give this state, if any, and items."""
 
     function: Any
     arguments: Any
