@@ -153,14 +153,9 @@ def _can_be(name: str, number: Any) -> Any:
 
 @jax.custom_jvp
 def _blend(
-    on: Bool[Array, ""],
-    live: Bool[Array, ""],
-    possible: Bool[Array, ""],
-    lead: Float[Array, ""],
-    trail: Float[Array, ""],
-    bad: Float[Array, " n"],
-    good: Float[Array, " n"],
-) -> Float[Array, " n"]:
+    on: Bool[Array, ""], live: Bool[Array, ""], possible: Bool[Array, ""], lead: Float[Array, ""],
+    trail: Float[Array, ""], bad: Float[Array, " n"], good: Float[Array, " n"],
+) -> Float[Array, " n"]:  # fmt: skip
     """Return `bad` where `on`, else `good`, differentiable by onset and end of the fault.
 
     Shifting the onset between two samples changes no value. The derivative is therefore taken from

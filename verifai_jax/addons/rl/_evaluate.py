@@ -91,12 +91,9 @@ def batched_mean_returns(
 
 @partial(jax.jit, static_argnums=(0, 1))
 def _episode_returns(
-    static_task: StaticTask,
-    episodes: int,
-    numbers: list[Array],
-    policy: Policy,
+    static_task: StaticTask, episodes: int, numbers: list[Array], policy: Policy,
     key: Key[Array, ""],
-) -> Float[Array, " episodes"]:
+) -> Float[Array, " episodes"]:  # fmt: skip
     task = static_task.with_numbers(numbers)
     starts, step_keys = _starts(task, episodes, key)
     step = jax.vmap(_step_of(task), in_axes=(None, 0, 0))
@@ -105,13 +102,9 @@ def _episode_returns(
 
 @partial(jax.jit, static_argnums=(0, 1, 2))
 def _mean_returns(
-    static_task: StaticTask,
-    episodes: int,
-    devices: tuple[Device, ...],
-    numbers: list[Array],
-    policies: PyTree,
-    key: Key[Array, ""],
-) -> Float[Array, " policies"]:
+    static_task: StaticTask, episodes: int, devices: tuple[Device, ...], numbers: list[Array],
+    policies: PyTree, key: Key[Array, ""],
+) -> Float[Array, " policies"]:  # fmt: skip
     def on_device(
         numbers: list[Array], policies: PyTree, key: Key[Array, ""]
     ) -> Float[Array, " some"]:
@@ -148,11 +141,9 @@ def _step_of(task: Task) -> Callable[[PyTree, Totals, Key[Array, ""]], Totals]:
 
 
 def _returns(
-    task: Task,
-    starts: Totals,
-    step_keys: Key[Array, " episodes"],
+    task: Task, starts: Totals, step_keys: Key[Array, " episodes"],
     step_all: Callable[[Totals, Key[Array, " episodes"]], Totals],
-) -> Float[Array, "*policies episodes"]:
+) -> Float[Array, "*policies episodes"]:  # fmt: skip
     """Step all episodes until the last one is over."""
 
     def goes_on(loop: tuple[Int[Array, ""], Totals]) -> Bool[Array, ""]:

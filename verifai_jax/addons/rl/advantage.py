@@ -21,13 +21,9 @@ class Ends(NamedTuple):
 
 
 def advantages(
-    reward: Float[Array, " time"],
-    value: Float[Array, " time"],
-    next_value: Float[Array, " time"],
-    ends: Ends,
-    discount: Number,
-    gae_lambda: Number,
-) -> Float[Array, " time"]:
+    reward: Float[Array, " time"], value: Float[Array, " time"], next_value: Float[Array, " time"],
+    ends: Ends, discount: Number, gae_lambda: Number,
+) -> Float[Array, " time"]:  # fmt: skip
     """Estimate the advantage of each action; advantage plus `value` is the critic's target.
 
     **Arguments:**

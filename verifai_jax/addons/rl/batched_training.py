@@ -118,13 +118,10 @@ class BatchedTraining:
     """
 
     def __init__(
-        self,
-        configurations: Sequence[Configuration],
-        *,
-        devices: Sequence[Device] | None = None,
+        self, configurations: Sequence[Configuration], *, devices: Sequence[Device] | None = None,
         per_device: int | None = None,
         watch: Callable[[int, Float[np.ndarray, " updates"]], None] | None = None,
-    ) -> None:
+    ) -> None:  # fmt: skip
         self._watch = watch
         for configuration in configurations:
             configuration.check()
@@ -349,14 +346,9 @@ def _over_lanes(layout: _Layout, one: Callable[..., PyTree], shared: int) -> Cal
 
 @partial(jax.jit, static_argnums=(0, 1, 2))
 def _start(
-    layout: _Layout,
-    static_task: StaticTask,
-    structure: PyTreeDef,
-    tasks: list[Array],
-    algorithms: list[Array],
-    seeds: Integer[Array, " lanes"],
-    updates: Int[Array, " lanes"],
-) -> tuple[AlgorithmState, Float[Array, "lanes capacity"]]:
+    layout: _Layout, static_task: StaticTask, structure: PyTreeDef, tasks: list[Array],
+    algorithms: list[Array], seeds: Integer[Array, " lanes"], updates: Int[Array, " lanes"],
+) -> tuple[AlgorithmState, Float[Array, "lanes capacity"]]:  # fmt: skip
     def one(
         task: list[Array], numbers: list[Array], seed: Integer[Array, ""], updates: Int[Array, ""]
     ) -> tuple[AlgorithmState, Float[Array, " capacity"]]:
@@ -369,24 +361,14 @@ def _start(
 
 @partial(jax.jit, static_argnums=(0, 1, 2))
 def _advance_updates(
-    layout: _Layout,
-    static_task: StaticTask,
-    structure: PyTreeDef,
-    tasks: list[Array],
-    algorithms: list[Array],
-    states: AlgorithmState,
-    curves: Float[Array, "lanes capacity"],
-    done: Int[Array, ""],
-    until: Int[Array, ""],
-) -> tuple[AlgorithmState, Float[Array, "lanes capacity"]]:
+    layout: _Layout, static_task: StaticTask, structure: PyTreeDef, tasks: list[Array],
+    algorithms: list[Array], states: AlgorithmState, curves: Float[Array, "lanes capacity"],
+    done: Int[Array, ""], until: Int[Array, ""],
+) -> tuple[AlgorithmState, Float[Array, "lanes capacity"]]:  # fmt: skip
     def one(
-        task_numbers: list[Array],
-        numbers: list[Array],
-        state: AlgorithmState,
-        curve: Float[Array, " capacity"],
-        done: Int[Array, ""],
-        until: Int[Array, ""],
-    ) -> tuple[AlgorithmState, Float[Array, " capacity"]]:
+        task_numbers: list[Array], numbers: list[Array], state: AlgorithmState,
+        curve: Float[Array, " capacity"], done: Int[Array, ""], until: Int[Array, ""],
+    ) -> tuple[AlgorithmState, Float[Array, " capacity"]]:  # fmt: skip
         task = static_task.with_numbers(task_numbers)
         algorithm = jax.tree.unflatten(structure, numbers)
 

@@ -20,15 +20,9 @@ Batch = TypeVar("Batch")
 
 
 def minibatch_epochs(
-    loss: Callable[[Weights, Batch], Float[Array, ""]],
-    start: tuple[Weights, PyTree],
-    batch: Batch,
-    key: Key[Array, ""],
-    optimizer: Optimizer,
-    rate: Number,
-    epochs: int,
-    minibatches: int,
-) -> tuple[Weights, PyTree]:
+    loss: Callable[[Weights, Batch], Float[Array, ""]], start: tuple[Weights, PyTree], batch: Batch,
+    key: Key[Array, ""], optimizer: Optimizer, rate: Number, epochs: int, minibatches: int,
+) -> tuple[Weights, PyTree]:  # fmt: skip
     """Minimise the loss, with one gradient step for each minibatch.
 
     **Arguments:**

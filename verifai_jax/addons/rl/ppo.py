@@ -110,14 +110,10 @@ class PPO:
             log_std=None if discrete else jnp.zeros(outputs),
         )
         return PPOState(
-            weights=weights,
-            moments=adam(self.max_gradient).init(weights),
-            statistics=ObservationStatistics.initial(size),
-            episodes=episodes,
-            key=key,
-            done=jnp.int32(0),
-            updates=jnp.int32(updates),
-        )
+            weights=weights, moments=adam(self.max_gradient).init(weights),
+            statistics=ObservationStatistics.initial(size), episodes=episodes, key=key,
+            done=jnp.int32(0), updates=jnp.int32(updates),
+        )  # fmt: skip
 
     def step(self, task: Task, state: "PPOState") -> tuple["PPOState", Progress]:
         """Collect `horizon` steps of each environment and learn from them.
@@ -272,34 +268,23 @@ def _learn(
     value = critic(observation)
     estimate = jax.vmap(advantages, in_axes=(0, 0, 0, 0, None, None))
     advantage = estimate(
-        transition.reward,
-        value,
-        critic(next_observation),
-        transition.ends,
-        ppo.discount,
+        transition.reward, value, critic(next_observation), transition.ends, ppo.discount,
         ppo.gae_lambda,
-    )
+    )  # fmt: skip
     log_std = state.weights.log_std
     log_probability = jax.vmap(jax.vmap(lambda o, a: _log_probability(task.action, o, log_std, a)))(
         experience.outputs, experience.action
     )
     batch = Minibatch(
-        observation=observation,
-        action=experience.action,
-        log_probability=log_probability,
-        advantage=advantage,
-        target=advantage + value,
-    )
+        observation=observation, action=experience.action, log_probability=log_probability,
+        advantage=advantage, target=advantage + value,
+    )  # fmt: skip
     return minibatch_epochs(
         lambda weights, part: _loss(weights, ppo, task.action, part),
-        (state.weights, state.moments),
-        batch,
-        key,
-        adam(ppo.max_gradient),
-        annealed(ppo.learning_rate, state.done, state.updates, ppo.anneal),
-        ppo.epochs,
+        (state.weights, state.moments), batch, key, adam(ppo.max_gradient),
+        annealed(ppo.learning_rate, state.done, state.updates, ppo.anneal), ppo.epochs,
         ppo.minibatches,
-    )
+    )  # fmt: skip
 
 
 def _loss(weights: Weights, ppo: PPO, action: Action, part: Minibatch) -> Float[Array, ""]:
@@ -326,11 +311,9 @@ def _noise(action: Action, key: Key[Array, ""]) -> Float[Array, " outputs"]:
 
 
 def _explore(
-    action: Action,
-    outputs: Float[Array, " outputs"],
-    log_std: Float[Array, " outputs"] | None,
+    action: Action, outputs: Float[Array, " outputs"], log_std: Float[Array, " outputs"] | None,
     noise: Float[Array, " outputs"],
-) -> Shaped[Array, "..."]:
+) -> Shaped[Array, "..."]:  # fmt: skip
     """Draw from the distribution that the outputs describe (Gumbel-max if discrete)."""
     if isinstance(action, Discrete):
         return jnp.argmax(noise + outputs).astype(jnp.int32)
@@ -339,11 +322,9 @@ def _explore(
 
 
 def _log_probability(
-    action: Action,
-    outputs: Float[Array, " outputs"],
-    log_std: Float[Array, " outputs"] | None,
+    action: Action, outputs: Float[Array, " outputs"], log_std: Float[Array, " outputs"] | None,
     taken: Shaped[Array, "..."],
-) -> Float[Array, ""]:
+) -> Float[Array, ""]:  # fmt: skip
     if isinstance(action, Discrete):
         # A choice instead of an index, whose derivative would scatter row by row.
         chosen = jnp.arange(action.n) == taken

@@ -115,15 +115,11 @@ class PQN:
         size = observation_size(task, episodes)
         layers = new_layers(weights_key, (size, *self.hidden, _count(task)), gain=0.01)
         return PQNState(
-            layers=layers,
-            moments=adam(self.max_gradient).init(layers),
-            statistics=ObservationStatistics.initial(size),
-            episodes=episodes,
-            held=jnp.full(self.environments, -1, jnp.int32),
-            key=key,
-            done=jnp.int32(0),
+            layers=layers, moments=adam(self.max_gradient).init(layers),
+            statistics=ObservationStatistics.initial(size), episodes=episodes,
+            held=jnp.full(self.environments, -1, jnp.int32), key=key, done=jnp.int32(0),
             updates=jnp.int32(updates),
-        )
+        )  # fmt: skip
 
     def step(self, task: Task, state: "PQNState") -> tuple["PQNState", Progress]:
         """Collect `horizon` steps of each environment and learn from them.
@@ -195,12 +191,9 @@ class Minibatch(NamedTuple):
 
 
 def q_lambda_targets(
-    reward: Float[Array, "time *lanes"],
-    next_value: Float[Array, "time *lanes"],
-    ends: Ends,
-    discount: Number,
-    q_lambda: Number,
-) -> Float[Array, "time *lanes"]:
+    reward: Float[Array, "time *lanes"], next_value: Float[Array, "time *lanes"], ends: Ends,
+    discount: Number, q_lambda: Number,
+) -> Float[Array, "time *lanes"]:  # fmt: skip
     """Compute targets for the values of the actions taken, for each lane.
 
     **Arguments:**
@@ -274,12 +267,9 @@ def exploration_chances(
 
 
 def next_held(
-    held: Int[Array, " environments"],
-    chance: Float[Array, " environments"],
-    option: Int[Array, " environments"],
-    keep: Float[Array, ""],
-    start: Float[Array, ""],
-) -> Int[Array, " environments"]:
+    held: Int[Array, " environments"], chance: Float[Array, " environments"],
+    option: Int[Array, " environments"], keep: Float[Array, ""], start: Float[Array, ""],
+) -> Int[Array, " environments"]:  # fmt: skip
     """Return the random action that each environment repeats in the next step; -1 for none."""
     goes_on = (held >= 0) & (chance < keep)
     # Given that the action is not held on, `chance` is uniform on [keep, 1).
@@ -296,22 +286,15 @@ def _learn(
     next_observation = normalise(state.statistics, transition.next_observation, pqn.normalise)
     next_values = network(state.layers, next_observation, pqn.activation)
     target = q_lambda_targets(
-        pqn.reward_scale * transition.reward,
-        jnp.max(next_values, axis=-1),
-        transition.ends,
-        pqn.discount,
-        pqn.q_lambda,
-    )
+        pqn.reward_scale * transition.reward, jnp.max(next_values, axis=-1), transition.ends,
+        pqn.discount, pqn.q_lambda,
+    )  # fmt: skip
     return minibatch_epochs(
-        lambda layers, part: _loss(layers, pqn, part),
-        (state.layers, state.moments),
-        Minibatch(observation, experience.action, target),
-        key,
-        adam(pqn.max_gradient),
-        annealed(pqn.learning_rate, state.done, state.updates, pqn.anneal),
-        pqn.epochs,
+        lambda layers, part: _loss(layers, pqn, part), (state.layers, state.moments),
+        Minibatch(observation, experience.action, target), key, adam(pqn.max_gradient),
+        annealed(pqn.learning_rate, state.done, state.updates, pqn.anneal), pqn.epochs,
         pqn.minibatches,
-    )
+    )  # fmt: skip
 
 
 def _loss(layers: Layers, pqn: PQN, part: Minibatch) -> Float[Array, ""]:

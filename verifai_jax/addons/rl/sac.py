@@ -145,17 +145,12 @@ class SAC:
             log_temperature=jnp.log(jnp.asarray(self.temperature, jnp.float32)),
         )
         return SACState(
-            weights=weights,
-            slow=weights.critics,
-            moments=adam().init(weights),
-            statistics=ObservationStatistics.initial(size),
-            episodes=episodes,
+            weights=weights, slow=weights.critics, moments=adam().init(weights),
+            statistics=ObservationStatistics.initial(size), episodes=episodes,
             noise=jax.random.normal(noise_key, (self.environments, actions)),
-            buffer=empty_buffer(self.capacity, size, actions),
-            key=key,
-            done=jnp.int32(0),
+            buffer=empty_buffer(self.capacity, size, actions), key=key, done=jnp.int32(0),
             updates=jnp.int32(updates),
-        )
+        )  # fmt: skip
 
     def step(self, task: Task, state: "SACState") -> tuple["SACState", Progress]:
         """Step the environments `horizon` times, with learning steps after each step.
@@ -262,12 +257,9 @@ def squash_log_prob(
 
 
 def act(
-    sac: SAC,
-    task: Task,
-    state: SACState,
-    noise: Float[Array, "environments actions"],
+    sac: SAC, task: Task, state: SACState, noise: Float[Array, "environments actions"],
     key: Key[Array, ""],
-) -> tuple[SACState, experience.Transition, Float[Array, "environments k"]]:
+) -> tuple[SACState, experience.Transition, Float[Array, "environments k"]]:  # fmt: skip
     """Take one step of each environment, and write the transitions to the buffer."""
     observation = jax.vmap(task.observe)(state.episodes.state)
     normalised = normalise(state.statistics, observation, sac.normalise)
@@ -278,12 +270,9 @@ def act(
         task, state.episodes, scale_to_range(task.action, unit), key
     )
     new = StoredTransitions(
-        observation,
-        transition.next_observation,
-        unit,
-        transition.reward,
+        observation, transition.next_observation, unit, transition.reward,
         transition.ends.terminated,
-    )
+    )  # fmt: skip
     # A new episode begins with noise of its own.
     rho = jnp.where(transition.over, 0.0, sac.correlation)[:, None]
     after = state._replace(
@@ -323,12 +312,9 @@ def _learn(sac: SAC, state: SACState, rate: Float[Array, ""], key: Key[Array, ""
 
 
 def total_loss(
-    weights: Weights,
-    sac: SAC,
-    slow: Layers,
-    batch: StoredTransitions,
+    weights: Weights, sac: SAC, slow: Layers, batch: StoredTransitions,
     noise: Float[Array, "2 batch actions"],
-) -> Float[Array, ""]:
+) -> Float[Array, ""]:  # fmt: skip
     """Sum three losses, each with a gradient only for its own part of the weights."""
     fixed = jax.lax.stop_gradient(weights)
     temperature = jnp.exp(fixed.log_temperature)
@@ -358,11 +344,9 @@ def _gaussian(
 
 
 def _values(
-    sac: SAC,
-    critics: Layers,
-    observation: Float[Array, "batch k"],
+    sac: SAC, critics: Layers, observation: Float[Array, "batch k"],
     action: Float[Array, "batch actions"],
-) -> Float[Array, "2 batch"]:
+) -> Float[Array, "2 batch"]:  # fmt: skip
     both = jnp.concatenate([observation, action], axis=-1)
     return jax.vmap(lambda layers: network(layers, both, sac.activation)[:, 0])(critics)
 

@@ -180,12 +180,9 @@ def _count_waiting(seconds: float) -> None:
 
 
 def compile_soon(
-    name: str,
-    lowered: jax.stages.Lowered,
-    effort: XlaOptimization = "most",
-    splits: bool = True,
+    name: str, lowered: jax.stages.Lowered, effort: XlaOptimization = "most", splits: bool = True,
     wide: bool = False,
-) -> Compilation:
+) -> Compilation:  # fmt: skip
     """Compile a program in the background.
 
     **Arguments:**

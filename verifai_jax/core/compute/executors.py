@@ -223,12 +223,9 @@ def _receive(token: str, thing: Any) -> "Shipment[Any]":
 
 
 def _receive_target(
-    token: str,
-    kind: type[Any],
-    target: str,
-    same: Callable[[Any], Mapping[str, str]],
+    token: str, kind: type[Any], target: str, same: Callable[[Any], Mapping[str, str]],
     wanted: Mapping[str, str],
-) -> "Shipment[Any]":
+) -> "Shipment[Any]":  # fmt: skip
     def load() -> Shipment[Any]:
         thing = load_target(target, kind)
         for what, text in same(thing).items():

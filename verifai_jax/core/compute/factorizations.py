@@ -42,21 +42,15 @@ def _of_matrix(weight: float) -> _Factorization:
 
 
 _FACTORIZATIONS = {
-    "cholesky": _of_matrix(1 / 3),
-    "lu": _of_matrix(1),
-    "geqrf": _of_matrix(2),
-    "svd": _of_matrix(10),
-    "eigh": _of_matrix(5),
-    "eig": _of_matrix(10),
-    "schur": _of_matrix(5),
-    "hessenberg": _of_matrix(2),
-    "tridiagonal": _of_matrix(4 / 3),
+    "cholesky": _of_matrix(1 / 3), "lu": _of_matrix(1), "geqrf": _of_matrix(2),
+    "svd": _of_matrix(10), "eigh": _of_matrix(5), "eig": _of_matrix(10), "schur": _of_matrix(5),
+    "hessenberg": _of_matrix(2), "tridiagonal": _of_matrix(4 / 3),
     "geqp3": _Factorization((2, 1), lambda a, _: 2 * a[0] * a[1] * min(a)),
     "householder_product": _Factorization((2, 1), lambda a, taus: 4 * a[0] * a[1] * taus[0]),
     "ormqr": _Factorization((2, 1, 2), lambda a, taus, c: 4 * taus[0] * c[0] * c[1]),
     "triangular_solve": _Factorization((2, 2), lambda a, b: a[0] * b[0] * b[1]),
     "tridiagonal_solve": _Factorization((1, 1, 1, 2), lambda _, d, __, b: 5 * b[0] * b[1]),
-}
+}  # fmt: skip
 """Primitives of JAX whose batches jaxlib cuts, by their names."""
 
 
@@ -76,13 +70,9 @@ def avoid_deadlock() -> None:
 
 
 def _lower(
-    primitive: Any,
-    known: _Factorization,
-    original: Callable[..., Any],
-    context: Any,
-    *operands: Any,
-    **parameters: Any,
-) -> Any:
+    primitive: Any, known: _Factorization, original: Callable[..., Any], context: Any,
+    *operands: Any, **parameters: Any,
+) -> Any:  # fmt: skip
     """Lower a factorization as JAX does, or as a loop over blocks of its batch."""
     forms = context.avals_in
     if all(isinstance(size, int) for form in forms for size in form.shape):
@@ -105,12 +95,9 @@ def _block(known: _Factorization, forms: Any) -> int:
 
 
 def _in_blocks(
-    call: Callable[..., Any],
-    ranks: tuple[int, ...],
-    batch: tuple[int, ...],
-    block: int,
+    call: Callable[..., Any], ranks: tuple[int, ...], batch: tuple[int, ...], block: int,
     *operands: Any,
-) -> Any:
+) -> Any:  # fmt: skip
     """Call a primitive on one block of the batch after the other."""
     count = math.prod(batch)
     whole = -(-count // block) * block

@@ -24,12 +24,9 @@ def called(step: Any) -> Any | None:
 
 
 def run_through(
-    program: Any,
-    constants: Sequence[V],
-    inputs: Sequence[V],
-    literal: Callable[[Any], V],
+    program: Any, constants: Sequence[V], inputs: Sequence[V], literal: Callable[[Any], V],
     step: Callable[[Any, list[V]], Sequence[V]],
-) -> list[V]:
+) -> list[V]:  # fmt: skip
     """Interpret the equations of a `Jaxpr` in order, and return its results.
 
     **Arguments:**

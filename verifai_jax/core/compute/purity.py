@@ -36,9 +36,8 @@ Program: TypeAlias = Any
 
 @dataclass(frozen=True)
 class Watched:
-    """A traced function with what was seen of its memory.
+    """The result of the first tracing of a function, with what was seen of its memory.
 
-    - `result`: the result of the first tracing.
     - `kept`: what each call changes, in words.
     - `why_impure`: why the program is not that of each call; None for a function that is pure.
     """
@@ -107,10 +106,7 @@ def _program(result: Any) -> Program:
 
 
 def difference(one: Program, other: Program) -> tuple[bool, str | None]:
-    """Return whether two programs use different constants, and the source line where known.
-
-    Compares operations, constants among their operands, and plain parameters.
-    """
+    """Return whether two programs have different constants, and the source line if known."""
     for a, b in zip_longest(_steps(one), _steps(other), fillvalue=(None, None)):
         if a[1] != b[1]:
             step = a[0] or b[0]

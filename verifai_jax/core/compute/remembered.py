@@ -33,14 +33,9 @@ MAX_BYTES = 64 * 2**20
 SEAL = 32
 """Bytes of the checksum in front of a program."""
 _SETTINGS = (
-    "jax_enable_x64",
-    "jax_default_matmul_precision",
-    "jax_numpy_dtype_promotion",
-    "jax_threefry_partitionable",
-    "jax_debug_nans",
-    "jax_debug_infs",
-    "jax_disable_jit",
-)
+    "jax_enable_x64", "jax_default_matmul_precision", "jax_numpy_dtype_promotion",
+    "jax_threefry_partitionable", "jax_debug_nans", "jax_debug_infs", "jax_disable_jit",
+)  # fmt: skip
 """Settings of JAX that change what it makes of a function."""
 
 

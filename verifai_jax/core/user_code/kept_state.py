@@ -23,6 +23,7 @@ import jax
 import jax.core
 import numpy as np
 
+from verifai_jax.core.user_code.source_collection import closure_of, names_in
 from verifai_jax.core.user_code.user_files import is_user_file
 
 MAX_ITEMS = 1000
@@ -33,7 +34,6 @@ State = dict[str, list[object]]
 """Values that can be compared, by what holds them."""
 CHANCE = "the random numbers of Python or NumPy"
 _CONTAINERS = (list, tuple, deque, set, frozenset, Mapping)
-_is_users_file = functools.cache(is_user_file)
 
 
 def changed(before: State, after: State) -> list[str]:
@@ -124,11 +124,8 @@ def _parts(value: Any, name: str) -> Iterator[tuple[Any, str]]:
         yield from _parts_of_function(value)
     elif any(map(_is_users, kind.__mro__)) or _is_looked_into(kind):
         slots = [n for c in kind.__mro__ for n in getattr(c, "__slots__", ()) if hasattr(value, n)]
-        for attribute, inner in [
-            *((n, getattr(value, n)) for n in slots),
-            *getattr(value, "__dict__", {}).items(),
-        ]:
-            yield inner, f"attribute {attribute!r} of {kind.__name__}"
+        held = {**{n: getattr(value, n) for n in slots}, **getattr(value, "__dict__", {})}
+        yield from ((v, f"attribute {n!r} of {kind.__name__}") for n, v in held.items())
         if kind is not value:
             yield from ((each, name) for each in kind.__mro__ if _is_users(each))
     else:
@@ -138,36 +135,24 @@ def _parts(value: Any, name: str) -> Iterator[tuple[Any, str]]:
 
 def _parts_of_function(function: types.FunctionType) -> Iterator[tuple[Any, str]]:
     code, own = function.__code__, function.__name__
-    for variable, cell in zip(code.co_freevars, function.__closure__ or (), strict=True):
-        try:
-            yield cell.cell_contents, f"variable {variable!r} of {own}"
-        except ValueError:  # It has no value yet.
-            continue
+    yield from ((v, f"variable {n!r} of {own}") for n, v in closure_of(function).items())
     arguments = code.co_varnames[: code.co_argcount]
     defaults = dict(zip(arguments[::-1], (function.__defaults__ or ())[::-1], strict=False))
     for argument, default in {**defaults, **(function.__kwdefaults__ or {})}.items():
         yield default, f"the default argument {argument!r} of {own}"
     yield from ((v, f"attribute {n!r} of {own}") for n, v in vars(function).items())
-    names = set(_names(code)) if _is_users_file(code.co_filename) else set()
+    names = names_in(code) if is_user_file(code.co_filename) else set()
     spaces = [function.__globals__]
     spaces += [vars(m) for n in names if _is_users_module(m := function.__globals__.get(n))]
     for space in spaces:
         yield from ((space[n], f"global variable {n!r}") for n in sorted(names & space.keys()))
 
 
-def _names(code: types.CodeType) -> Iterator[str]:
-    """Yield the names that a function and the functions within it look up."""
-    yield from code.co_names
-    for inner in code.co_consts:
-        if isinstance(inner, types.CodeType):
-            yield from _names(inner)
-
-
 def _is_users_module(module: object) -> bool:
     if not isinstance(module, types.ModuleType):
         return False
     file = getattr(module, "__file__", None)
-    return module.__name__ == "__main__" or (file is not None and _is_users_file(file))
+    return module.__name__ == "__main__" or (file is not None and is_user_file(file))
 
 
 def _is_users(kind: type) -> bool:
@@ -178,5 +163,5 @@ def _is_looked_into(value: Any) -> bool:
     """Return whether a function is the user's, or a function or class of ours may hold one."""
     ours = str(value.__module__).startswith("verifai_jax")
     if isinstance(value, types.FunctionType):
-        return ours or _is_users_file(value.__code__.co_filename)
+        return ours or is_user_file(value.__code__.co_filename)
     return ours and hasattr(value, "__dataclass_fields__")

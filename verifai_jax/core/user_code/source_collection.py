@@ -120,16 +120,9 @@ def sources_of(
     files += [Source(PROGRAM, PROGRAM, program)] if program else []
     tree = next((tree for tree in map(tree_of, modules) if tree is not None), None)
     commit, dirty = _checked_out() if tree is None else ("", False)
-    return Sources(
-        files=tuple(files),
-        versions=versions(),
-        without_file=tuple(without),
-        root=Path.cwd().as_posix(),
-        first=first,
-        commit=commit,
-        dirty=dirty,
-        revision="" if tree is None else tree_commits[tree],
-    )
+    root, revision = Path.cwd().as_posix(), "" if tree is None else tree_commits[tree]
+    without_file = tuple(without)
+    return Sources(tuple(files), versions(), without_file, root, first, commit, dirty, revision)
 
 
 def _checked_out() -> tuple[str, bool]:
@@ -244,13 +237,13 @@ def _look_into(things: object, others: dict[str, Source]) -> Iterator[_Module]:
             continue
         kept[id(value)] = value
         if isinstance(value, FunctionType):
-            waiting += [value.__defaults__ or (), value.__kwdefaults__ or {}, _closure(value)]
+            waiting += [value.__defaults__ or (), value.__kwdefaults__ or {}, closure_of(value)]
             if (wrapped := getattr(value, "__wrapped__", None)) is not None:
                 waiting.append(wrapped)  # Whose module imports what wraps it.
             elif (module := _module(value.__globals__)) is not None:
                 yield module
             elif value.__globals__.get("__name__") == "__main__":
-                waiting += [value.__globals__.get(name) for name in _names(value.__code__)]
+                waiting += [value.__globals__.get(name) for name in names_in(value.__code__)]
                 _add_function(value, others)
         elif isinstance(value, MethodType):
             waiting += [value.__func__, value.__self__]
@@ -281,8 +274,8 @@ def _add_function(function: FunctionType, others: dict[str, Source]) -> None:
         text = inspect.getsource(function)
     except (OSError, TypeError):
         text = function.__code__.co_code.hex()
-    values = {name: function.__globals__.get(name) for name in _names(function.__code__)}
-    plain = {n: v for n, v in (values | _closure(function)).items() if _is_plain(v)}
+    values = {name: function.__globals__.get(name) for name in names_in(function.__code__)}
+    plain = {n: v for n, v in (values | closure_of(function)).items() if _is_plain(v)}
     texts = [text, *(f"{name}={value!r}" for name, value in sorted(plain.items()))]
     name = f"{function.__qualname__} ({where})"
     # Of several of one name, such as lambdas, the hash stands for all in their order.
@@ -291,7 +284,8 @@ def _add_function(function: FunctionType, others: dict[str, Source]) -> None:
     others[name] = Source(name, FUNCTION, sha256)
 
 
-def _closure(function: FunctionType) -> dict[str, object]:
+def closure_of(function: FunctionType) -> dict[str, object]:
+    """Return the variables of outer functions that a function uses, if they have a value."""
     found = {}
     for name, cell in zip(function.__code__.co_freevars, function.__closure__ or (), strict=False):
         try:
@@ -301,9 +295,9 @@ def _closure(function: FunctionType) -> dict[str, object]:
     return found
 
 
-def _names(code: CodeType) -> set[str]:
+def names_in(code: CodeType) -> set[str]:
     """Return the global names of a function, and of those inside of it."""
-    inner = [_names(each) for each in code.co_consts if isinstance(each, CodeType)]
+    inner = [names_in(each) for each in code.co_consts if isinstance(each, CodeType)]
     return set(code.co_names).union(*inner)
 
 

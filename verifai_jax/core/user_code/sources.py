@@ -94,15 +94,10 @@ class Sources:
     def to_json(self) -> dict[str, Any]:
         """Return it as plain data."""
         return {
-            "first": self.first,
-            "root": self.root,
-            "commit": self.commit,
-            "dirty": self.dirty,
-            "revision": self.revision,
-            "files": [list(file) for file in self.files],
-            "without_file": list(self.without_file),
-            "versions": dict(self.versions),
-        }
+            "first": self.first, "root": self.root, "commit": self.commit, "dirty": self.dirty,
+            "revision": self.revision, "files": [list(file) for file in self.files],
+            "without_file": list(self.without_file), "versions": dict(self.versions),
+        }  # fmt: skip
 
     @classmethod
     def from_json(cls, data: Mapping[str, Any]) -> "Sources":

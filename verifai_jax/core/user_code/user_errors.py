@@ -104,11 +104,8 @@ TRACING_BY_WORDS = {
 
 
 class UserLine(NamedTuple):
-    """A line of a user's file.
+    """A line of a user's file, named relative to the working directory, in a function.
 
-    - `file`: its path, relative if it lies below the working directory.
-    - `line`: its line number.
-    - `function`: name of the enclosing function.
     - `code`: the text of the line; empty if the file cannot be read.
     """
 

@@ -151,10 +151,7 @@ def _run_of(
 
 
 def _faults_of(problem: Problem) -> dict[str, Fault]:
-    """Return the faults of a problem by name.
-
-    **Raises:** `ValueError` without faults, and for a fault that cannot be switched off.
-    """
+    """Return the faults of a problem by name; refuse those that cannot be switched off."""
     known: dict[str, Fault] = {}
     for name, domain in problem.space.domains.items():
         if not isinstance(domain, FaultFeatures):

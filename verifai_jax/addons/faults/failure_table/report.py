@@ -18,11 +18,7 @@ SAMPLED = "The numbers of a fault are independent samples of its prior, given th
 
 
 def failure_table_page(found: FailureTable, about: About, problem: Problem | None) -> Page:
-    """Make the report on a failure table.
-
-    **Arguments:**
-    - `problem`: the problem with its faults, unless the table has a run.
-    """
+    """Make the report on a table of a problem with faults, that of its run if it has one."""
     run, sure = found.run, format_percent(found.confidence)
     problem = problem if run is None else run.problem
     about.check(None if problem is None else problem.space)

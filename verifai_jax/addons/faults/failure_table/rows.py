@@ -37,6 +37,7 @@ FEW = 10
 TRIED = 32
 """Failing samples simulated again with the lowered ones, whose verdicts are less stable."""
 Points = Float[np.ndarray, "n d"]
+Index = Int[np.ndarray, " k"]
 
 
 @dataclass(eq=False)
@@ -55,10 +56,6 @@ class Rows:
         self.draws = depends_on_key(self.problem)
         self._evaluate = Evaluator(self.problem, 512, seed=self.seed, executor=self.executor)
         self._count = 0
-
-    def coordinate(self, fault: str, number: str) -> int:
-        """Return the index of the coordinate of one number of a fault."""
-        return int(self.groups[fault][list(self.faults[fault].domains).index(number)])
 
     def __call__(self, what: str, points: Points) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Simulate points; return which violate, which have a verdict, and their robustness."""
@@ -125,39 +122,42 @@ class Rows:
         return self.cache.remember(f"search/{'+'.join(names)}", searched)["points"]
 
     def _lowered(self, names: Sequence[str], failing: Points, budget: int) -> tuple[Points, bool]:
-        """Return failing points with their severity lowered as far as they fail, lowest first.
-
-        **Returns:** the points, and whether a search below the lowest found nothing that fails.
-        """
-        home, faults = self.nominal.u, self.faults
-        index = np.array([self.coordinate(name, faults[name].grade) for name in names])
+        """Return failing points, the least severe first, and whether a search below found none."""
+        own = {name: self.faults[name] for name in names}
+        index = np.array(
+            [self.groups[name][list(one.domains).index(one.grade)] for name, one in own.items()]
+        )
         # Where chance decides, no severity is an edge: a few failing points are tried many times.
-        others = any(fault.draws for fault in faults.values())
-        draws = self.draws and (not others or any(faults[name].draws for name in names))
+        others = any(fault.draws for fault in self.faults.values())
+        draws = self.draws and (not others or any(fault.draws for fault in own.values()))
 
-        def ordered(points: Points) -> Points:
-            return points[np.argsort(self._away(points, index), kind="stable")]
-
-        failing = ordered(failing)
-        lowest = ordered(self._on_lines(names, index, failing[:FOLLOWED]))
+        failing = self._ordered(failing, index)
+        lowest = self._ordered(self._on_lines(names, index, failing[:FOLLOWED]), index)
         edge = False
         if len(lowest) and not draws:
             lowest, edge = self._below(names, index, lowest, budget)
         # Closer replays may refute the very edge, and are given some points just above it.
         above = np.repeat(lowest[:1], len(ABOVE) if len(lowest) else 0, axis=0)
-        away = above[:, index] - home[index]
-        size = np.maximum(self._away(above, index), 1e-9)[:, None]
-        above[:, index] = np.clip(home[index] + away * (1 + RESOLVED * ABOVE[:, None] / size), 0, 1)
-        tried = np.resize(failing, (8 * TRIED, len(home))) if draws else failing[:TRIED]
+        above = self._moved(above, index, self._away(above, index) + RESOLVED * ABOVE[: len(above)])
+        size = len(self.nominal.u)
+        tried = np.resize(failing, (8 * TRIED, size)) if draws else failing[:TRIED]
         return np.concatenate([above, lowest[1:FOLLOWED], tried]), edge
 
-    def _away(self, points: Points, index: Int[np.ndarray, " k"]) -> Float[np.ndarray, " n"]:
+    def _away(self, points: Points, index: Index) -> Float[np.ndarray, " n"]:
         """Return how severe faults are, in shares of the ranges of their severities."""
         return np.abs(points[:, index] - self.nominal.u[index]).sum(axis=1)
 
-    def _on_lines(
-        self, names: Sequence[str], index: Int[np.ndarray, " k"], starts: Points
-    ) -> Points:
+    def _ordered(self, points: Points, index: Index) -> Points:
+        return points[np.argsort(self._away(points, index), kind="stable")]
+
+    def _moved(self, points: Points, index: Index, away: Float[np.ndarray, " n"] | float) -> Points:
+        """Return points whose faults are as severe as this, in the same shares as before."""
+        home, moved = self.nominal.u[index], points.copy()
+        share = np.asarray(away / np.maximum(self._away(points, index), 1e-9))[:, None]
+        moved[:, index] = np.clip(home + (points[:, index] - home) * share, 0, 1)
+        return moved
+
+    def _on_lines(self, names: Sequence[str], index: Index, starts: Points) -> Points:
         """Return those of some points that fail, each with the lowest severity found to fail."""
         home = self.nominal.u
         away = (starts[:, index] - home[index])[:, None]
@@ -178,13 +178,10 @@ class Rows:
         return lowered[fails]
 
     def _below(
-        self, names: Sequence[str], index: Int[np.ndarray, " k"], lowest: Points, budget: int
+        self, names: Sequence[str], index: Index, lowest: Points, budget: int
     ) -> tuple[Points, bool]:
-        """Search all numbers of some faults for failures just below the lowest severity.
-
-        **Returns:** the failing points, lowest first, and whether the last rounds found none below.
-        """
-        home, misses = self.nominal.u, 0
+        """Search below the lowest severity; return what fails, and whether the last rounds had none."""
+        misses = 0
         own = np.concatenate([self.groups[name] for name in names])
         good = lowest[:FOLLOWED]
         for _ in range(budget // ROUND):
@@ -197,15 +194,11 @@ class Rows:
             points[:, own] += reach * self.rng.normal(size=(ROUND, len(own)))
             points[: ROUND // 4, own] = self.rng.random((ROUND // 4, len(own)))
             points[:, own] = np.clip(points[:, own], 0, 1)
-            size = np.maximum(self._away(points, index), 1e-9)[:, None]
-            away = (points[:, index] - home[index]) * level / size
-            points[:, index] = np.clip(home[index] + away, 0, 1)
+            points = self._moved(points, index, level)
             violated, _, rho = self(f"below/{'+'.join(names)}", points)
             order = np.argsort(rho)
             good, misses = points[order[:FOLLOWED]], misses + 1
             if violated.any():
                 found = self._on_lines(names, index, points[order[violated[order]]][:FOLLOWED])
-                lowest = np.concatenate([found, lowest])
-                lowest = lowest[np.argsort(self._away(lowest, index), kind="stable")]
-                misses = 0
+                lowest, misses = self._ordered(np.concatenate([found, lowest]), index), 0
         return lowest, False

@@ -21,12 +21,13 @@ from jaxtyping import Array, Float, PyTree
 
 from verifai_jax.addons.rl.policies.errors import PolicyError
 from verifai_jax.addons.rl.policies.onnx_graph import OPSET, Graph
-from verifai_jax.addons.rl.policies.tracing import number_type, traced
+from verifai_jax.addons.rl.policies.tracing import Traced, number_type, traced
 from verifai_jax.core.messages.errors import check_names, require
 from verifai_jax.core.store.atomic_files import replacing
 
 Compute = Callable[[PyTree, PyTree, PyTree], tuple[Any, PyTree]]
 """A pure function `(weights, observation, memory) -> (outputs, memory)`."""
+Arrays = Mapping[str, np.ndarray]
 ACTIONS = {
     "outputs": "the outputs themselves",
     "argmax": "the index of the greatest output",
@@ -61,15 +62,14 @@ class Actions:
         check_names("action", [self.kind], ACTIONS)
         bounded = self.kind in ("clip", "scale", "tanh")
         pairs = list(zip(self.low, self.high, strict=False))
+        got = f"got {self.low} and {self.high}"
         if len(self.low) != len(self.high) or bool(self.low) != bounded:
             what = "needs low= and high= of one size" if bounded else "takes no low= and high="
-            raise PolicyError(f"action={self.kind!r} {what}; got {self.low} and {self.high}")
+            raise PolicyError(f"action={self.kind!r} {what}; {got}")
         if not all(low < high for low, high in pairs):
-            raise PolicyError(f"low must be less than high; got {self.low} and {self.high}")
-        if self.kind in ("scale", "tanh") and not np.all(np.isfinite([*self.low, *self.high])):
-            raise PolicyError(
-                f"action={self.kind!r} needs finite bounds; got {self.low} and {self.high}"
-            )
+            raise PolicyError(f"low must be less than high; {got}")
+        if self.kind in ("scale", "tanh") and not np.all(np.isfinite(pairs)):
+            raise PolicyError(f"action={self.kind!r} needs finite bounds; {got}")
 
     def __call__(self, outputs: Array) -> Array:
         """Return the action that outputs `[n]` mean."""
@@ -139,13 +139,12 @@ class Policy:
         """Return the outputs of the network; with its memory, for one that remembers."""
         (remembered,) = memory or (None,)
         if (self.initial_memory is None) != (remembered is None):
-            form = (
-                "has no memory: call act(observation)"
-                if self.initial_memory is None
-                else "has a memory: act(observation, memory) returns (action, memory), and "
+            if self.initial_memory is None:
+                raise TypeError("this policy has no memory: call act(observation)")
+            raise TypeError(
+                "this policy has a memory: act(observation, memory) returns (action, memory), and "
                 "policy.initial_memory is the first"
             )
-            raise TypeError(f"this policy {form}")
         if self.normaliser is not None:
             observation = self.normaliser(observation)
         outputs, after = self.compute(self.weights, observation, remembered)
@@ -181,20 +180,16 @@ class Policy:
         graph, arrays, start = self.as_graph(observation)
         return write(graph, arrays, start, Path(path))
 
-    def as_graph(
-        self, observation: PyTree = None
-    ) -> tuple[Graph, dict[str, np.ndarray], tuple[np.ndarray, ...]]:
+    def as_graph(self, observation: PyTree = None) -> Traced:
         """Return the policy as a graph of ONNX operators with its arrays and its initial memory.
 
         **Raises:** the `PolicyError` of `save`.
         """
         if observation is None:
-            example = getattr(self.compute, "example", None)
-            observation = None if example is None else example(self.weights)
+            observation = getattr(self.compute, "example", lambda _: None)(self.weights)
         if observation is None:
             raise PolicyError("the policy does not define its input: give an example, observation=")
         seen = jax.tree.map(lambda o: np.asarray(o, np.float32), observation)
-        parts = (self.weights, self.normaliser)
 
         def decide(parts: PyTree, observation: PyTree, memory: PyTree) -> tuple[Any, PyTree]:
             weights, normaliser = parts
@@ -203,7 +198,7 @@ class Policy:
                 return policy.act(observation), None
             return policy.act(observation, memory)
 
-        return traced(decide, parts, seen, self.initial_memory)
+        return traced(decide, (self.weights, self.normaliser), seen, self.initial_memory)
 
 
 @dataclass(frozen=True)
@@ -257,24 +252,18 @@ def stack_frames(policy: Policy, count: int, size: int) -> Policy:
 
 
 def bounds(values: object, name: str) -> tuple[float, ...]:
-    """Return bounds of an action as a tuple.
-
-    **Raises:** `PolicyError` for values that are not numbers.
-    """
+    """Return bounds of an action as a tuple; refuse what are no numbers."""
     try:
         array = np.atleast_1d(np.asarray(values, float)).ravel()
     except (TypeError, ValueError):
-        raise PolicyError(
-            f"{name} must be a number or one for each entry; got {values!r}"
-        ) from None
+        what = f"{name} must be a number or one for each entry"
+        raise PolicyError(f"{what}; got {values!r}") from None
     if np.any(np.isnan(array)):
         raise PolicyError(f"{name} must not be NaN; got {values!r}")
     return tuple(array.tolist())
 
 
-def write(
-    graph: Graph, arrays: Mapping[str, np.ndarray], start: Sequence[np.ndarray], path: Path
-) -> Path:
+def write(graph: Graph, arrays: Arrays, start: Sequence[np.ndarray], path: Path) -> Path:
     """Write a graph that was `traced` with its arrays and its first memory.
 
     **Raises:** `PolicyError` for an ending other than `.onnx`, `.safetensors` and `.npz`, and for
@@ -302,29 +291,20 @@ def write(
     return path
 
 
-def _as_onnx(
-    graph: Graph, arrays: Mapping[str, np.ndarray], memory: Mapping[str, np.ndarray]
-) -> bytes:
+def _as_onnx(graph: Graph, arrays: Arrays, memory: Arrays) -> bytes:
     onnx = require("onnx", extra="policies")
-    helper, kinds = onnx.helper, onnx.TensorProto
-    nodes = [
-        helper.make_node(n.operator, n.inputs, n.outputs, name=n.name, **n.attributes)
-        for n in graph.nodes
-    ]
-    inputs = [helper.make_tensor_value_info(n, kinds.FLOAT, s) for n, s in graph.inputs.items()]
-    inputs += [
-        helper.make_tensor_value_info(name, number_type(first.dtype), first.shape)
-        for name, first in memory.items()
-    ]
+    helper = onnx.helper
+    node, info = helper.make_node, helper.make_tensor_value_info
+    nodes = [node(n.operator, n.inputs, n.outputs, n.name, **n.attributes) for n in graph.nodes]
+    inputs = [info(name, onnx.TensorProto.FLOAT, shape) for name, shape in graph.inputs.items()]
+    inputs += [info(name, number_type(a.dtype), a.shape) for name, a in memory.items()]
     names = (graph.output, *(after for _, after in graph.memory))
     outputs = [onnx.ValueInfoProto(name=name) for name in names]
     tensors = [onnx.numpy_helper.from_array(array, name) for name, array in arrays.items()]
     model = helper.make_model(
         helper.make_graph(nodes, "policy", inputs, outputs, tensors),
-        opset_imports=[helper.make_opsetid("", OPSET)],
-        ir_version=9,
-        producer_name="verifai_jax",
-    )
+        opset_imports=[helper.make_opsetid("", OPSET)], ir_version=9, producer_name="verifai_jax",
+    )  # fmt: skip
     model = onnx.shape_inference.infer_shapes(model, strict_mode=True, data_prop=True)
     onnx.checker.check_model(model)
     return model.SerializeToString()

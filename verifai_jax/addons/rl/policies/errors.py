@@ -1,5 +1,10 @@
 """The error of a policy that cannot be loaded."""
 
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+from verifai_jax.core.messages.text import one_line
+
 MAX_BYTES = 150_000_000
 """Maximum bytes of a file, also after unpacking; policies for control have a thousandth."""
 MAX_NUMBERS = 2**24
@@ -8,3 +13,14 @@ MAX_NUMBERS = 2**24
 
 class PolicyError(ValueError):
     """An error for a file or an object that is not a usable policy."""
+
+
+@contextmanager
+def refused(what: str, said: Callable[[BaseException], str] = str) -> Iterator[None]:
+    """Make any other error within a `PolicyError` of one line: this text, and what it `said`."""
+    try:
+        yield
+    except PolicyError:
+        raise
+    except Exception as error:
+        raise PolicyError(f"{what}: {one_line(said(error))}") from error

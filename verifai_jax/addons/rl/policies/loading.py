@@ -11,6 +11,7 @@ import json
 import logging
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -20,10 +21,11 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, PyTree
 
 from verifai_jax.addons.rl.policies.base import Actions, Normaliser, Policy, bounds, stack_frames
-from verifai_jax.addons.rl.policies.errors import MAX_BYTES, PolicyError
+from verifai_jax.addons.rl.policies.errors import MAX_BYTES, PolicyError, refused
 from verifai_jax.addons.rl.policies.networks import Mlp, activation_name
 from verifai_jax.addons.rl.policies.objects import from_object, pure_program, read_brax
 from verifai_jax.addons.rl.policies.onnx_graph import read_graph, read_onnx
+from verifai_jax.addons.rl.policies.onnx_memory import Stated
 from verifai_jax.addons.rl.policies.sb3 import read_normaliser, read_sb3
 from verifai_jax.addons.rl.policies.tensors import (
     Tensors,
@@ -42,12 +44,13 @@ from verifai_jax.addons.rl.policies.torch_archive import (
 from verifai_jax.core.compute.fingerprint import used_inputs
 from verifai_jax.core.messages.checks import check_count
 from verifai_jax.core.messages.errors import require, suggests_options
-from verifai_jax.core.messages.text import one_line
 from verifai_jax.systems.policy import Policy as OwnPolicy
 from verifai_jax.systems.policy import load_policy
 
 log = logging.getLogger("verifai_jax.policies")
 Network = Callable[[dict[str, Array], PyTree], PyTree]
+_MlpOptions = tuple[str | None, Network | None, Sequence[str] | None, Sequence[str]]
+"""The arguments `activation`, `network`, `layers` and `ignore` of `policy`."""
 _TYPES: dict[str, Any] = {
     **{f"{kind}{8 * size}": f"{kind.lower()}{size}" for kind in "FIU" for size in (1, 2, 4, 8)},
     **{"BOOL": bool, "BF16": ml_dtypes.bfloat16},
@@ -123,18 +126,14 @@ def policy(
     stated = action is not None or low is not None or high is not None
     if isinstance(loaded, OwnPolicy):
         if normalise is not None or stated or stack > 1:
-            raise PolicyError(
-                "the policy's own file defines its normalisation and actions: leave these "
-                "options out"
-            )
+            defines = "the policy's own file defines its normalisation and actions"
+            raise PolicyError(f"{defines}: leave these options out")
         return loaded
-    changes: dict[str, Any] = {}
     if normalise is not None:
-        changes["normaliser"] = _normaliser(normalise)
+        loaded = replace(loaded, normaliser=_normaliser(normalise))
     if stated:
-        low_, high_ = (() if v is None else bounds(v, n) for v, n in ((low, "low"), (high, "high")))
-        changes["actions"] = Actions(action or "clip", low_, high_)
-    loaded = replace(loaded, **changes)
+        ends = (() if v is None else bounds(v, n) for v, n in ((low, "low"), (high, "high")))
+        loaded = replace(loaded, actions=Actions(action or "clip", *ends))
     if stack > 1:
         if observation is None:
             raise PolicyError("stack= needs observation=, an example of a single observation")
@@ -143,10 +142,7 @@ def policy(
 
 
 def _of_file(
-    path: Path,
-    mlp: tuple[str | None, Network | None, Sequence[str] | None, Sequence[str]],
-    graph: tuple[str | None, Mapping[str, str] | None],
-    normalised: bool,
+    path: Path, mlp: _MlpOptions, graph: tuple[str | None, Stated], normalised: bool
 ) -> Policy | OwnPolicy:
     if path.is_dir():
         return read_brax(path.resolve())
@@ -155,11 +151,9 @@ def _of_file(
     kind = path.suffix.lower()
     if kind not in FORMATS:
         raise PolicyError(f"{path} has to be one of {', '.join(FORMATS)}, or a folder of Brax")
-    if path.stat().st_size > MAX_BYTES:
-        raise PolicyError(
-            f"{path} has {path.stat().st_size / 1e6:z.0f} MB, and a policy may have at most "
-            f"{MAX_BYTES / 1e6:z.0f} MB"
-        )
+    if (size := path.stat().st_size) > MAX_BYTES:
+        most = f"a policy may have at most {MAX_BYTES / 1e6:z.0f} MB"
+        raise PolicyError(f"{path} has {size / 1e6:z.0f} MB, and {most}")
     data = path.read_bytes()
     stored = _stored_graph(data, path)
     weights_alone = kind in (".safetensors", ".pt", ".pth") and stored is None
@@ -175,56 +169,40 @@ def _of_file(
     if kind == ".zip":
         return read_sb3(data, str(path))
     if kind == ".onnx":
-        output, memory = graph
-        function, weights, first = read_onnx(path, data, str(path), output=output, memory=memory)
+        function, weights, first = read_onnx(path, data, str(path), *graph)
         return Policy(weights, function, first)
     arrays = _safetensors(data, path) if kind == ".safetensors" else read_state(data, str(path))
-    return _of_weights(Tensors(arrays, str(path)), *mlp, normalised)
+    return _of_weights(Tensors(arrays, str(path)), mlp, normalised)
 
 
 def _stored_graph(data: bytes, path: Path) -> tuple[Any, dict[str, np.ndarray]] | None:
-    """Return the graph and the arrays of a file of `Policy.save`; None for another file.
-
-    **Raises:** `PolicyError` for a damaged file.
-    """
-    try:
+    """Return the graph and the arrays of a file of `Policy.save`; None for another file."""
+    with refused(f"{path} holds no policy"):
         if path.suffix.lower() == ".npz":
             archive = open_archive(data, str(path))
-            arrays = {
-                n.removesuffix(".npy"): np.lib.format.read_array(
-                    io.BytesIO(read_member(archive, n, str(path))), allow_pickle=False
-                )
-                for n in archive.namelist()
-            }
+            files = {n: io.BytesIO(read_member(archive, n, str(path))) for n in archive.namelist()}
+            read = partial(np.lib.format.read_array, allow_pickle=False)
+            arrays = {n.removesuffix(".npy"): read(file) for n, file in files.items()}
             about = json.loads(str(arrays.pop("about")))
             return (about["graph"], arrays) if "graph" in about else None
         if path.suffix.lower() == ".safetensors":
             header = json.loads(data[8 : 8 + int.from_bytes(data[:8], "little")])
             about = header.get("__metadata__", {}).get("graph")
             return None if about is None else (json.loads(about), _safetensors(data, path))
-    except PolicyError:
-        raise
-    except Exception as error:
-        raise PolicyError(f"{path} holds no policy: {one_line(str(error))}") from error
     return None
 
 
 def _safetensors(data: bytes, path: Path) -> dict[str, np.ndarray]:
     package = require("safetensors", extra="policies")
-    try:
+    with refused(f"{path} holds no tensors"):
         return {
             name: widened(np.frombuffer(part["data"], _TYPES[part["dtype"]]).reshape(part["shape"]))
             for name, part in package.deserialize(data)
         }
-    except Exception as error:
-        raise PolicyError(f"{path} holds no tensors: {one_line(str(error))}") from error
 
 
 class _Given:
-    """The function of a user's own network and its weights.
-
-    - `what`: the file of the weights, for messages.
-    """
+    """The function of a user's own network, for the weights of the file `what`."""
 
     def __init__(self, network: Network, what: str) -> None:
         self.network, self.what, self.checked = network, what, False
@@ -239,16 +217,9 @@ class _Given:
         return self.network(weights, observation), None
 
 
-def _of_weights(
-    tensors: Tensors,
-    activation: str | None,
-    network: Network | None,
-    layers: Sequence[str] | None,
-    ignore: Sequence[str],
-    normalised: bool,
-) -> Policy:
+def _of_weights(tensors: Tensors, mlp: _MlpOptions, normalised: bool) -> Policy:
     """Return the policy of weights with a given network; every tensor is used, or named."""
-    what = tensors.what
+    what, (activation, network, layers, ignore) = tensors.what, mlp
     tensors.ignore([ignore] if isinstance(ignore, str) else ignore)
     if (activation is None) == (network is None):
         raise PolicyError(
@@ -260,11 +231,10 @@ def _of_weights(
         return Policy(arrays, _Given(network, what))
     assert activation is not None
     try:
-        names = layer_names(tensors) if layers is None else list(layers)
+        names = layer_names(tensors) if layers is None else layers
         weights = linear_layers(tensors, names, what)
     except PolicyError as error:
-        hint = "give the layers of the policy in order with layers="
-        raise PolicyError(f"{str(error).removesuffix(f': {hint}')}: {hint}") from None
+        raise PolicyError(f"{error}: give the layers of the policy in order with layers=") from None
     normaliser = None
     if normalised:
         tensors.used.update(n for kinds in normalisers(tensors).values() for n in kinds.values())

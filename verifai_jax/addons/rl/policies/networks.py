@@ -12,27 +12,17 @@ from verifai_jax.addons.rl.policies.errors import PolicyError
 from verifai_jax.core.messages.errors import check_names
 
 ACTIVATIONS: dict[str, Callable[[Array], Array]] = {
-    "tanh": jnp.tanh,
-    "relu": jax.nn.relu,
-    "elu": jax.nn.elu,
-    "selu": jax.nn.selu,
-    "gelu": lambda x: jax.nn.gelu(x, approximate=False),
-    "silu": jax.nn.silu,
-    "swish": jax.nn.silu,
-    "leakyrelu": lambda x: jax.nn.leaky_relu(x, 0.01),
-    "sigmoid": jax.nn.sigmoid,
-    "softplus": jax.nn.softplus,
-    "identity": lambda x: x,
-}
+    "tanh": jnp.tanh, "relu": jax.nn.relu, "elu": jax.nn.elu, "selu": jax.nn.selu,
+    "gelu": lambda x: jax.nn.gelu(x, approximate=False), "silu": jax.nn.silu,
+    "swish": jax.nn.silu, "leakyrelu": lambda x: jax.nn.leaky_relu(x, 0.01),
+    "sigmoid": jax.nn.sigmoid, "softplus": jax.nn.softplus, "identity": lambda x: x,
+}  # fmt: skip
 """Functions between layers, by the lower-case names of PyTorch's classes."""
 Layers = tuple[tuple[Float[Array, "inputs outputs"], Float[Array, " outputs"]], ...]
 
 
 def activation_name(name: str) -> str:
-    """Return the name in `ACTIVATIONS` of an activation, such as `LeakyReLU`.
-
-    **Raises:** `UnknownNameError`.
-    """
+    """Return the name in `ACTIVATIONS` of an activation, such as `LeakyReLU`; refuse others."""
     plain = name.lower().replace("_", "")
     check_names("activation", [plain], ACTIVATIONS)
     return plain
@@ -65,33 +55,21 @@ class Mlp:
             convolutions, layers = weights
             x = _nature(convolutions, jnp.asarray(x, float) / 255)
         elif self.categories:
-            parts = jnp.split(jnp.reshape(x, -1), len(self.categories))
-            hot = [
-                (part[0] == jnp.arange(n)).astype(float)
-                for part, n in zip(parts, self.categories, strict=True)
-            ]
-            x = jnp.concatenate(hot)
+            parts = zip(jnp.reshape(x, len(self.categories)), self.categories, strict=True)
+            x = jnp.concatenate([(one == jnp.arange(n)).astype(float) for one, n in parts])
         elif x.ndim and x.shape[-1] != layers[0][0].shape[0]:
             x = jnp.reshape(x, -1)
-        between = ACTIVATIONS[self.activation]
-        check_size(x, layers[0][0].shape[0])
+        size, between = layers[0][0].shape[0], ACTIVATIONS[self.activation]
+        if not x.ndim or x.shape[-1] != size:
+            raise PolicyError(
+                f"the network takes observations of {size} numbers; got shape {list(x.shape)}"
+            )
         for i, (weight, bias) in enumerate(layers):
             # The linear layer after convolutions has the activation of those.
             f = jax.nn.relu if self.pixels and i == 0 else between
             x = x @ weight + bias
             x = x if i == len(layers) - 1 else f(x)
         return x, None
-
-
-def check_size(observation: Array, size: int) -> None:
-    """Check that an observation has as many numbers as a network needs.
-
-    **Raises:** `PolicyError`.
-    """
-    if not observation.ndim or observation.shape[-1] != size:
-        raise PolicyError(
-            f"the network takes observations of {size} numbers; got shape {list(observation.shape)}"
-        )
 
 
 def _nature(convolutions: Layers, image: Float[Array, "c h w"]) -> Float[Array, " k"]:

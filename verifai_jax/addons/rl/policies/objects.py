@@ -22,7 +22,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Key, PyTree
 
 from verifai_jax.addons.rl.policies.base import Policy
-from verifai_jax.addons.rl.policies.errors import PolicyError
+from verifai_jax.addons.rl.policies.errors import PolicyError, refused
 from verifai_jax.addons.rl.policies.onnx_graph import read_onnx
 from verifai_jax.addons.rl.policies.sb3 import read_sb3
 from verifai_jax.addons.simulators.environments.episode import count_required, without_extras
@@ -36,26 +36,15 @@ log = logging.getLogger("verifai_jax.policies")
 
 
 def from_object(source: Any, observation: ArrayLike | None, batched: bool) -> Policy:
-    """Return the policy of a model or function.
-
-    **Arguments:**
-    - `source`: see `policy`.
-    - `observation`: an example observation, for an object that cannot be translated without one.
-    - `batched`: whether a Python function takes a batch of observations.
-    **Raises:** `PolicyError` for an object that is not a policy.
-    """
+    """Return the policy of a model or function, as `policy` does; refuse any other object."""
     root = type(source).__module__.partition(".")[0]
     if root in ("stable_baselines3", "sb3_contrib"):
         return _of_sb3(source)
     if _is_a(source, "torch.nn.modules.module", "Module"):
         return _of_torch(source, observation, batched)
-    if (
-        isinstance(source, tuple)
-        and len(source) == 2
-        and callable(getattr(source[0], "apply", None))
-    ):
-        module, variables = source
-        return Policy(variables, _Of(_linen, (module,)))
+    pair = isinstance(source, tuple) and len(source) == 2
+    if pair and callable(getattr(source[0], "apply", None)):
+        return Policy(source[1], _Of(_linen, source[:1]))
     if _is_a(source, "flax.nnx.module", "Module"):
         nnx = require("flax.nnx", extra="policies")
         # A copy, so that the user's stays in training.
@@ -73,13 +62,10 @@ def from_object(source: Any, observation: ArrayLike | None, batched: bool) -> Po
     leaves, structure = jax.tree.flatten(source)
     if leaves and leaves != [source]:
         arrays = [leaf if isinstance(leaf, jax.Array | np.ndarray) else None for leaf in leaves]
-        rest = tuple(
-            None if a is not None else leaf for a, leaf in zip(arrays, leaves, strict=True)
-        )
+        rest = tuple(leaf if a is None else None for a, leaf in zip(arrays, leaves, strict=True))
         return Policy(arrays, _Of(partial(_rebuilt, structure, rest)))
-    if count_required(source) == 2:
-        return RandomPolicy((), _Function(source, batched))
-    return Policy((), _Function(source, batched))
+    kind = RandomPolicy if count_required(source) == 2 else Policy
+    return kind((), _Function(source, batched))
 
 
 def _is_a(source: object, module: str, name: str) -> bool:
@@ -124,21 +110,18 @@ def _linen(module: Any, variables: PyTree, observation: PyTree) -> Any:
     except Exception as error:
         if not type(error).__module__.startswith("flax"):
             raise
-        raise PolicyError(
-            f"{type(module).__name__} cannot be applied to an observation, as if it were in "
-            f"training: {one_line(str(error))[:300]}"
-        ) from error
+        why = "cannot be applied to an observation, as if it were in training"
+        name = type(module).__name__
+        raise PolicyError(f"{name} {why}: {one_line(str(error), 300)}") from error
 
 
 def _nnx(graph: Any, state: PyTree, observation: PyTree) -> Any:
     return require("flax.nnx", extra="policies").merge(graph, state)(observation)
 
 
-def _rebuilt(
-    structure: Any, rest: tuple[Any, ...], weights: Sequence[Any], observation: PyTree
-) -> Any:
+def _rebuilt(structure: Any, rest: Sequence[Any], weights: Sequence[Any], seen: PyTree) -> Any:
     leaves = [r if w is None else w for w, r in zip(weights, rest, strict=True)]
-    return jax.tree.unflatten(structure, leaves)(observation)
+    return jax.tree.unflatten(structure, leaves)(seen)
 
 
 def _brax(make: Callable[..., Any], weights: PyTree, observation: PyTree) -> Any:
@@ -147,10 +130,7 @@ def _brax(make: Callable[..., Any], weights: PyTree, observation: PyTree) -> Any
 
 @dataclass(frozen=True, eq=False)
 class _Function:
-    """A Python function: traced by JAX if possible, otherwise called on the host.
-
-    - `batched`: whether the function takes a batch of observations on the host.
-    """
+    """A Python function: traced by JAX if possible, otherwise called on the host, or `batched`."""
 
     function: Callable[..., Any]
     batched: bool = False
@@ -161,7 +141,7 @@ class _Function:
         return {}
 
     def __call__(self, weights: PyTree, observation: PyTree, memory: None) -> tuple[Any, None]:
-        key = str(jax.tree.map(lambda o: (jnp.shape(o), str(jnp.result_type(o))), observation))
+        key = str(jax.tree.map(_abstract, observation))
         if key not in self.forms:
             before = state_of(self.function)
             try:
@@ -177,24 +157,17 @@ class _Function:
                 self.forms[key] = self._form(observation, error)
         if self.forms[key] is None:
             return jax.tree.map(jnp.asarray, without_extras(self.function(observation))), None
-        action = jax.pure_callback(
-            self._on_host,
-            self.forms[key],
-            observation,
-            vmap_method="broadcast_all" if self.batched else "sequential",
-        )
-        return action, None
+        method, form = "broadcast_all" if self.batched else "sequential", self.forms[key]
+        return jax.pure_callback(self._on_host, form, observation, vmap_method=method), None
 
     def _on_host(self, observation: PyTree) -> Any:
         seen = jax.tree.map(np.asarray, observation)
         return jax.tree.map(_plain, returned(self.function, self.function(seen)))
 
     def _form(self, observation: PyTree, error: Exception) -> Any:
-        """Return the form of the action on the host, and log the time of a call.
-
-        **Raises:** `PolicyError` if it remembers earlier calls; the errors of the function.
-        """
-        zeros = jax.tree.map(lambda o: np.zeros(jnp.shape(o), jnp.result_type(o)), observation)
+        """Return the form of the action on the host, after checks, and log the time of a call."""
+        forms = jax.tree.map(_abstract, observation)
+        zeros = jax.tree.map(lambda o: np.zeros(o.shape, o.dtype), forms)
         before, begun = state_of(self.function), time.perf_counter()
         action = self._on_host(zeros)
         took = time.perf_counter() - begun
@@ -203,39 +176,26 @@ class _Function:
             self._on_host(jax.tree.map(lambda o: (o + 0.1).astype(o.dtype), zeros))
         again = self._on_host(zeros)
         kept = changed(before, state_of(self.function))
-        same = map(np.array_equal, jax.tree.leaves(action), jax.tree.leaves(again))
-        if not all(same):
+        if not all(map(np.array_equal, jax.tree.leaves(action), jax.tree.leaves(again))):
             raise _impure(self.function, why_differs(kept))
         log.warning(
             "the policy%s runs in Python, %s a call, because JAX cannot trace it: %s",
-            defined_at(self.function),
-            format_seconds(took, 2),
-            one_line(str(error))[:200],
-        )
-        return jax.tree.map(lambda a: jax.ShapeDtypeStruct(a.shape, a.dtype), action)
+            defined_at(self.function), format_seconds(took, 2), one_line(str(error), 200),
+        )  # fmt: skip
+        return jax.tree.map(_abstract, action)
 
 
 def returned(function: Callable[..., Any], made: Any) -> Any:
-    """Return the action that a function has returned, without extras.
-
-    **Raises:** `PolicyError` for None.
-    """
+    """Return the action that a function has returned, without extras; refuse None."""
     if made is None:
-        raise PolicyError(
-            f"the policy{defined_at(function)} returned None: it may lack a return statement"
-        )
+        where = defined_at(function)
+        raise PolicyError(f"the policy{where} returned None: it may lack a return statement")
     return without_extras(made)
 
 
 def pure_program(function: Callable[..., Any], *arguments: PyTree) -> Any:
-    """Return the program of a policy, traced by JAX.
-
-    **Raises:** `PolicyError` for one that returns None, and for one that is no function of its
-    arguments alone; the errors of tracing.
-    """
-    forms = jax.tree.map(
-        lambda a: jax.ShapeDtypeStruct(jnp.shape(a), jnp.result_type(a)), arguments
-    )
+    """Return the program of a policy, traced by JAX; refuse one that returns None, or remembers."""
+    forms = jax.tree.map(_abstract, arguments)
     # A new function each time: JAX remembers what it traced by the function.
     trace = lambda: jax.make_jaxpr(lambda *a: returned(function, function(*a)))(*forms)  # noqa: E731
     watched = watch(function, trace)
@@ -250,6 +210,10 @@ def _impure(function: Callable[..., Any], why: str) -> PolicyError:
         "alone, or of (observation, key) with a random key. An object with a method reset() may be "
         f"given to vj.gymnasium without vj.policy. {AS_MEMORY}"
     )
+
+
+def _abstract(value: Any) -> jax.ShapeDtypeStruct:
+    return jax.ShapeDtypeStruct(jnp.shape(value), jnp.result_type(value))
 
 
 def _plain(value: Any) -> np.ndarray:
@@ -287,29 +251,22 @@ def _of_torch(module: Any, observation: ArrayLike | None, batched: bool) -> Poli
     try:
         return _translated(torch, module, example, on_host)
     except Exception as error:
-        log.warning(
-            "the torch module runs in Python, because it cannot be translated: %s",
-            one_line(str(error))[:300],
-        )
+        why = one_line(str(error), 300)
+        log.warning("the torch module runs in Python, because it cannot be translated: %s", why)
         return Policy((), _Function(on_host, batched))
 
 
 def _translated(
     torch: Any, module: Any, example: np.ndarray, on_host: Callable[..., Any]
 ) -> Policy:
-    """Return a module of PyTorch in JAX, after comparing its outputs with PyTorch's.
-
-    **Raises:** `ValueError` if they differ, for an exporter follows only one branch of a condition.
-    """
+    """Return a module of PyTorch in JAX if both agree: an exporter follows one branch only."""
     file = io.BytesIO()
     # It prints the whole graph where it fails.
     with warnings.catch_warnings(), contextlib.redirect_stdout(io.StringIO()):
         warnings.simplefilter("ignore")
         inputs = (torch.as_tensor(example)[None],)
         torch.onnx.export(module, inputs, file, dynamo=False, input_names=["observation"])
-    graph, weights, memory = read_onnx(
-        None, file.getvalue(), "the torch module", output=None, memory=None
-    )
+    graph, weights, memory = read_onnx(None, file.getvalue(), "the torch module")
     policy = Policy(weights, graph, memory)
     if memory is None:
         draws = np.random.default_rng(0).normal(size=(32, *example.shape)).astype(np.float32)
@@ -317,39 +274,27 @@ def _translated(
         for seen, scale in zip(draws, np.resize(scales, len(draws)), strict=True):
             one, other = np.asarray(policy.act(seen * scale)), _plain(on_host(seen * scale))
             if one.shape != other.shape or not np.allclose(one, other, rtol=1e-3, atol=1e-4):
-                raise ValueError(
-                    "its translation gives other actions, as for a module with branches"
-                )
+                why = "its translation gives other actions, as for a module with branches"
+                raise ValueError(why)
     return policy
 
 
 def read_brax(folder: Path) -> Policy:
-    """Return the deterministic policy of a PPO checkpoint of Brax or Playground.
-
-    **Raises:** `PolicyError` for a folder without one.
-    """
+    """Return the deterministic policy of a PPO checkpoint of Brax or Playground."""
     networks = require("brax.training.agents.ppo.networks", extra="brax")
     known = require("brax.training.networks", extra="brax").ACTIVATION
     statistics = require("brax.training.acme.running_statistics", extra="brax")
-    try:
+    with refused(f"{folder} holds no checkpoint of Brax' PPO"):
         config = json.loads((folder / "ppo_network_config.json").read_text())
         # Brax 0.14.2 refuses a checkpoint of its own whose initialisers are not named; a trained
         # network needs none.
-        options = {
-            name: value
-            for name, value in config["network_factory_kwargs"].items()
-            if value is not None and "kernel_init" not in name
-        }
+        given = config["network_factory_kwargs"].items()
+        options = {n: v for n, v in given if v is not None and "kernel_init" not in n}
         if "activation" in options:
             options["activation"] = known[options["activation"]]
         if config["normalize_observations"]:
             options["preprocess_observations_fn"] = statistics.normalize
-        made = networks.make_ppo_networks(
-            config["observation_size"], config["action_size"], **options
-        )
+        sizes = config["observation_size"], config["action_size"]
+        made = networks.make_ppo_networks(*sizes, **options)
         weights = require("brax.training.checkpoint", extra="brax").load(folder)
-    except Exception as error:
-        raise PolicyError(
-            f"{folder} holds no checkpoint of Brax' PPO: {one_line(str(error))[:300]}"
-        ) from error
     return Policy(weights, _Of(_brax, (networks.make_inference_fn(made),)))

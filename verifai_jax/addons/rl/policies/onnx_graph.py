@@ -20,9 +20,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, PyTree
 
-from verifai_jax.addons.rl.policies.errors import MAX_BYTES, MAX_NUMBERS, PolicyError
+from verifai_jax.addons.rl.policies.errors import MAX_BYTES, MAX_NUMBERS, PolicyError, refused
 from verifai_jax.addons.rl.policies.onnx_layers import extreme
-from verifai_jax.addons.rl.policies.onnx_memory import memory_of
+from verifai_jax.addons.rl.policies.onnx_memory import Stated, memory_of
 from verifai_jax.addons.rl.policies.onnx_node import TYPES, Node, cast, fitting, known
 from verifai_jax.addons.rl.policies.onnx_operators import GROWING, OPERATORS, output_size
 from verifai_jax.core.messages.errors import check_names, require
@@ -35,6 +35,8 @@ SPILLED = ""
 """What has the name of no value: whether whole numbers have left their range."""
 OPSETS = 7, 26
 """The first and the last operator set that is read."""
+_DOMAINS = "", "ai.onnx"
+"""Names of ONNX's own operators."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,15 +64,7 @@ class Graph:
     def digest(self) -> str:
         """Hash of all parts."""
         parts = [getattr(self, f.name) for f in fields(self)]
-        text = json.dumps(
-            parts,
-            sort_keys=True,
-            default=lambda part: (
-                vars(part)
-                if isinstance(part, Node)
-                else [part.dtype.str, part.shape, part.tobytes().hex()]
-            ),
-        )
+        text = json.dumps(parts, sort_keys=True, default=_as_json)
         return hashlib.sha256(text.encode()).hexdigest()[:20]
 
     def __eq__(self, other: object) -> bool:
@@ -88,10 +82,7 @@ class Graph:
         return next(iter(zeros.values())) if len(zeros) == 1 else zeros
 
     def to_json(self) -> dict[str, Any]:
-        """Return the graph as plain data, for `read_graph`.
-
-        Only for graphs of `writing.traced`, whose attributes are numbers and texts.
-        """
+        """Return a graph of `traced`, whose attributes are numbers and texts, for `read_graph`."""
         nodes = [[n.operator, n.inputs, n.outputs, n.attributes] for n in self.nodes]
         inputs = {name: list(shape) for name, shape in self.inputs.items()}
         return {"nodes": nodes, "inputs": inputs, "memory": self.memory, "output": self.output}
@@ -101,19 +92,15 @@ class Graph:
         values: Values = {**self.constants, **weights}
         added = 0
         for name, shape in self.inputs.items():
-            rank = len(shape)
             given = observation[name] if isinstance(observation, Mapping) else observation
             given = jnp.asarray(fitting(f"the observation {name!r}", given))
             given = cast(given, TYPES[self.types.get(name, 1)])
-            added = rank - given.ndim
+            added = len(shape) - given.ndim
             if added < 0:
-                raise PolicyError(
-                    f"the network takes observations of rank {rank} at most; got shape "
-                    f"{list(given.shape)}"
-                )
+                most = f"the network takes observations of rank {len(shape)} at most"
+                raise PolicyError(f"{most}; got shape {list(given.shape)}")
             values[name] = given.reshape((1,) * added + given.shape)
-        for (name, _), value in zip(self.memory, memory or (), strict=True):
-            values[name] = value
+        values.update(zip(dict(self.memory), memory or (), strict=True))
         run(self.nodes, values)
         absent = [n for n in (self.output, *dict(self.memory).values()) if n not in values]
         if absent:
@@ -131,31 +118,31 @@ class Graph:
         return outputs, after
 
 
-def run(nodes: Sequence[Node], values: Values) -> None:
-    """Compute nodes one after the other, and store their outputs among the values.
+Read = tuple[Graph, dict[str, Array], PyTree]
+"""A graph that was read, its weights, and its initial memory."""
 
-    **Raises:** `PolicyError` that names the node, its operator and its input shapes.
-    """
+
+def _as_json(part: Any) -> Any:
+    is_node = isinstance(part, Node)
+    return vars(part) if is_node else [part.dtype.str, part.shape, part.tobytes().hex()]
+
+
+def run(nodes: Sequence[Node], values: Values) -> None:
+    """Compute nodes one after the other, and store their outputs among the values."""
     total = 0
     for node in nodes:
         absent = [name for name in node.inputs if name and name not in values]
         if absent:
             raise PolicyError(f"{node} reads {absent[0]!r}, an output that is not supported")
         inputs = [values[name] if name else None for name in node.inputs]
-        try:
+        shapes = ", ".join("-" if i is None else str(list(np.shape(i))) for i in inputs)
+        with refused(f"{node} cannot be computed from inputs of shapes {shapes}"):
             _check_size(node, total + output_size(node, *inputs))
             if node.operator == "If":
                 outputs = _branch(node, inputs[0], values)
             else:
                 outputs = OPERATORS[node.operator](node, *inputs)
                 _note_spilled(node, inputs, outputs, values)
-        except PolicyError:
-            raise
-        except Exception as error:
-            shapes = ", ".join("-" if i is None else str(list(np.shape(i))) for i in inputs)
-            raise PolicyError(
-                f"{node} cannot be computed from inputs of shapes {shapes}: {one_line(str(error))}"
-            ) from error
         outputs = outputs if isinstance(outputs, tuple) else (outputs,)
         total += sum(int(np.size(made)) for made in outputs)
         _check_size(node, total)
@@ -181,18 +168,17 @@ def _check_size(node: Node, count: int) -> None:
     if count > MAX_NUMBERS:
         raise PolicyError(
             f"with {node} the graph computes {count:z.3g} numbers; the graph of a policy may "
-            "compute at most "
-            f"{MAX_NUMBERS:,}"
+            f"compute at most {MAX_NUMBERS:,}"
         )
 
 
 def _branch(node: Node, condition: Any, values: Values) -> tuple[Any, ...]:
     """Compute the branch of an `If` whose condition is a constant."""
-    if not isinstance(condition, np.ndarray | np.generic):
-        raise PolicyError(
-            f"{node} branches on a value of the observation, which is not supported: export the "
-            "model with torch.where instead"
-        )
+    node.refuse(
+        not known(condition),
+        "branches on a value of the observation, which is not supported: export the model with "
+        "torch.where instead",
+    )
     inner, outputs = node.attributes["then_branch" if np.all(condition) else "else_branch"]
     within = dict(values)
     run(inner, within)
@@ -201,13 +187,8 @@ def _branch(node: Node, condition: Any, values: Values) -> tuple[Any, ...]:
 
 
 def read_onnx(
-    path: Path | None,
-    data: bytes,
-    what: str,
-    *,
-    output: str | None,
-    memory: Mapping[str, str] | None,
-) -> tuple[Graph, dict[str, Array], PyTree]:
+    path: Path | None, data: bytes, what: str, output: str | None = None, memory: Stated = None
+) -> Read:
     """Read an ONNX model.
 
     **Arguments:**
@@ -219,17 +200,11 @@ def read_onnx(
     **Raises:** `PolicyError` for a damaged model, or one with unsupported operators.
     """
     package = require("onnx", extra="policies")
-    try:
+    with refused(f"{what} is not an ONNX model, or is damaged"):
         model = package.load_from_string(data)
         graph = model.graph
-        opset = max(
-            (o.version for o in model.opset_import if o.domain in ("", "ai.onnx")), default=0
-        )
-    except Exception as error:
-        raise PolicyError(
-            f"{what} is not an ONNX model, or is damaged: {one_line(str(error))}"
-        ) from error
-    others = sorted({o.domain for o in model.opset_import} - {"", "ai.onnx"})
+        opset = max([0, *(o.version for o in model.opset_import if o.domain in _DOMAINS)])
+    others = sorted({o.domain for o in model.opset_import} - {*_DOMAINS})
     if graph.output and others and not opset:
         raise PolicyError(
             f"{what} uses only operators of {', '.join(others)}, such as those of trees, which are "
@@ -237,7 +212,8 @@ def read_onnx(
         )
     if not graph.output or not opset:
         raise PolicyError(f"{what} is not an ONNX model: it has no outputs, or names no operators")
-    arrays = {t.name: _tensor(t, path, what) for t in graph.initializer}
+    reader = _Reader(package, path, what, opset)
+    arrays = reader.tensors(graph)
     fed = [i for i in graph.input if i.name not in arrays]
     first, last = OPSETS
     if not first <= opset <= last:
@@ -252,45 +228,36 @@ def read_onnx(
         # Sizes may be declared wrongly, which does no harm.
         if re.search("(unsupported|inconsistent) type|input size", str(error)):
             wrong = one_line(str(error))
-    nodes = _nodes(graph, opset, {*arrays, *(i.name for i in fed)}, path, what)
+    nodes = reader.nodes(graph, {*arrays, *(i.name for i in fed)}, {})
     types = {i.name: i.type.tensor_type.elem_type for i in fed}
     wrong = wrong or next((f"type {t} of {n!r}" for n, t in types.items() if t not in TYPES), "")
     if wrong:
         raise PolicyError(f"{what} has types that ONNX or this reader does not allow: {wrong}")
     weights, constants = _sorted_out(arrays)
-    for each in fed:
-        if math.prod(_shape(each)) > MAX_NUMBERS:
-            raise PolicyError(f"{what} takes an input {each.name!r} of shape {list(_shape(each))}")
-    made = [o.name for o in graph.output]
-    shapes = ({i.name: _shape(i) for i in fed}, {o.name: _shape(o) for o in graph.output})
-    feeds = memory_of(nodes, *shapes, memory, output, what)
-    left = [i for i in fed if i.name not in feeds]
-    remembered = [i for i in fed if i.name in feeds]
-    if not left:
+    shapes, made = ({v.name: _shape(v) for v in values} for values in (fed, graph.output))
+    for name, shape in shapes.items():
+        if math.prod(shape) > MAX_NUMBERS:
+            raise PolicyError(f"{what} takes an input {name!r} of shape {list(shape)}")
+    feeds = memory_of(nodes, (shapes, made), memory, output, what)
+    inputs = {name: shape for name, shape in shapes.items() if name not in feeds}
+    if not inputs:
         raise PolicyError(f"{what} has no input for an observation")
-    inputs = {i.name: _shape(i) for i in left}
-    chosen = _output([n for n in made if n not in feeds.values()], output, made, what)
-    start = tuple(cast(jnp.zeros(_shape(i)), TYPES[types[i.name]]) for i in remembered) or None
-    ordered = tuple((i.name, feeds[i.name]) for i in remembered)
+    chosen = _output([n for n in made if n not in feeds.values()], output, list(made), what)
+    start = tuple(cast(jnp.zeros(shapes[name]), TYPES[types[name]]) for name in feeds) or None
     types = {name: types[name] for name in inputs if TYPES[types[name]] is not float}
-    return Graph(nodes, constants, inputs, ordered, chosen, types), weights, start
+    return Graph(nodes, constants, inputs, tuple(feeds.items()), chosen, types), weights, start
 
 
 def _sorted_out(arrays: Mapping[str, np.ndarray]) -> tuple[dict[str, Array], dict[str, np.ndarray]]:
     """Return the weights among arrays, which are real numbers, and the others."""
-    real = {n: a for n, a in arrays.items() if a.dtype.kind not in "iub" and a.size}
-    weights = {n: jnp.asarray(a) for n, a in real.items()}
+    real = [n for n, a in arrays.items() if a.dtype.kind not in "iub" and a.size]
+    weights = {n: jnp.asarray(arrays[n]) for n in real}
     return weights, {n: a for n, a in arrays.items() if n not in weights}
 
 
-def read_graph(
-    data: Mapping[str, Any], arrays: Mapping[str, np.ndarray], what: str
-) -> tuple[Graph, dict[str, Array], PyTree]:
-    """Return the result of `read_onnx`, from `Graph.to_json` and all arrays by name.
-
-    **Raises:** `PolicyError` for data that do not describe a graph.
-    """
-    try:
+def read_graph(data: Mapping[str, Any], arrays: Mapping[str, np.ndarray], what: str) -> Read:
+    """Return the result of `read_onnx`, from `Graph.to_json`, which is checked, and all arrays."""
+    with refused(f"{what} is damaged: its graph is not valid", repr):
         nodes = tuple(
             Node(operator, outputs[0], tuple(inputs), tuple(outputs), {
                 name: tuple(v) if isinstance(v, list) else v for name, v in attributes.items()
@@ -301,22 +268,17 @@ def read_graph(
         memory = tuple((str(one), str(after)) for one, after in data["memory"])
         start = tuple(jnp.asarray(arrays[one]) for one, _ in memory) or None
         output = str(data["output"])
-    except Exception as error:
-        raise PolicyError(f"{what} is damaged: its graph is not valid ({error!r})") from error
-    rest = {n: a for n, a in arrays.items() if n not in dict(memory)}
     for name, array in arrays.items():
         if array.dtype.kind not in "fiub" or np.any(np.isnan(array)):
             raise PolicyError(f"the array {name!r} of {what} holds NaN, or no numbers")
     check_nodes(nodes, {*arrays, *inputs}, [output, *(after for _, after in memory)], what)
+    rest = {n: a for n, a in arrays.items() if n not in dict(memory)}
     weights, constants = _sorted_out(rest)
     return Graph(nodes, constants, inputs, memory, output), weights, start
 
 
 def check_nodes(nodes: Sequence[Node], known: set[str], outputs: Sequence[str], what: str) -> None:
-    """Check that operators exist, and that inputs of nodes and outputs are computed earlier.
-
-    **Raises:** `PolicyError` that names the node.
-    """
+    """Check that operators exist, and that inputs of nodes and outputs are computed earlier."""
     known = set(known)
     missing = sorted({n.operator for n in nodes} - {*OPERATORS, "If"})
     if missing:
@@ -337,120 +299,104 @@ def check_nodes(nodes: Sequence[Node], known: set[str], outputs: Sequence[str], 
             raise PolicyError(f"{what} is damaged: no node computes its output {name!r}")
 
 
-def _nodes(
-    graph: Any,
-    opset: int,
-    known: set[str],
-    path: Path | None,
-    what: str,
-    types: Mapping[str, int] | None = None,
-) -> tuple[Node, ...]:
-    """Return the nodes of a graph, checked."""
-    found, inner, types = [], set(known), {**(types or {})}
-    for each in (*graph.input, *graph.value_info, *graph.output):
-        types[each.name] = each.type.tensor_type.elem_type
-    types |= {each.name: each.data_type for each in graph.initializer}
-    for node in graph.node:
-        if node.domain not in ("", "ai.onnx"):
-            raise PolicyError(
-                f"{what} uses {node.op_type} of {node.domain}, which is not ONNX's own"
+@dataclass(frozen=True)
+class _Reader:
+    """What reads the nodes and tensors of the file `what` at `path`, if it is one."""
+
+    package: Any
+    path: Path | None
+    what: str
+    opset: int
+
+    def nodes(self, graph: Any, known: set[str], types: Mapping[str, int]) -> tuple[Node, ...]:
+        """Return the nodes of a graph, checked."""
+        found, inner, types = [], set(known), dict(types)
+        for each in (*graph.input, *graph.value_info, *graph.output):
+            types[each.name] = each.type.tensor_type.elem_type
+        types |= {each.name: each.data_type for each in graph.initializer}
+        for node in graph.node:
+            if node.domain not in _DOMAINS:
+                raise PolicyError(
+                    f"{self.what} uses {node.op_type} of {node.domain}, which is not ONNX's own"
+                )
+            attributes = {a.name: self._attribute(a, inner, types) for a in node.attribute}
+            name = node.name or (node.output[0] if node.output else "")
+            wide = any(types.get(output) in (7, 13) for output in node.output[:1])
+            ports = tuple(node.input), tuple(node.output)
+            found.append(Node(node.op_type, name, *ports, attributes, self.opset, wide))
+            inner.update(node.output)
+        check_nodes(found, known, [o.name for o in graph.output], self.what)
+        for node in found:
+            version = f"in operator set {self.opset}"
+            try:
+                page = self.package.defs.get_schema(node.operator, self.opset, "").attributes
+            except self.package.defs.SchemaError:
+                raise PolicyError(f"{node} of {self.what} is not {version}") from None
+            more = [name for name in node.attributes if name not in page]
+            node.refuse(more, f"of {self.what} has {more}, no attributes {version}")
+        return tuple(found)
+
+    def _attribute(self, attribute: Any, known: set[str], types: Mapping[str, int]) -> Any:
+        kinds = self.package.AttributeProto
+        if attribute.type == kinds.TENSOR:
+            return self._tensor(attribute.t)
+        if attribute.type == kinds.GRAPH:
+            inner, arrays = attribute.g, self.tensors(attribute.g)
+            nodes = self.nodes(inner, known | {*arrays}, types)
+            constants = (
+                Node("Constant", name, (), (name,), {"value": array}, self.opset)
+                for name, array in arrays.items()
             )
-        attributes = {
-            a.name: _attribute(a, opset, inner, path, what, types) for a in node.attribute
-        }
-        name = node.name or (node.output[0] if node.output else "")
-        wide = any(types.get(output) in (7, 13) for output in node.output[:1])
-        inputs, outputs = tuple(node.input), tuple(node.output)
-        found.append(Node(node.op_type, name, inputs, outputs, attributes, opset, wide))
-        inner.update(node.output)
-    check_nodes(found, known, [o.name for o in graph.output], what)
-    package = require("onnx", extra="policies")
-    for node in found:
-        try:
-            page = package.defs.get_schema(node.operator, node.opset, "").attributes
-        except package.defs.SchemaError:
-            raise PolicyError(f"{node} of {what} is not in operator set {opset}") from None
-        more = [name for name in node.attributes if name not in page]
-        node.refuse(more, f"of {what} has {more}, no attributes in operator set {opset}")
-    return tuple(found)
+            return (*constants, *nodes), tuple(o.name for o in inner.output)
+        value = self.package.helper.get_attribute_value(attribute)
+        if isinstance(value, list | tuple):
+            return tuple(map(_decoded, value))
+        if not isinstance(value, bytes | float | int):
+            raise PolicyError(f"the attribute {attribute.name!r} in {self.what} is not supported")
+        return _decoded(value)
+
+    def tensors(self, graph: Any) -> dict[str, np.ndarray]:
+        """Return the tensors of a graph by name."""
+        return {t.name: self._tensor(t) for t in graph.initializer}
+
+    def _tensor(self, tensor: Any) -> np.ndarray:
+        with refused(f"the tensor {tensor.name!r} of {self.what}"):
+            if tensor.data_location == self.package.TensorProto.EXTERNAL:
+                array = self._external(tensor)
+            else:
+                array = self.package.numpy_helper.to_array(tensor)
+            if array.dtype.kind not in "fiub" and "float" not in array.dtype.name:
+                raise ValueError(f"it holds {array.dtype}")
+        if array.dtype.kind not in "iub":
+            if array.dtype not in (np.float16, jnp.bfloat16):
+                array = np.asarray(array, np.float32)
+            if np.any(np.isnan(array)):
+                raise PolicyError(f"the tensor {tensor.name!r} of {self.what} holds NaN")
+        return array
+
+    def _external(self, tensor: Any) -> np.ndarray:
+        """Read a tensor that is stored in a file of the model's own folder."""
+        said = {entry.key: entry.value for entry in tensor.external_data}
+        name = said.get("location", "")
+        if self.path is None or not name or Path(name).name != name:
+            raise ValueError(f"it is kept in {name!r}, which is not a file next to the model")
+        dtype = self.package.helper.tensor_dtype_to_np_dtype(tensor.data_type)
+        count = int(np.prod(tensor.dims, dtype=object)) * dtype.itemsize
+        offset, length = int(said.get("offset", 0)), int(said.get("length", count))
+        file = self.path.parent / name
+        if length != count or min(offset, count) < 0 or count > MAX_BYTES:
+            raise ValueError(f"it says {length} bytes for shape {list(tensor.dims)}")
+        if file.resolve().parent != self.path.resolve().parent:
+            raise ValueError(f"{name} is a link to another folder")
+        if offset + count > file.stat().st_size:
+            raise ValueError(f"{name} is smaller than the model says")
+        with file.open("rb") as opened:
+            opened.seek(offset)
+            return np.frombuffer(opened.read(count), dtype).reshape(tuple(tensor.dims))
 
 
-def _attribute(
-    attribute: Any,
-    opset: int,
-    known: set[str],
-    path: Path | None,
-    what: str,
-    types: Mapping[str, int],
-) -> Any:
-    package = require("onnx", extra="policies")
-    kinds = package.AttributeProto
-    if attribute.type == kinds.TENSOR:
-        return _tensor(attribute.t, path, what)
-    if attribute.type == kinds.GRAPH:
-        inner = attribute.g
-        arrays = {t.name: _tensor(t, path, what) for t in inner.initializer}
-        nodes = _nodes(inner, opset, known | {*arrays}, path, what, types)
-        constants = tuple(
-            Node("Constant", name, (), (name,), {"value": array}, opset)
-            for name, array in arrays.items()
-        )
-        return (*constants, *nodes), tuple(o.name for o in inner.output)
-    value = package.helper.get_attribute_value(attribute)
-    if isinstance(value, bytes):
-        return value.decode("utf-8", "replace")
-    if isinstance(value, float | int):
-        return value
-    if not isinstance(value, list | tuple):
-        raise PolicyError(f"the attribute {attribute.name!r} in {what} is not supported")
-    return tuple(v.decode("utf-8", "replace") if isinstance(v, bytes) else v for v in value)
-
-
-def _tensor(tensor: Any, path: Path | None, what: str) -> np.ndarray:
-    """Return a tensor of the model, which may be stored in a file next to it."""
-    package = require("onnx", extra="policies")
-    try:
-        if tensor.data_location == package.TensorProto.EXTERNAL:
-            array = _external(tensor, path)
-        else:
-            array = package.numpy_helper.to_array(tensor)
-        if array.dtype.kind not in "fiub" and "float" not in array.dtype.name:
-            raise ValueError(f"it holds {array.dtype}")
-    except Exception as error:
-        raise PolicyError(
-            f"the tensor {tensor.name!r} of {what}: {one_line(str(error))}"
-        ) from error
-    if array.dtype.kind not in "iub":
-        if array.dtype not in (np.float16, jnp.bfloat16):
-            array = np.asarray(array, np.float32)
-        if np.any(np.isnan(array)):
-            raise PolicyError(f"the tensor {tensor.name!r} of {what} holds NaN")
-    return array
-
-
-def _external(tensor: Any, path: Path | None) -> np.ndarray:
-    """Read a tensor that is stored in a file of the model's own folder.
-
-    **Raises:** `ValueError` for a file elsewhere, or one that is too small.
-    """
-    package = require("onnx", extra="policies")
-    said = {entry.key: entry.value for entry in tensor.external_data}
-    name = said.get("location", "")
-    if path is None or not name or Path(name).name != name:
-        raise ValueError(f"it is kept in {name!r}, which is not a file next to the model")
-    dtype = package.helper.tensor_dtype_to_np_dtype(tensor.data_type)
-    count = int(np.prod(tensor.dims, dtype=object)) * dtype.itemsize
-    offset, length = int(said.get("offset", 0)), int(said.get("length", count))
-    file = path.parent / name
-    if length != count or min(offset, count) < 0 or count > MAX_BYTES:
-        raise ValueError(f"it says {length} bytes for shape {list(tensor.dims)}")
-    if file.resolve().parent != path.resolve().parent:
-        raise ValueError(f"{name} is a link to another folder")
-    if offset + count > file.stat().st_size:
-        raise ValueError(f"{name} is smaller than the model says")
-    with file.open("rb") as opened:
-        opened.seek(offset)
-        return np.frombuffer(opened.read(count), dtype).reshape(tuple(tensor.dims))
+def _decoded(value: Any) -> Any:
+    return value.decode("utf-8", "replace") if isinstance(value, bytes) else value
 
 
 def _shape(value: Any) -> tuple[int, ...]:

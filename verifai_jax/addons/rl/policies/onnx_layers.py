@@ -78,14 +78,9 @@ def conv(node: Node, x: Value, kernel: Value, bias: Value | None = None) -> Valu
     """Return a convolution."""
     strides, dilations, around = _window(node, x, kernel.shape[2:])
     real = jnp.promote_types(x.dtype, kernel.dtype)
-    made = jax.lax.conv_general_dilated(
-        jnp.asarray(x, real),
-        jnp.asarray(kernel, real),
-        strides,
-        around,
-        rhs_dilation=dilations,
-        feature_group_count=node.get("group", 1),
-    )
+    image, kernel = jnp.asarray(x, real), jnp.asarray(kernel, real)
+    more = {"rhs_dilation": dilations, "feature_group_count": node.get("group", 1)}
+    made = jax.lax.conv_general_dilated(image, kernel, strides, around, **more)
     return made if bias is None else made + _across(made, bias)
 
 
@@ -121,18 +116,9 @@ def pool(node: Node, x: Value) -> Value:
 _FUNCTIONS = {"Sigmoid": jax.nn.sigmoid, "Tanh": jnp.tanh, "Relu": jax.nn.relu}
 
 
-def recurrent(
-    node: Node,
-    x: Array,
-    w: Array,
-    r: Array,
-    b: Array | None = None,
-    lengths: Array | None = None,
-    h: Array | None = None,
-    c: Array | None = None,
-    peepholes: Array | None = None,
-) -> tuple[Array, ...]:
+def recurrent(node: Node, x: Array, w: Array, r: Array, *more: Array | None) -> tuple[Array, ...]:
     """Return the outputs `[time, directions, batch, hidden]`, and the last state."""
+    b, lengths, h, c, peepholes = (*more, *[None] * 5)[:5]
     gates, usual, step = _STEPS[node.operator]
     odd = peepholes is not None or node.get("input_forget", 0)
     node.refuse(odd, "has peepholes or coupled gates, which are not supported")
@@ -148,14 +134,12 @@ def recurrent(
     for i in range(count):
         biases = jnp.zeros(2 * gates * hidden) if b is None else b[i]
         input_bias, bias = jnp.split(biases, 2)
-        first = tuple(
-            jnp.zeros((x.shape[1], hidden), x.dtype) if s is None else jnp.asarray(s[i], x.dtype)
-            for s in start
-        )
+        none = jnp.zeros((x.shape[1], hidden), x.dtype)
+        first = tuple(none if s is None else jnp.asarray(s[i], x.dtype) for s in start)
         f = [_FUNCTIONS[name] for name in names[i * len(usual) : (i + 1) * len(usual)]]
 
         def one(carry: Any, at: Any, i: int = i, f: Any = f, bias: Array = bias) -> Any:
-            after = step(node, f, at[0], carry, r[i], bias, hidden)
+            after = step(node, f, at[0], carry, r[i], bias)
             if lengths is None:
                 return after, after[0]
             # After its end a sequence keeps its state and its output is zero.
@@ -176,20 +160,17 @@ def recurrent(
     return (jnp.stack(series, axis=1), *last)
 
 
-def _lstm_step(
-    node: Node, f: Any, at: Array, carry: Any, r: Array, bias: Array, hidden: int
-) -> tuple[Array, Array]:
+def _lstm_step(node: Node, f: Any, at: Array, carry: Any, r: Array, bias: Array) -> Any:
     h, c = carry
     i, o, forget, new = jnp.split(at + h @ r.T + bias, 4, axis=-1)
     c = f[0](forget) * c + f[0](i) * f[1](new)
     return f[0](o) * f[2](c), c
 
 
-def _gru_step(
-    node: Node, f: Any, at: Array, carry: Any, r: Array, bias: Array, hidden: int
-) -> tuple[Array]:
+def _gru_step(node: Node, f: Any, at: Array, carry: Any, r: Array, bias: Array) -> Any:
     (h,) = carry
-    both, rest = 2 * hidden, r[2 * hidden :]
+    both = 2 * h.shape[-1]
+    rest = r[both:]
     z, reset = jnp.split(f[0](at[..., :both] + h @ r[:both].T + bias[:both]), 2, axis=-1)
     if node.get("linear_before_reset", 0):
         new = f[1](at[..., both:] + reset * (h @ rest.T + bias[both:]))
@@ -198,9 +179,7 @@ def _gru_step(
     return ((1 - z) * new + z * h,)
 
 
-def _rnn_step(
-    node: Node, f: Any, at: Array, carry: Any, r: Array, bias: Array, hidden: int
-) -> tuple[Array]:
+def _rnn_step(node: Node, f: Any, at: Array, carry: Any, r: Array, bias: Array) -> Any:
     return (f[0](at + carry[0] @ r.T + bias),)
 
 

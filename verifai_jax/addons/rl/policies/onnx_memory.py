@@ -14,12 +14,14 @@ from verifai_jax.addons.rl.policies.onnx_node import Node
 from verifai_jax.core.messages.errors import check_names
 
 Shapes = Mapping[str, tuple[int, ...]]
+Stated = Mapping[str, str] | None
+"""The memory that a user states, `{input: output}`; None to find it."""
 _STATES = {"LSTM": ((5, 1), (6, 2)), "GRU": ((5, 1),), "RNN": ((5, 1),)}
 """Of each recurrent operator, the ports of its initial and its last states."""
-_PASSES = (
-    *("Cast", "Concat", "Expand", "Flatten", "Gather", "Identity", "Reshape", "Slice", "Split"),
-    *("Squeeze", "Transpose", "Unsqueeze"),
-)
+_PASSES = {
+    "Cast", "Concat", "Expand", "Flatten", "Gather", "Identity", "Reshape", "Slice", "Split",
+    "Squeeze", "Transpose", "Unsqueeze",
+}  # fmt: skip
 """Operators that pass values on without computing with them."""
 _SIDES = re.compile(
     r"\b(ins?|outs?|input|output|next|new|prev|previous|old|last|init|initial|current|after|n|0|1)\b"
@@ -30,21 +32,16 @@ _KNOWN = re.compile(r"action|mu|mean|logit|value|critic|prob|entropy|std|sigma|n
 
 
 def memory_of(
-    nodes: Sequence[Node],
-    inputs: Shapes,
-    outputs: Shapes,
-    stated: Mapping[str, str] | None,
-    action: str | None,
-    what: str,
+    nodes: Sequence[Node], shapes: Sequence[Shapes], stated: Stated, action: str | None, what: str
 ) -> dict[str, str]:
     """Return the memory of a graph, the output with the next value by input.
 
     **Arguments:**
-    - `inputs`, `outputs`: shapes by name, in the order of the graph; () if unknown.
-    - `stated`: the memory that the user states; None to find it.
+    - `shapes`: those of inputs and of outputs by name, in the order of the graph; () if unknown.
     - `action`: the output that the user has chosen as the action; None for none.
     **Raises:** `PolicyError` for a pair of two shapes, and for inputs that may be memory.
     """
+    inputs, outputs = shapes
     pairs = _by_ports(nodes, inputs, outputs, what) if stated is None else dict(stated)
     check_names("input of the network", pairs, inputs)
     check_names("output of the network", pairs.values(), outputs)
@@ -81,10 +78,7 @@ def _plain(name: str) -> str:
 
 
 def _by_ports(nodes: Sequence[Node], inputs: Shapes, outputs: Shapes, what: str) -> dict[str, str]:
-    """Return the pairs that recurrent nodes show: the origin of a state, and where its last goes.
-
-    **Raises:** `PolicyError` for a state of several inputs or outputs.
-    """
+    """Return the pairs that recurrent nodes show: origins of states, and where their last go."""
     made = {name: node for node in nodes for name in node.outputs if name}
     pairs: dict[str, str] = {}
     for node in nodes:

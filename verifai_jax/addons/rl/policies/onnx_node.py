@@ -92,10 +92,7 @@ def like(made: Value, x: Value) -> Any:
 
 
 def fitting(what: object, value: Value) -> Value:
-    """Return values for JAX, which has no whole numbers of 64 bits in its usual precision.
-
-    **Raises:** `PolicyError` for whole numbers that would be changed.
-    """
+    """Return values for JAX without 64 bits; refuse whole numbers that would be changed."""
     kind = jax.dtypes.canonicalize_dtype(value.dtype) if known(value) else None
     if kind in (np.int32, np.uint32) and np.any(changed := value != value.astype(kind)):
         raise PolicyError(
@@ -106,10 +103,7 @@ def fitting(what: object, value: Value) -> Value:
 
 
 def static(node: Node, value: Value) -> tuple[int, ...]:
-    """Return concrete numbers for a shape, axes or indices.
-
-    **Raises:** `PolicyError` if they depend on the observation.
-    """
+    """Return concrete numbers for a shape or indices, which no observation may change."""
     node.refuse(not known(value), "has a shape that depends on the observation")
     return tuple(int(n) for n in np.ravel(value))
 

@@ -13,15 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from verifai_jax.addons.rl.policies.onnx_layers import (
-    IN_TRAINING,
-    channel_normalization,
-    conv,
-    extreme,
-    layer_normalization,
-    pool,
-    recurrent,
-)
+from verifai_jax.addons.rl.policies import onnx_layers as layers
 from verifai_jax.addons.rl.policies.onnx_node import (
     TYPES,
     Node,
@@ -35,6 +27,8 @@ from verifai_jax.addons.rl.policies.onnx_node import (
     whole,
 )
 
+Given = Value | None
+
 
 def _same(name: str) -> Callable[..., Any]:
     """Return an operator that is a function of NumPy of this name."""
@@ -44,11 +38,6 @@ def _same(name: str) -> Callable[..., Any]:
 def _folded(name: str) -> Callable[..., Any]:
     """Return an operator of any number of inputs that is a function of two."""
     return lambda node, *inputs: reduce(getattr(module(*inputs), name), inputs)
-
-
-def _alone(function: Callable[[Value], Value]) -> Callable[..., Any]:
-    """Return an operator that is a function of one array."""
-    return lambda node, x: function(x)
 
 
 def _by_index(name: str) -> Callable[..., Any]:
@@ -92,7 +81,7 @@ def _pow(node: Node, a: Value, b: Value) -> Value:
     return like(xp.where(b < 0, inverse, xp.power(a, xp.maximum(b, 0))), a)
 
 
-def _gemm(node: Node, a: Value, b: Value, c: Value | None = None) -> Value:
+def _gemm(node: Node, a: Value, b: Value, c: Given = None) -> Value:
     a = a.T if node.get("transA", 0) else a
     b = b.T if node.get("transB", 0) else b
     alpha, beta = node.get("alpha", 1.0), node.get("beta", 1.0)
@@ -116,14 +105,12 @@ def _softmax(function: Callable[..., Any]) -> Callable[..., Any]:
     return operator
 
 
-def _clip(node: Node, x: Value, low: Value | None = None, high: Value | None = None) -> Value:
-    low = node.get("min", None) if low is None else low
-    high = node.get("max", None) if high is None else high
+def _clip(node: Node, x: Value, low: Given = None, high: Given = None) -> Value:
+    # Without an end infinity becomes the greatest number.
+    ends: Any = jnp.finfo(x.dtype) if jnp.issubdtype(x.dtype, jnp.floating) else None
+    low = node.get("min", ends and ends.min) if low is None else low
+    high = node.get("max", ends and ends.max) if high is None else high
     xp = module(x)
-    if jnp.issubdtype(x.dtype, jnp.floating):
-        # Without an end infinity becomes the greatest number.
-        ends: Any = jnp.finfo(x.dtype)
-        low, high = (ends.min if low is None else low), (ends.max if high is None else high)
     x = x if low is None else xp.maximum(x, xp.asarray(low, x.dtype))
     return x if high is None else xp.minimum(x, xp.asarray(high, x.dtype))
 
@@ -145,31 +132,29 @@ def _constant_of_shape(node: Node, shape: Value) -> Any:
     return np.full(static(node, shape), value)
 
 
-def _dropout(node: Node, x: Value, ratio: Value | None = None, training: object = False) -> Value:
-    node.refuse(training, IN_TRAINING)
+def _dropout(node: Node, x: Value, ratio: Given = None, training: object = False) -> Value:
+    node.refuse(training, layers.IN_TRAINING)
     return x
 
 
 def _flatten(node: Node, x: Value) -> Value:
     axis = node.get("axis", 1)
-    axis = axis + x.ndim if axis < 0 else axis
+    axis += x.ndim * (axis < 0)
     return x.reshape(math.prod(x.shape[:axis]), math.prod(x.shape[axis:]))
 
 
-def _reshape(node: Node, x: Value, shape: Value | None = None) -> Value:
+def _reshape(node: Node, x: Value, shape: Given = None) -> Value:
     sizes = list(node.attributes["shape"] if shape is None else static(node, shape))
     if not node.get("allowzero", 0):
         sizes = [x.shape[i] if n == 0 else n for i, n in enumerate(sizes)]
     return x.reshape(sizes)
 
 
-def _squeeze(node: Node, x: Value, axes: Value | None = None) -> Value:
-    found = static_axes(node, axes)
-    found = tuple(i for i, n in enumerate(x.shape) if n == 1) if found is None else found
-    return module(x).squeeze(x, found)
+def _squeeze(node: Node, x: Value, axes: Given = None) -> Value:
+    return module(x).squeeze(x, static_axes(node, axes))
 
 
-def _split(node: Node, x: Value, sizes: Value | None = None) -> tuple[Value, ...]:
+def _split(node: Node, x: Value, sizes: Given = None) -> tuple[Value, ...]:
     axis = node.get("axis", 0)
     lengths = node.get("split", None) if sizes is None else static(node, sizes)
     if lengths is None:
@@ -180,16 +165,10 @@ def _split(node: Node, x: Value, sizes: Value | None = None) -> tuple[Value, ...
 
 
 def _slice(node: Node, x: Value, *given: Value) -> Value:
-    if given:
-        starts, ends, axes, steps = (
-            None if v is None else static(node, v) for v in (*given, None, None)[:4]
-        )
-    else:
-        starts, ends, axes, steps = (node.get(n, None) for n in ("starts", "ends", "axes", "steps"))
-    assert starts is not None
-    assert ends is not None
-    axes = range(len(starts)) if axes is None else axes
-    steps = [1] * len(starts) if steps is None else steps
+    named = zip(("starts", "ends", "axes", "steps"), given, strict=False)
+    said = {**node.attributes, **{n: static(node, v) for n, v in named if v is not None}}
+    starts, ends = said["starts"], said["ends"]
+    axes, steps = said.get("axes", range(len(starts))), said.get("steps", [1] * len(starts))
     where = [slice(None)] * x.ndim
     for axis, start, end, step in zip(axes, starts, ends, steps, strict=True):
         size, back = x.shape[axis], step < 0
@@ -201,13 +180,7 @@ def _slice(node: Node, x: Value, *given: Value) -> Value:
     return x[tuple(where)]
 
 
-def _pad(
-    node: Node,
-    x: Value,
-    pads: Value | None = None,
-    value: Value | None = None,
-    axes: Value | None = None,
-) -> Value:
+def _pad(node: Node, x: Value, pads: Given = None, value: Given = None, axes: Given = None) -> Any:
     widths = node.attributes["pads"] if pads is None else static(node, pads)
     chosen = range(x.ndim) if axes is None else static(node, axes)
     around, left = [(0, 0)] * x.ndim, [slice(None)] * x.ndim
@@ -225,23 +198,23 @@ def _pad(
 
 
 def _reduce(name: str) -> Callable[..., Any]:
-    def operator(node: Node, x: Value, axes: Value | None = None) -> Value:
+    def operator(node: Node, x: Value, axes: Given = None) -> Value:
         found = static_axes(node, axes)
         if found is None and node.get("noop_with_empty_axes", 0):
             found = ()
         xp, form = module(x), {"axis": found, "keepdims": bool(node.get("keepdims", 1))}
         if name in ("max", "min"):
             # Of no values the maximum is the lowest value of the type.
-            none = {"initial": extreme(x, name)} if x.size == 0 else {}
+            none = {"initial": layers.extreme(x, name)} if x.size == 0 else {}
             return getattr(xp, name)(x, **form, **none)
         if name == "mean" and whole(x):
             total = xp.sum(x, **form, dtype=x.dtype)
             return _divide(node, total, xp.asarray(x.size // max(total.size, 1), x.dtype))
         node.refuse(name == "l2" and whole(x), "has whole numbers, which are not supported")
-        if name in ("l1", "l2"):
-            x = xp.abs(x) if name == "l1" else x * x
-            total = xp.sum(x, **form, dtype=x.dtype)
-            return total if name == "l1" else xp.sqrt(total)
+        if name == "l1":
+            return xp.sum(xp.abs(x), **form, dtype=x.dtype)
+        if name == "l2":
+            return xp.sqrt(xp.sum(x * x, **form, dtype=x.dtype))
         return getattr(xp, name)(x, **form, dtype=x.dtype)
 
     return operator
@@ -249,10 +222,10 @@ def _reduce(name: str) -> Callable[..., Any]:
 
 def _arg(name: str) -> Callable[..., Any]:
     def operator(node: Node, x: Value) -> Value:
-        axis, keep = node.get("axis", 0), bool(node.get("keepdims", 1))
-        if node.get("select_last_index", 0):
-            return x.shape[axis] - 1 - getattr(jnp, name)(jnp.flip(x, axis), axis, keepdims=keep)
-        return getattr(jnp, name)(x, axis=axis, keepdims=keep)
+        axis, last = node.get("axis", 0), node.get("select_last_index", 0)
+        x = jnp.flip(x, axis) if last else x
+        found = getattr(jnp, name)(x, axis, keepdims=bool(node.get("keepdims", 1)))
+        return x.shape[axis] - 1 - found if last else found
 
     return operator
 
@@ -273,14 +246,10 @@ _REDUCTIONS = {
 }  # fmt: skip
 """Operators over axes, by the function of NumPy."""
 _ACTIVATIONS: dict[str, Callable[[Value], Value]] = {
-    "Sigmoid": jax.nn.sigmoid,
-    "Softplus": jax.nn.softplus,
-    "Softsign": jax.nn.soft_sign,
-    "HardSwish": lambda x: x * jnp.clip(x / 6 + 0.5, 0, 1),
-    "Mish": jax.nn.mish,
-    "Erf": jax.scipy.special.erf,
-    "Reciprocal": lambda x: 1 / x,
-}
+    "Sigmoid": jax.nn.sigmoid, "Softplus": jax.nn.softplus, "Softsign": jax.nn.soft_sign,
+    "HardSwish": lambda x: x * jnp.clip(x / 6 + 0.5, 0, 1), "Mish": jax.nn.mish,
+    "Erf": jax.scipy.special.erf, "Reciprocal": lambda x: 1 / x,
+}  # fmt: skip
 """Operators without attributes, as functions of one array."""
 GROWING = {
     **{name: name for name in ("Add", "Sub", "Mul", "Div", "Pow", "Neg", "Abs", "Sum", "MatMul")},
@@ -288,9 +257,7 @@ GROWING = {
     "ReduceMean": "ReduceSum", "Cast": "Identity", "CastLike": "Identity",
 }  # fmt: skip
 """Operators whose results may be larger than their inputs, with those that say how large."""
-_ELEMENTWISE = {*_OF_NUMPY, "Min", "Max", "Sum", "Mean", "Div", "Mod", "PRelu", "Where"} - {
-    "MatMul"
-}
+_ELEMENTWISE = {*_OF_NUMPY, "Min", "Max", "Sum", "Mean", "Div", "Mod", "PRelu", "Where"}
 
 
 def output_size(node: Node, *inputs: Any) -> int:
@@ -333,7 +300,7 @@ def output_size(node: Node, *inputs: Any) -> int:
 OPERATORS: dict[str, Callable[..., Any]] = {
     **{operator: _same(name) for operator, name in _OF_NUMPY.items()},
     **{operator: _reduce(name) for operator, name in _REDUCTIONS.items()},
-    **{operator: _alone(function) for operator, function in _ACTIVATIONS.items()},
+    **{operator: lambda node, x, f=f: f(x) for operator, f in _ACTIVATIONS.items()},
     "Min": _folded("minimum"), "Max": _folded("maximum"), "Sum": _folded("add"),
     "Mean": lambda node, *inputs: sum(inputs) / len(inputs),
     "Div": _divide, "Gemm": _gemm, "Mod": _mod, "Pow": _pow,
@@ -376,11 +343,11 @@ OPERATORS: dict[str, Callable[..., Any]] = {
     "Size": lambda node, x: np.array(math.prod(x.shape), np.int64),
     "Where": lambda node, *inputs: module(*inputs).where(*inputs),
     "ArgMax": _arg("argmax"), "ArgMin": _arg("argmin"),
-    "LayerNormalization": layer_normalization, "RMSNormalization": layer_normalization,
-    "BatchNormalization": channel_normalization, "InstanceNormalization": channel_normalization,
-    "Conv": conv, "MaxPool": pool, "AveragePool": pool,
+    **dict.fromkeys(("LayerNormalization", "RMSNormalization"), layers.layer_normalization),
+    **dict.fromkeys(("BatchNormalization", "InstanceNormalization"), layers.channel_normalization),
+    "Conv": layers.conv, "MaxPool": layers.pool, "AveragePool": layers.pool,
     "GlobalAveragePool": lambda node, x: x.mean(tuple(range(2, x.ndim)), keepdims=True),
     "GlobalMaxPool": lambda node, x: x.max(tuple(range(2, x.ndim)), keepdims=True),
-    "LSTM": recurrent, "GRU": recurrent, "RNN": recurrent,
+    **dict.fromkeys(("LSTM", "GRU", "RNN"), layers.recurrent),
 }  # fmt: skip
 """The operators that policies use, by name."""

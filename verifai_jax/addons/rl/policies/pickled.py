@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from verifai_jax.addons.rl.policies.errors import PolicyError
+from verifai_jax.addons.rl.policies.errors import PolicyError, refused
 
 
 @dataclass(frozen=True)
@@ -28,13 +28,7 @@ class Name:
 
 @dataclass(eq=False)
 class Record:
-    """A record of an object that a pickle would make by a call.
-
-    - `function`: the function that would be called.
-    - `arguments`: the arguments of the call.
-    - `state`: the state that would be set on the object afterwards, or None.
-    - `items`: the items that would be added to it, for example to a dictionary.
-    """
+    """An object that a pickle would make by a call, then give this state, if any, and items."""
 
     function: Any
     arguments: Any
@@ -120,9 +114,7 @@ _OPERATIONS: dict[str, Callable[[_Stack, Any], object]] = {
     "NEWFALSE": lambda s, a: s.append(False),
     "EMPTY_DICT": lambda s, a: s.append({}),
     "EMPTY_TUPLE": lambda s, a: s.append(()),
-    "TUPLE1": lambda s, a: s.append(tuple(s.take(1))),
-    "TUPLE2": lambda s, a: s.append(tuple(s.take(2))),
-    "TUPLE3": lambda s, a: s.append(tuple(s.take(3))),
+    **{f"TUPLE{n}": lambda s, a, n=n: s.append(tuple(s.take(n))) for n in (1, 2, 3)},
     "TUPLE": lambda s, a: s.append(tuple(s.since_mark())),
     "DICT": lambda s, a: s.append(dict(_pairs(s.since_mark()))),
     "APPEND": lambda s, a: s.add(s.take(1)),
@@ -147,7 +139,7 @@ def read_pickle(data: bytes, what: str) -> Any:
     **Raises:** `PolicyError` for bytes that are not a pickle.
     """
     stack = _Stack()
-    try:
+    with refused(f"{what} is damaged: it holds no pickled data"):
         for operation, argument, _ in pickletools.genops(data):
             known = _OPERATIONS.get(operation.name)
             if known is not None:
@@ -157,9 +149,7 @@ def read_pickle(data: bytes, what: str) -> Any:
             else:
                 raise ValueError(f"the operation {operation.name} is not supported")
         (result,) = stack
-    except Exception as error:
-        raise PolicyError(f"{what} is damaged: it holds no pickled data ({error})") from error
-    return result
+        return result
 
 
 def array_of(record: object) -> np.ndarray | None:
@@ -171,22 +161,20 @@ def array_of(record: object) -> np.ndarray | None:
     if not isinstance(record, Record) or not isinstance(record.function, Name):
         return None
     if record.function.name == "scalar" and len(record.arguments) == 2:
-        dtype, data = record.arguments
-        return np.frombuffer(_bytes(data), _dtype(dtype))[0]
+        return _array(record.arguments[1], record.arguments[0])[0]
     if record.function.name == "_frombuffer":
         data, dtype, shape, order = record.arguments
-        return np.frombuffer(_bytes(data), _dtype(dtype)).reshape(shape, order=order)
+        return _array(data, dtype).reshape(shape, order=order)
     if record.function.name != "_reconstruct" or not isinstance(record.state, tuple):
         return None
     _, shape, dtype, fortran, data = record.state
-    array = np.frombuffer(_bytes(data), _dtype(dtype))
-    return array.reshape(shape, order="F" if fortran else "C")
+    return _array(data, dtype).reshape(shape, order="F" if fortran else "C")
 
 
-def _bytes(data: object) -> bytes:
+def _array(data: object, dtype: object) -> np.ndarray:
     if not isinstance(data, bytes | bytearray):
         raise PolicyError("an array of the pickled data has no bytes")
-    return bytes(data)
+    return np.frombuffer(bytes(data), _dtype(dtype))
 
 
 def _dtype(record: object) -> np.dtype[Any]:

@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from verifai_jax.addons.rl.policies.base import Actions, Normaliser, Policy
-from verifai_jax.addons.rl.policies.errors import PolicyError
+from verifai_jax.addons.rl.policies.errors import PolicyError, refused
 from verifai_jax.addons.rl.policies.networks import Mlp, activation_name
 from verifai_jax.addons.rl.policies.pickled import Name, Record, array_of, read_pickle
 from verifai_jax.addons.rl.policies.tensors import Tensors, linear_layers, natural
@@ -35,28 +35,24 @@ _KINDS = (
 """PPO and A2C; SAC, with and without hidden layers; TD3 and DDPG; DQN."""
 _POLICIES = re.compile(r"(ActorCritic|MaskableActorCritic|SAC|TD3|TQC|DQN|)(Mlp|Cnn|)Policy")
 _EXTRACTORS = re.compile("FlattenExtractor|NatureCNN")
+Space = tuple[str, dict[str, Any]]
+"""The kind of a space of Gymnasium, and its attributes."""
 EXPORT = "export it as ONNX, and load that"
 
 
 def read_sb3(data: bytes, what: str) -> Policy:
-    """Return the deterministic policy of a model of Stable-Baselines3.
-
-    It returns the same actions as `model.predict(observation, deterministic=True)`.
-
-    **Raises:** `PolicyError` for a file without a model, or with one of an unsupported form.
-    """
+    """Return a model of Stable-Baselines3, which acts as its `predict(..., deterministic=True)`."""
     archive = open_archive(data, what)
     if "data" not in archive.namelist() or "policy.pth" not in archive.namelist():
         raise PolicyError(
             f"{what} is not a model of Stable-Baselines3: it has no data and policy.pth. Name an "
             "archive of torch.save .pt"
         )
-    try:
+    with refused(f"the settings of {what} are damaged", repr):
         settings = json.loads(read_member(archive, "data", what))
         observed = _space(settings["observation_space"], "observation", what)
         acts = _space(settings["action_space"], "action", what)
-        entry = settings.get("policy_kwargs", {})
-        options = _unpickled(entry, f"policy_kwargs of {what}")
+        options = _unpickled(settings.get("policy_kwargs", {}), f"policy_kwargs of {what}")
         if not isinstance(options, Mapping):
             raise PolicyError(f"policy_kwargs of {what} is damaged")
         options = {str(name): value for name, value in options.items()}
@@ -69,17 +65,10 @@ def read_sb3(data: bytes, what: str) -> Policy:
         loaded = _policy(weights, observed, acts, options, what)
         weights.settle(EXPORT, logging.INFO)
         return loaded
-    except PolicyError:
-        raise
-    except Exception as error:
-        raise PolicyError(f"the settings of {what} are damaged: {error!r}") from error
 
 
 def read_normaliser(data: bytes, what: str) -> Normaliser:
-    """Return the normalisation of observations from a file of `VecNormalize.save`.
-
-    **Raises:** `PolicyError` for another file, and for dictionary observations.
-    """
+    """Return the normalisation of observations, not by name, of `VecNormalize.save`."""
     record = read_pickle(data, what)
     state = record.state if isinstance(record, Record) else None
     if isinstance(state, Mapping) and state.get("norm_obs") is False:
@@ -110,10 +99,8 @@ def _check_class(given: object, known: re.Pattern[str], role: str, what: str) ->
 
 def _number(value: object, name: str, what: str) -> float:
     value = value if (array := array_of(value)) is None else array
-    try:
+    with refused(f"{what} is damaged: its {name} is not a number"):
         return float(value)  # pyright: ignore[reportArgumentType]
-    except (TypeError, ValueError):
-        raise PolicyError(f"{what} is damaged: its {name} is not a number") from None
 
 
 def _unpickled(entry: Any, what: str) -> Any:
@@ -123,7 +110,7 @@ def _unpickled(entry: Any, what: str) -> Any:
     return entry
 
 
-def _space(entry: Any, role: str, what: str) -> tuple[str, dict[str, Any]]:
+def _space(entry: Any, role: str, what: str) -> Space:
     """Return the kind of a space of Gymnasium, and its attributes, arrays read."""
     record = _unpickled(entry, f"the {role} space of {what}")
     kind = record.function if isinstance(record, Record) else None
@@ -131,38 +118,29 @@ def _space(entry: Any, role: str, what: str) -> tuple[str, dict[str, Any]]:
         kind = record.arguments[0]
     if not isinstance(kind, Name) or not isinstance(record.state, Mapping):
         raise PolicyError(f"the {role} space of {what} is damaged")
-    attributes = {}
-    for name, value in record.state.items():
-        array = array_of(value)
-        attributes[str(name)] = value if array is None else array
-    return kind.name, attributes
+    read = {str(name): (value, array_of(value)) for name, value in record.state.items()}
+    return kind.name, {n: value if array is None else array for n, (value, array) in read.items()}
 
 
 def _policy(
-    weights: Tensors,
-    observed: tuple[str, dict[str, Any]],
-    acts: tuple[str, dict[str, Any]],
-    options: Mapping[str, Any],
-    what: str,
+    weights: Tensors, observed: Space, acts: Space, options: Mapping[str, Any], what: str
 ) -> Policy:
     known = [kind for kind in _KINDS if kind[0] in weights]
     if not known:
         some = ", ".join(sorted(weights)[:3])
-        raise PolicyError(
-            f"{what} holds a network of another form than PPO, A2C, SAC, TD3, DDPG and DQN have "
-            f"({some} ...): {EXPORT}"
-        )
+        form = "a network of another form than PPO, A2C, SAC, TD3, DDPG and DQN have"
+        raise PolicyError(f"{what} holds {form} ({some} ...): {EXPORT}")
     found, hidden, last, features = known[0]
     if "actor.mu.0.weight" in weights and found == "actor.latent_pi.0.weight":
         raise PolicyError(f"{what} is a SAC with use_sde=True: {EXPORT}")
     names = _numbered(weights, hidden) + ([last] if last else [])
     if any(name.startswith("mlp_extractor.shared_net.") for name in weights):
         names = _numbered(weights, "mlp_extractor.shared_net.") + names
-    usual = "tanh" if found == "action_net.weight" else "relu"
-    function = options.get("activation_fn")
+    on_policy, function = found == "action_net.weight", options.get("activation_fn")
+    usual = "tanh" if on_policy else "relu"
     activation = activation_name(function.name if isinstance(function, Name) else usual)
     network, arrays = _network(weights, names, features, observed, activation, options, what)
-    squashed = found != "action_net.weight" or bool(options.get("squash_output", False))
+    squashed = not on_policy or bool(options.get("squash_output", False))
     return Policy(arrays, network, actions=_actions(acts, squashed, what))
 
 
@@ -173,14 +151,9 @@ def _numbered(weights: Tensors, prefix: str) -> list[str]:
 
 
 def _network(
-    weights: Tensors,
-    names: list[str],
-    features: str,
-    observed: tuple[str, dict[str, Any]],
-    activation: str,
-    options: Mapping[str, Any],
-    what: str,
-) -> tuple[Mlp, Any]:
+    weights: Tensors, names: list[str], features: str, observed: Space, activation: str,
+    options: Mapping[str, Any], what: str,
+) -> tuple[Mlp, Any]:  # fmt: skip
     """Return the network's form and its weights."""
     kind, space = observed
     prefixes = [f"{features}{n}features_extractor." for n in ("pi_", "")]
@@ -193,18 +166,15 @@ def _network(
     convolutions = [f"{extractor}cnn.{i}" for i in (0, 2, 4)]
     image = len(space.get("_shape") or ()) == 3 and options.get("normalize_images", True) is True
     if kind != "Box" or not image or not all(f"{n}.weight" in weights for n in convolutions):
-        raise PolicyError(
-            f"{what} reads observations of {kind} with an unsupported features extractor: {EXPORT}"
-        )
-    kernels = tuple(
-        tuple(jnp.asarray(weights[f"{name}.{part}"], np.float32) for part in ("weight", "bias"))
-        for name in convolutions
-    )
+        sees = f"{what} reads observations of {kind}"
+        raise PolicyError(f"{sees} with an unsupported features extractor: {EXPORT}")
+    array = lambda name: jnp.asarray(weights[name], np.float32)  # noqa: E731
+    kernels = tuple((array(f"{name}.weight"), array(f"{name}.bias")) for name in convolutions)
     layers = linear_layers(weights, [f"{extractor}linear.0", *names], what)
     return Mlp(activation, pixels=True), (kernels, layers)
 
 
-def _actions(acts: tuple[str, dict[str, Any]], squashed: bool, what: str) -> Actions:
+def _actions(acts: Space, squashed: bool, what: str) -> Actions:
     """Return the conversion of outputs to an action of the space."""
     kind, space = acts
     if kind == "Discrete":

@@ -7,15 +7,15 @@ tensors.settle("give ...")                          # refuses what nothing has r
 
 import logging
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from itertools import pairwise
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
 
 from verifai_jax.addons.rl.policies.base import Normaliser
 from verifai_jax.addons.rl.policies.errors import PolicyError
+from verifai_jax.addons.rl.policies.networks import Layers
 from verifai_jax.core.messages.errors import unknown_name
 
 log = logging.getLogger("verifai_jax.policies")
@@ -30,16 +30,12 @@ OTHERWISE = "say how observations are normalised by normalise=(mean, scale), (0,
 
 
 class Tensors(dict[str, np.ndarray]):
-    """The tensors of a file in the order of their names, which remember what `[name]` has read.
-
-    - `what`: the file, for errors.
-    """
+    """The tensors of the file `what`, in the order of names; `used` is what `[name]` has read."""
 
     def __init__(self, arrays: Mapping[str, np.ndarray], what: str) -> None:
         # A file need not keep their order.
         super().__init__({name: arrays[name] for name in sorted(arrays, key=natural)})
-        self.what = what
-        self.used: set[str] = set()
+        self.what, self.used = what, set[str]()
 
     def __getitem__(self, name: str) -> np.ndarray:
         self.used.add(name)
@@ -50,10 +46,7 @@ class Tensors(dict[str, np.ndarray]):
         return super().__getitem__(name)
 
     def ignore(self, names: Iterable[str]) -> None:
-        """Count tensors as read; a name stands for all that begin with it.
-
-        **Raises:** `UnknownNameError` for a name that no tensor begins with.
-        """
+        """Count tensors as read, by names or their beginnings, of which each must exist."""
         for name in names:
             found = [n for n in self if f"{n}.".startswith(f"{name.rstrip('.')}.")]
             if not found:
@@ -69,34 +62,27 @@ class Tensors(dict[str, np.ndarray]):
         """
         used = [self.peek(name) for name in self.used]
         # A second name of a tensor that was read is none that is missing.
-        left = [
-            name
-            for name, array in self.items()
-            if name not in self.used
-            and not any(array.size > 1 and np.array_equal(array, one) for one in used)
-        ]
+        again = {
+            n for n, a in self.items() if a.size > 1 and any(np.array_equal(a, u) for u in used)
+        }
+        left = [name for name in self if name not in self.used | again]
         held = {name for names in normalisers(self).values() for name in names.values()}
         needed = [name for name in left if name in held or not ASIDE.search(name)]
         if needed:
-            raise PolicyError(
-                f"{self.what} also holds {listed(needed)}, which nothing uses: {remedy}"
-            )
+            some = listed(needed)
+            raise PolicyError(f"{self.what} also holds {some}, which nothing uses: {remedy}")
         if left:
             log.log(level, "%s also holds %s, which no action depends on", self.what, listed(left))
 
 
-def listed(names: Iterable[str], count: int = 8) -> str:
+def listed(names: Collection[str], count: int = 8) -> str:
     """Write names, the first of many."""
-    every = list(names)
-    more = f" and {len(every) - count} more" if len(every) > count else ""
-    return ", ".join(every[:count]) + more
+    more = f" and {len(names) - count} more" if len(names) > count else ""
+    return ", ".join(list(names)[:count]) + more
 
 
 def normalisers(tensors: Tensors) -> dict[str, dict[str, str]]:
-    """Return the names of means with their variances or deviations, none of a critic or a layer.
-
-    They are by kind, and by the name that they have in common.
-    """
+    """Return unread means with variances or deviations, by common name and kind; no critic's."""
     found: dict[str, dict[str, str]] = {}
     for name in (name for name in tensors if name not in tensors.used):
         parent, _, leaf = name.rpartition(".")
@@ -122,46 +108,37 @@ def normaliser_of(tensors: Tensors, size: int) -> Normaliser | None:
     common, kinds = next(iter(found.items()))
     parent, _, leaf = common.rpartition(".")
     number = {k: np.ravel(np.asarray(tensors.peek(n), float)) for k, n in kinds.items()}
-    variance = number.get("var", number.get("variance", np.zeros(())))
+    mean, variance = number["mean"], number.get("var", number.get("variance", np.zeros(())))
     deviation = number.get("std", np.sqrt(np.maximum(variance, 0)))
-    trainers = {
-        "": (deviation + 0.01, None, "rsl_rl"),
-        "current_count": (deviation + 1e-8, 5.0, "skrl"),
-        "count": (np.sqrt(variance + 1e-5), 5.0, "rl_games"),
-    }
-    signs = [n for n in trainers if n and leaf == "running_*" and f"{parent}.{n}" in tensors]
-    signs += [""] if leaf == "_*" else []
-    scale, clip, trainer = trainers[signs[0]] if signs else (None, None, "")
-    if scale is None or len(found) > 1:
+    if leaf == "_*":
+        scale, clip, trainer = deviation + 0.01, None, "rsl_rl"
+    elif leaf == "running_*" and f"{parent}.current_count" in tensors:
+        scale, clip, trainer = deviation + 1e-8, 5.0, "skrl"
+    elif leaf == "running_*" and f"{parent}.count" in tensors:
+        scale, clip, trainer = np.sqrt(variance + 1e-5), 5.0, "rl_games"
+    else:
+        scale, clip, trainer = mean, None, ""
+    if not trainer or len(found) > 1:
         form = "several normalisers" if len(found) > 1 else "a normaliser of an unknown form"
         raise PolicyError(f"{tensors.what} holds {form}, {names}: {OTHERWISE}")
-    mean = number["mean"]
     if mean.shape != (size,) or scale.shape != (size,):
-        raise PolicyError(
-            f"{tensors.what} holds {names} for {mean.size} numbers, and the network takes {size}: "
-            f"{OTHERWISE}"
-        )
+        holds = f"{tensors.what} holds {names} for {mean.size} numbers"
+        raise PolicyError(f"{holds}, and the network takes {size}: {OTHERWISE}")
     if not (np.all(np.isfinite([mean, scale])) and np.all(scale > 0)):
         raise PolicyError(f"{names} of {tensors.what} are no mean and scale: {OTHERWISE}")
     tensors.used.update(kinds.values())
-    bound = "" if clip is None else f", clipped to {clip:zg}"
-    log.warning(
-        "%s: observations are normalised by %s%s, as by %s", tensors.what, names, bound, trainer
-    )
+    names += "" if clip is None else f", clipped to {clip:zg}"
+    log.warning("%s: observations are normalised by %s, as by %s", tensors.what, names, trainer)
     return Normaliser(jnp.asarray(mean, np.float32), jnp.asarray(scale, np.float32), clip)
 
 
 def layer_names(tensors: Tensors) -> list[str]:
-    """Return the names of the layers of an actor that is an MLP, in the order of computation.
-
-    **Raises:** `PolicyError` if names and shapes do not determine the order.
-    """
+    """Return the layers of an MLP in order, or refuse names and shapes that leave it open."""
     every = [name.removesuffix(".weight") for name in tensors if name.endswith(".weight")]
     actor = [name for name in every if not ASIDE.search(name)] or every
     if not actor:
-        raise PolicyError(
-            f"{tensors.what} has no tensor that ends in .weight, but {listed(tensors)}"
-        )
+        there = listed(tensors)
+        raise PolicyError(f"{tensors.what} has no tensor that ends in .weight, but {there}")
     # One sequence, in whose names one number counts, and at most one layer without a number.
     counted = [name for name in actor if re.search(r"\d", name)]
     others = [name for name in actor if name not in counted]
@@ -174,36 +151,27 @@ def layer_names(tensors: Tensors) -> list[str]:
         if len(others) == 1 and len(orders) == 1:
             return orders[0]
     raise PolicyError(
-        f"the names of {tensors.what} do not determine the order of its layers ({listed(actor)}): "
-        "give the layers of the policy in order with layers="
+        f"the names of {tensors.what} do not determine the order of its layers ({listed(actor)})"
     )
 
 
 def _fit(tensors: Tensors, names: Sequence[str]) -> bool:
     shapes = [tensors.peek(f"{name}.weight").shape for name in names]
-    return all(map((2).__eq__, map(len, shapes))) and all(a[0] == b[1] for a, b in pairwise(shapes))
+    return {*map(len, shapes)} == {2} and all(a[0] == b[1] for a, b in pairwise(shapes))
 
 
-def linear_layers(
-    weights: Tensors, names: Sequence[str], what: str
-) -> tuple[tuple[Array, Array], ...]:
-    """Return the PyTorch layers with these names as `([in, out], [out])`, in this order.
-
-    **Raises:** `PolicyError` for a layer that is missing or does not fit its predecessor.
-    """
+def linear_layers(weights: Tensors, names: Sequence[str], what: str) -> Layers:
+    """Return PyTorch's layers as `([in, out], [out])`, each of which must fit the one before."""
     layers, before = [], None
     for name in names:
         if f"{name}.weight" not in weights:
-            known = [n.removesuffix(".weight") for n in weights if n.endswith(".weight")]
-            raise PolicyError(
-                f"{what} has no tensor {name}.weight; its layers are {listed(known, 20)}"
-            )
+            known = listed([n.removesuffix(".weight") for n in weights if ".weight" in n], 20)
+            raise PolicyError(f"{what} has no tensor {name}.weight; its layers are {known}")
         weight = np.asarray(weights[f"{name}.weight"], np.float32)
         if weight.ndim != 2 or before not in (None, weight.shape[1]):
             raise PolicyError(f"{name}.weight of {what} has shape {list(weight.shape)}")
-        has_bias = f"{name}.bias" in weights
-        bias = weights[f"{name}.bias"] if has_bias else np.zeros(len(weight))
-        bias = np.asarray(bias, np.float32)
+        bias = f"{name}.bias"
+        bias = np.asarray(weights[bias] if bias in weights else [0] * len(weight), np.float32)
         if bias.shape != (len(weight),):
             raise PolicyError(f"{name}.bias of {what} has shape {list(bias.shape)}")
         if not (np.all(np.isfinite(weight)) and np.all(np.isfinite(bias))):

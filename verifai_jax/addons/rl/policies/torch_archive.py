@@ -15,32 +15,21 @@ from typing import Any
 import ml_dtypes
 import numpy as np
 
-from verifai_jax.addons.rl.policies.errors import MAX_BYTES, PolicyError
+from verifai_jax.addons.rl.policies.errors import MAX_BYTES, PolicyError, refused
 from verifai_jax.addons.rl.policies.pickled import Name, Persistent, Record, array_of, read_pickle
 
 _STORAGES: dict[str, Any] = {
-    "FloatStorage": np.float32,
-    "DoubleStorage": np.float64,
-    "HalfStorage": np.float16,
-    "BFloat16Storage": ml_dtypes.bfloat16,
-    "LongStorage": np.int64,
-    "IntStorage": np.int32,
-    "ShortStorage": np.int16,
-    "CharStorage": np.int8,
-    "ByteStorage": np.uint8,
+    "FloatStorage": np.float32, "DoubleStorage": np.float64, "HalfStorage": np.float16,
+    "BFloat16Storage": ml_dtypes.bfloat16, "LongStorage": np.int64, "IntStorage": np.int32,
+    "ShortStorage": np.int16, "CharStorage": np.int8, "ByteStorage": np.uint8,
     "BoolStorage": np.bool_,
-}
+}  # fmt: skip
 
 
 def open_archive(data: bytes, what: str) -> zipfile.ZipFile:
-    """Open an archive.
-
-    **Raises:** `PolicyError` for another file, and for one larger than `MAX_BYTES` when unpacked.
-    """
-    try:
+    """Open an archive; refuse one larger than `MAX_BYTES` when unpacked."""
+    with refused(f"{what} is not an archive, or is damaged"):
         archive = zipfile.ZipFile(io.BytesIO(data))
-    except Exception as error:
-        raise PolicyError(f"{what} is not an archive, or is damaged: {error}") from error
     size = sum(entry.file_size for entry in archive.infolist())
     if size > MAX_BYTES:
         raise PolicyError(
@@ -51,28 +40,17 @@ def open_archive(data: bytes, what: str) -> zipfile.ZipFile:
 
 
 def read_member(archive: zipfile.ZipFile, name: str, what: str) -> bytes:
-    """Return the bytes of a member of an archive.
-
-    **Raises:** `PolicyError` for a member that is missing, damaged, or larger than stated.
-    """
-    try:
-        entry = archive.getinfo(name)
-        with archive.open(entry) as file:
-            data = file.read(entry.file_size + 1)
-    except Exception as error:
-        raise PolicyError(f"{what} has no readable {name}: {error}") from error
-    if len(data) > entry.file_size:
+    """Return the bytes of a member of an archive; refuse one larger than stated."""
+    with refused(f"{what} has no readable {name}"), archive.open(name) as file:
+        size = archive.getinfo(name).file_size
+        data = file.read(size + 1)
+    if len(data) > size:
         raise PolicyError(f"{name} of {what} is larger than the archive says")
     return data
 
 
 def read_state(data: bytes, what: str) -> dict[str, np.ndarray]:
-    """Return the tensors in a file of `torch.save`, by their names.
-
-    Names of nested dictionaries are joined by dots. Values that are not tensors are left out.
-
-    **Raises:** `PolicyError` for a file without tensors, or with damaged ones.
-    """
+    """Return the tensors in a file of `torch.save`; dots join names of nested dictionaries."""
     archive = open_archive(data, what)
     pickles = [n for n in archive.namelist() if n.rpartition("/")[2] == "data.pkl"]
     if len(pickles) != 1:
@@ -103,18 +81,17 @@ def _collect(value: Any, name: str, found: dict[str, np.ndarray], read: Any, dep
 
 def _tensor(value: Any, read: Any, name: str) -> np.ndarray | None:
     """Return the tensor pickled as `_rebuild_tensor_v2(storage, offset, size, stride, ...)`."""
-    if not isinstance(value, Record) or not isinstance(value.function, Name):
-        return None
-    if value.function.name == "_rebuild_parameter":
+    function = value.function if isinstance(value, Record) else None
+    made_by = function.name if isinstance(function, Name) else ""
+    if made_by == "_rebuild_parameter":
         return _tensor(value.arguments[0], read, name)
-    if value.function.name != "_rebuild_tensor_v2":
+    if made_by != "_rebuild_tensor_v2":
         return None
-    try:
+    with refused(f"the tensor {name!r} is damaged"):
         storage, offset, shape, stride = value.arguments[:4]
         assert isinstance(storage, Persistent)
         _, kind, key, _, _ = storage.reference
-        dtype = _STORAGES[kind.name]
-        flat = np.frombuffer(read(key), dtype)
+        flat = np.frombuffer(read(key), _STORAGES[kind.name])
         last = offset + sum((n - 1) * s for n, s in zip(shape, stride, strict=True))
         if min((offset, *shape, *stride)) < 0 or (math.prod(shape) and last >= len(flat)):
             raise ValueError("it reaches beyond its storage")
@@ -122,11 +99,7 @@ def _tensor(value: Any, read: Any, name: str) -> np.ndarray | None:
             raise ValueError("it has more numbers than its storage")
         strides = tuple(s * flat.itemsize for s in stride)
         view = np.lib.stride_tricks.as_strided(flat[offset:], shape, strides, writeable=False)
-    except PolicyError:
-        raise
-    except Exception as error:
-        raise PolicyError(f"the tensor {name!r} is damaged: {error}") from error
-    return widened(np.array(view))
+        return widened(np.array(view))
 
 
 def widened(array: np.ndarray) -> np.ndarray:

@@ -26,6 +26,10 @@ Jaxpr = Any
 """A `jax.core.Jaxpr`, its equations, variables and their forms: JAX does not export the classes."""
 Value: TypeAlias = str | np.ndarray
 """The name of a value that depends on the observation or the weights, or a known array."""
+Traced = tuple[Graph, dict[str, np.ndarray], tuple[np.ndarray, ...]]
+"""A graph, all its arrays by name, and its initial memory."""
+Options = Mapping[str, Any]
+Ints = Sequence[int]
 _SAME = {
     "add": "Add", "sub": "Sub", "mul": "Mul", "div": "Div", "max": "Max", "min": "Min",
     "pow": "Pow", "neg": "Neg", "exp": "Exp", "log": "Log", "tanh": "Tanh", "logistic": "Sigmoid",
@@ -48,19 +52,14 @@ _COMPOSED: dict[str, Callable[..., str]] = {
     "clamp": lambda node, number, low, x, high: node("Min", [node("Max", [x, low]), high]),
 }
 """Operations of JAX that are several operators, by `node` and `number`, which makes constants."""
-_REDUCTIONS = {
-    "reduce_sum": "ReduceSum",
-    "reduce_max": "ReduceMax",
-    "reduce_min": "ReduceMin",
-    "reduce_prod": "ReduceProd",
-}
+_REDUCTIONS = {f"reduce_{kind.lower()}": f"Reduce{kind}" for kind in ("Sum", "Max", "Min", "Prod")}
 _TYPES = {"f": 1, "b": 9, "i": 6, "u": 12}
 """Numbers of the types of ONNX: float, bool, int32, uint32."""
 
 
 def traced(
     function: Callable[..., Any], weights: PyTree, observation: PyTree, memory: PyTree
-) -> tuple[Graph, dict[str, np.ndarray], tuple[np.ndarray, ...]]:
+) -> Traced:
     """Translate a function `(weights, observation, memory) -> (action, memory)` to ONNX.
 
     **Arguments:**
@@ -95,13 +94,8 @@ def traced(
     after = [f"memory.{i}.next" for i in range(len(states))]
     for name, value in zip(["action", *after], outputs, strict=True):
         translation.node("Identity", [value], name)
-    graph = Graph(
-        nodes=tuple(translation.needed(["action", *after])),
-        constants={},
-        inputs=shapes,
-        memory=tuple(zip(first, after, strict=True)),
-        output="action",
-    )
+    nodes = tuple(translation.needed(["action", *after]))
+    graph = Graph(nodes, {}, shapes, tuple(zip(first, after, strict=True)), output="action")
     read = {name for node in graph.nodes for name in node.inputs}
     arrays = {n: a for n, a in translation.arrays.items() if n in read}
     return graph, arrays, tuple(np.asarray(s) for s in states)
@@ -118,10 +112,8 @@ class _Translation:
         if isinstance(value, str):
             return value
         array = np.asarray(value)
-        name = next(
-            (n for n, a in self.arrays.items() if n.startswith("c") and _same(a, array)), ""
-        )
-        name = name or f"c{len(self.arrays)}"
+        known = [n for n, a in self.arrays.items() if n.startswith("c") and _same(a, array)]
+        name = [*known, f"c{len(self.arrays)}"][0]
         self.arrays[name] = array
         return name
 
@@ -174,9 +166,9 @@ class _Translation:
         try:
             return [self.operation(kind, given, options, form, shapes)]
         except NotImplementedError:
+            remedy = "save its weights with its own framework"
             raise PolicyError(
-                f"the policy computes {kind}, which cannot be saved as a graph: save its weights "
-                "with its own framework"
+                f"the policy computes {kind}, which cannot be saved as a graph: {remedy}"
             ) from None
 
     def scan(self, given: list[Value], options: Mapping[str, Any]) -> list[Value]:
@@ -206,29 +198,16 @@ class _Translation:
         return self.node("Reshape", [value, _i(shape)])
 
     def sliced(
-        self,
-        value: Value,
-        starts: Sequence[int],
-        ends: Sequence[int],
-        axes: Sequence[int] | None = None,
-        steps: Sequence[int] = (),
+        self, value: Value, starts: Ints, ends: Ints, axes: Ints | None = None, steps: Ints = ()
     ) -> str:
         axes = range(len(starts)) if axes is None else axes
         last = [_i(steps)] if steps else []
         return self.node("Slice", [value, _i(starts), _i(ends), _i(axes), *last])
 
     def operation(
-        self,
-        kind: str,
-        given: list[Value],
-        options: Mapping[str, Any],
-        form: Jaxpr,
-        shapes: list[Jaxpr],
+        self, kind: str, given: list[Value], options: Options, form: Jaxpr, shapes: list[Jaxpr]
     ) -> str:
-        """Return the output of an operation that is not a call.
-
-        **Raises:** `NotImplementedError` for an operation without a translation.
-        """
+        """Return the output of an operation; `NotImplementedError` for an unknown one."""
         node, x = self.node, given[0]
         real = shapes[0].dtype
         if kind in ("and", "or", "xor", "not") and real.kind != "b":
@@ -289,7 +268,7 @@ class _Translation:
                 return self.pooling(kind, x, options, real)
         raise NotImplementedError
 
-    def gathered(self, given: list[Value], options: Mapping[str, Any], shapes: list[Jaxpr]) -> str:
+    def gathered(self, given: list[Value], options: Options, shapes: list[Jaxpr]) -> str:
         """Return entries of one axis by their indices, which are clipped as JAX does."""
         x, index = given
         numbers, shape, form = options["dimension_numbers"], shapes[0].shape, shapes[1].shape
@@ -335,25 +314,20 @@ class _Translation:
             free.append(rest)
         return self.reshaped(self.node("MatMul", sides), shape)
 
-    def convolution(self, given: list[Value], options: Mapping[str, Any]) -> str:
+    def convolution(self, given: list[Value], options: Options) -> str:
         image, kernel, out = options["dimension_numbers"]
         if any(n != 1 for n in options["lhs_dilation"]):
             raise NotImplementedError
         pads = tuple(p[k] for k in (0, 1) for p in options["padding"])
+        sides = zip(given, (image, kernel), strict=True)
         made = self.node(
-            "Conv",
-            [
-                self.node("Transpose", [v], perm=tuple(spec))
-                for v, spec in zip(given, (image, kernel), strict=True)
-            ],
-            strides=tuple(options["window_strides"]),
-            pads=pads,
-            dilations=tuple(options["rhs_dilation"]),
-            group=options["feature_group_count"],
-        )
+            "Conv", [self.node("Transpose", [v], perm=tuple(spec)) for v, spec in sides],
+            strides=tuple(options["window_strides"]), pads=pads,
+            dilations=tuple(options["rhs_dilation"]), group=options["feature_group_count"],
+        )  # fmt: skip
         return self.node("Transpose", [made], perm=tuple(int(i) for i in np.argsort(out)))
 
-    def pooling(self, kind: str, x: Value, options: Mapping[str, Any], real: np.dtype[Any]) -> str:
+    def pooling(self, kind: str, x: Value, options: Options, real: np.dtype[Any]) -> str:
         """Return the maximum or the sum of each window, over all axes except two."""
         window = options["window_dimensions"]
         still = [i for i, n in enumerate(window) if n == 1][:2]

@@ -197,17 +197,12 @@ def mjx_task(
             )
         control = _over_control_range(compiled) if action is None else _identity
     task = MjxTask(
-        compiled=compiled,
-        action=kind,
-        time_limit=time_limit,
-        substeps=substeps,
-        reward=reward,
+        compiled=compiled, action=kind, time_limit=time_limit, substeps=substeps, reward=reward,
         observe_data=observe or (lambda data: jnp.concatenate([data.qpos, data.qvel])),
         initial=initial or (lambda key, qpos, qvel: (qpos, qvel)),
-        terminate=terminate or (lambda data: False),
-        control=control,
+        terminate=terminate or (lambda data: False), control=control,
         vary=vary or (lambda key, model: {}),
-    )
+    )  # fmt: skip
     _check(task)
     return task
 

@@ -222,13 +222,9 @@ def _with_weights(names: tuple[str, ...]) -> type[OdeTask]:
     """Return a task class with a field for each weight; these fields are its pytree leaves."""
     static = [field.name for field in dataclasses.fields(OdeTask)]
     made = dataclasses.make_dataclass(
-        "OdeTask",
-        [(name, float) for name in names],
-        bases=(OdeTask,),
-        namespace={"weights": names, "__module__": __name__},
-        frozen=True,
-        eq=False,
-    )
+        "OdeTask", [(name, float) for name in names], bases=(OdeTask,),
+        namespace={"weights": names, "__module__": __name__}, frozen=True, eq=False,
+    )  # fmt: skip
     return jax.tree_util.register_dataclass(made, data_fields=list(names), meta_fields=static)
 
 

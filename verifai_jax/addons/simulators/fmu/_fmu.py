@@ -160,11 +160,7 @@ class FMUSimulation:
         return trace
 
     def _simulated(
-        self,
-        instance: Instance,
-        constant: dict[str, object],
-        moving: dict[str, Any],
-        features: Features,
+        self, instance: Instance, constant: dict[str, Any], moving: dict[str, Any], given: Features
     ) -> Trace:
         steps = count_periods(self.duration, self.dt, "duration")
         names = tuple(self.outputs.values())
@@ -182,7 +178,7 @@ class FMUSimulation:
             inputs = at(time) if moving else {}
             if self.controller is not None:
                 seen = dict(zip(self.outputs, rows[step], strict=True))
-                inputs.update(self.controller(time, seen, features))
+                inputs.update(self.controller(time, seen, given))
             if inputs:
                 instance.set(inputs)
             last = step == steps - 1 and self.description.varies_step
@@ -216,8 +212,12 @@ class FMUSimulation:
                     f"a process can only have one instance of {self.file.name}, and this process "
                     "already has one; simulate each system in its own process with workers=1"
                 )
+            folder = Path(tempfile.mkdtemp(prefix="verifai_jax_fmu_"))
+            atexit.register(shutil.rmtree, folder, ignore_errors=True)
+            with zipfile.ZipFile(self.file) as archive:
+                archive.extractall(folder)
             kind = ExchangeInstance if self.description.exchange else Instance
-            _instances[self._key] = kind(self.description, _unpacked(self.file))
+            _instances[self._key] = kind(self.description, folder)
         return _instances[self._key]
 
     @property
@@ -234,15 +234,6 @@ def _extremes(domain: Domain | None, listed: bool = False) -> tuple[Any, ...]:
     if not (is_number(low) and is_number(high)):
         return ()
     return tuple(range(int(low), int(high) + 1)) if listed else (low, high)
-
-
-def _unpacked(file: Path) -> Path:
-    """Unpack an FMU into a folder of this process."""
-    folder = Path(tempfile.mkdtemp(prefix="verifai_jax_fmu_"))
-    atexit.register(shutil.rmtree, folder, ignore_errors=True)
-    with zipfile.ZipFile(file) as archive:
-        archive.extractall(folder)
-    return folder
 
 
 @suggests_options
@@ -291,22 +282,18 @@ def fmu(
     steps = count_periods(duration, dt, "duration")
     description = read_description(file, exchange)
     if description.only_once and not reuse:
-        raise ValueError(
-            f"a process can only have one instance of the FMU {description.file.name}; leave out "
-            "reuse=False"
-        )
+        only = f"a process can only have one instance of the FMU {description.file.name}"
+        raise ValueError(f"{only}; leave out reuse=False")
     _ = description.binary
     if outputs is None:
         there = [v for v in description.variables.values() if v.causality == "output"]
-        named = {_identifier(v.name): v.name for v in there if v.scalar and v.type != "String"}
-    else:
-        named = (
-            dict(outputs) if isinstance(outputs, Mapping) else {_identifier(n): n for n in outputs}
-        )
+        outputs = [v.name for v in there if v.scalar and v.type != "String"]
+    named = dict(outputs if isinstance(outputs, Mapping) else {_identifier(n): n for n in outputs})
     if not named:
+        some = ", ".join(list(description.variables)[:5])
         raise ValueError(
             f"the FMU {description.file.name} has no output; name variables by outputs=..., such "
-            f"as {', '.join(list(description.variables)[:5])}"
+            f"as {some}"
         )
     for name in (*named.values(), *(bind or {}).values()):
         description.variable(name)

@@ -39,11 +39,9 @@ TYPES3 = {
 class Variable:
     """A scalar variable of an FMU.
 
-    - `name`, `reference`, `description`: as in the FMU.
     - `type`: the type in the names of its set and get functions, such as `Real` or `Float64`.
     - `causality`: `parameter`, `input`, `output`, `local` ...
     - `variability`: `constant`, `fixed`, `tunable`, `discrete` or `continuous`.
-    - `unit`: its unit; empty if there is none.
     - `start`: its start value as text; None without one.
     - `low`, `high`: declared range; infinite if it has no end.
     - `scalar`: False for an array.
@@ -104,12 +102,8 @@ class Variable:
 class Description:
     """The description of an FMU, read from its archive.
 
-    - `file`: the FMU.
     - `version`: the version of FMI, 2 or 3.
-    - `name`: the name of the model.
-    - `identifier`: the identifier of the binary.
-    - `token`: the token with which the binary recognises its description.
-    - `variables`: the variables by name.
+    - `identifier`, `token`: those of the binary, by which it recognises its description.
     - `exchange`: whether to simulate it by model exchange instead of co-simulation.
     - `sizes`: numbers of continuous states and event indicators, which FMI 2 declares.
     - `varies_step`: whether a communication step may differ from the others.
@@ -132,10 +126,7 @@ class Description:
     asks_after_steps: bool = True
 
     def variable(self, name: str) -> Variable:
-        """Return a scalar variable.
-
-        **Raises:** `ValueError` for a variable that does not exist, or is an array or a text.
-        """
+        """Return a variable; refuse one that does not exist, or is an array or a text."""
         if name not in self.variables:
             raise missing_name(f"the FMU {self.file.name}", "variable", name, list(self.variables))
         found = self.variables[name]
@@ -146,18 +137,13 @@ class Description:
 
     @property
     def binary(self) -> str:
-        """Path in the archive of the binary for this machine.
-
-        **Raises:** `ValueError` if there is none.
-        """
+        """Path in the archive of the binary for this machine; `ValueError` if there is none."""
         system = {"linux": "linux", "darwin": "darwin", "win32": "win"}.get(sys.platform, "linux")
         ending = {"linux": "so", "darwin": "dylib", "win": "dll"}[system]
-        machine = {"AMD64": "x86_64", "arm64": "aarch64"}.get(
-            platform.machine(), platform.machine()
-        )
+        machine = platform.machine()
+        machine = {"AMD64": "x86_64", "arm64": "aarch64"}.get(machine, machine)
         folder = f"{system}64" if self.version == 2 else f"{machine}-{system}"
-        if self.version == 3 and system == "win":
-            folder = f"{machine}-windows"
+        folder = f"{machine}-windows" if folder.endswith("-win") else folder
         wanted = f"binaries/{folder}/{self.identifier}.{ending}"
         with zipfile.ZipFile(self.file) as archive:
             names = archive.namelist()
@@ -182,25 +168,19 @@ def read_description(file: str | Path, exchange: bool | None = None) -> Descript
     path = Path(file).absolute()
     if not path.exists():
         raise FileNotFoundError(f"there is no FMU {path}")
+    what = f"the modelDescription.xml of {path.name}"
     try:
         with zipfile.ZipFile(path) as archive:
             if archive.getinfo("modelDescription.xml").file_size > MAX_BYTES:
-                raise ValueError(
-                    f"the modelDescription.xml of {path.name} is over {MAX_BYTES} bytes"
-                )
-            root = read_xml(
-                archive.read("modelDescription.xml"), f"the modelDescription.xml of {path.name}"
-            )
+                raise ValueError(f"{what} is over {MAX_BYTES} bytes")
+            root = read_xml(archive.read("modelDescription.xml"), what)
     except (zipfile.BadZipFile, KeyError) as error:
         raise ValueError(
             f"{path.name} is not an FMU: an archive with modelDescription.xml is expected ({error})"
         ) from error
-    version = root.get("fmiVersion", "").split(".")[0]
-    if version not in ("2", "3"):
-        raise ValueError(
-            f"{path.name} is of FMI {root.get('fmiVersion', 'without a version')}; 2 and 3 can be "
-            "simulated"
-        )
+    declared = root.get("fmiVersion", "without a version")
+    if (version := declared.split(".")[0]) not in ("2", "3"):
+        raise ValueError(f"{path.name} is of FMI {declared}; 2 and 3 can be simulated")
     kinds = {False: "CoSimulation", True: "ModelExchange"}
     there = {k: found for k, tag in kinds.items() if (found := root.find(tag)) is not None}
     exchange = next(iter(there), None) if exchange is None else exchange
@@ -235,10 +215,9 @@ def _variables(root: Element, version: int) -> dict[str, Variable]:
     items: dict[str, dict[str, int]] = {}
     for each in root.iterfind("TypeDefinitions/*"):
         inner = each if version == 3 else next(iter(each), each)
-        declared[each.get("name", "")] = dict(inner.attrib)
-        items[each.get("name", "")] = {
-            item.get("name", ""): int(item.get("value", "0")) for item in inner.iterfind("Item")
-        }
+        name, entries = each.get("name", ""), inner.iterfind("Item")
+        declared[name] = dict(inner.attrib)
+        items[name] = {item.get("name", ""): int(item.get("value", "0")) for item in entries}
     found = {}
     for element in root.iterfind("ModelVariables/*"):
         value = element if version == 3 else next(iter(element), element)
@@ -246,16 +225,12 @@ def _variables(root: Element, version: int) -> dict[str, Variable]:
         kind = (TYPES3 if version == 3 else TYPES).get(value.tag)
         if kind is None:  # Clocks and binary data.
             continue
-        name = element.get("name", "")
-        continuous = value.tag in FLOATS
-        start = value.get("start")
-        texts = value.find("Start")
-        if start is None and texts is not None:
-            start = texts.get("value")
+        name, texts = element.get("name", ""), value.find("Start")
+        start = value.get("start", None if texts is None else texts.get("value"))
         found[name] = Variable(
             name, int(element.get("valueReference", "0")), kind,
             element.get("causality", "local"),
-            element.get("variability", "continuous" if continuous else "discrete"),
+            element.get("variability", "continuous" if value.tag in FLOATS else "discrete"),
             attributes.get("unit", ""), start, float(attributes.get("min", "-inf")),
             float(attributes.get("max", "inf")), element.get("description", ""),
             value.find("Dimension") is None, items.get(value.get("declaredType", ""), {}),

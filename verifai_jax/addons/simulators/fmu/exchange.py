@@ -33,13 +33,9 @@ class _EventInfo(Structure):
     """The answer of an FMU of FMI 2 to an event; FMI 3 gives the same numbers one by one."""
 
     _fields_ = (
-        ("again", c_int),
-        ("ended", c_int),
-        ("nominals_changed", c_int),
-        ("states_changed", c_int),
-        ("next_defined", c_int),
-        ("next", c_double),
-    )
+        ("again", c_int), ("ended", c_int), ("nominals_changed", c_int),
+        ("states_changed", c_int), ("next_defined", c_int), ("next", c_double),
+    )  # fmt: skip
 
 
 class ExchangeInstance(Instance):
@@ -87,10 +83,7 @@ class ExchangeInstance(Instance):
             self._settle()
 
     def step(self, time: float, size: float) -> bool:
-        """Integrate up to the next communication time; False if the FMU ended its simulation.
-
-        **Raises:** `FMUError`, also if the integration fails or events do not end.
-        """
+        """Integrate up to the next communication time; False if the FMU ended its simulation."""
         end, events = time + size, 0
         for _ in range(MAX_STEPS):
             if self._time >= end or self._ended:
@@ -102,9 +95,8 @@ class ExchangeInstance(Instance):
             if event or self._asks.value or self._time >= self._next:
                 events += 1
                 if events > MAX_EVENTS:
-                    raise self._stopped(
-                        f"has more than {MAX_EVENTS:,} events in a step of communication"
-                    )
+                    many = f"more than {MAX_EVENTS:,} events in a step of communication"
+                    raise self._stopped(f"has {many}")
                 self._call("EnterEventMode")
                 self._settle()
         raise self._stopped(f"takes more than {MAX_STEPS:,} steps of the integrator")
@@ -201,9 +193,8 @@ class ExchangeInstance(Instance):
         nominals, nominal = _shared(self._size)
         self._call("GetNominalsOfContinuousStates", nominals, c_size_t(self._size))
         tolerances = TOLERANCE * np.where(nominal == 0, 1.0, np.abs(nominal))
-        solver: Any = ode(self._slope).set_integrator(
-            "lsoda", rtol=TOLERANCE, atol=tolerances, max_step=self._longest
-        )
+        limits = {"rtol": TOLERANCE, "atol": tolerances, "max_step": self._longest}
+        solver: Any = ode(self._slope).set_integrator("lsoda", **limits)
         # LSODA can take one step at a time, as SciPy's own class of that name makes it do.
         solver._integrator.supports_step = True
         return solver
@@ -240,10 +231,10 @@ class ExchangeInstance(Instance):
         """Return the numbers of states and of event indicators."""
         if self._two:
             return self.description.sizes
-        found = [c_size_t(), c_size_t()]
-        for kind, number in zip(("ContinuousStates", "EventIndicators"), found, strict=True):
-            self._call(f"GetNumberOf{kind}", byref(number))
-        return found[0].value, found[1].value
+        states, indicators = c_size_t(), c_size_t()
+        self._call("GetNumberOfContinuousStates", byref(states))
+        self._call("GetNumberOfEventIndicators", byref(indicators))
+        return states.value, indicators.value
 
     def _stopped(self, why: str) -> FMUError:
         return FMUError(f"{self.description.file.name} {why} at {self._time:z.6g} s{self._said()}")

@@ -36,12 +36,9 @@ class _Callbacks(ctypes.Structure):
     """The functions that an FMU of FMI 2 is given."""
 
     _fields_ = (
-        ("logger", Logger2),
-        ("allocate", c_void_p),
-        ("free", c_void_p),
-        ("finished", c_void_p),
-        ("environment", c_void_p),
-    )
+        ("logger", Logger2), ("allocate", c_void_p), ("free", c_void_p),
+        ("finished", c_void_p), ("environment", c_void_p),
+    )  # fmt: skip
 
 
 class _Group(NamedTuple):
@@ -58,13 +55,7 @@ class FMUError(RuntimeError):
 
 
 class Instance:
-    """An instance of an FMU; `begin` may be called again after a simulation.
-
-    **Arguments:**
-    - `description`: the description of the FMU.
-    - `folder`: the folder into which the FMU is unpacked.
-    **Raises:** `FMUError` if the binary cannot be loaded or does not make an instance.
-    """
+    """An instance of an FMU unpacked in `folder`; `begin` may be called again afterwards."""
 
     def __init__(self, description: Description, folder: Path) -> None:
         self.description, self.messages = description, []
@@ -116,16 +107,12 @@ class Instance:
         if self._begun:
             self._renew()
         self._begun, self.failed = True, False
-        end = (c_bool(True), c_double(duration))
+        flag = c_int if self._two else c_bool
+        times = flag(0), c_double(0.0), c_double(0.0), flag(1), c_double(duration)
         if self._two:
-            rest = (c_int(0), c_double(0.0), c_double(0.0), c_int(1), c_double(duration))
-            self._call("SetupExperiment", *rest)
-            self.set(values)
-            self._call("EnterInitializationMode")
-        else:
-            self.set(values)
-            start = (c_bool(False), c_double(0.0), c_double(0.0))
-            self._call("EnterInitializationMode", *start, *end)
+            self._call("SetupExperiment", *times)
+        self.set(values)
+        self._call("EnterInitializationMode", *(() if self._two else times))
         self._call("ExitInitializationMode")
 
     def step(self, time: float, size: float) -> bool:
@@ -134,10 +121,7 @@ class Instance:
         return self._do_step() != DISCARD and not self._flags[1]
 
     def set(self, values: Mapping[str, object]) -> None:
-        """Set variables by name.
-
-        **Raises:** the errors of `Variable.number`; `ValueError` for a number beyond its type.
-        """
+        """Set variables by name; refuse numbers beyond their types."""
         given = list(values.values())
         for group in self._grouped(tuple(values)):
             for i, (index, variable) in enumerate(group.variables.items()):
@@ -185,8 +169,7 @@ class Instance:
         """Return variables by type, with memory for their values."""
         if names not in self._groups:
             by_type: dict[str, dict[int, Variable]] = {}
-            for index, name in enumerate(names):
-                variable = self.description.variable(name)
+            for index, variable in enumerate(map(self.description.variable, names)):
                 by_type.setdefault(variable.type, {})[index] = variable
             self._groups[names] = [self._group(kind, those) for kind, those in by_type.items()]
         return self._groups[names]
@@ -200,10 +183,7 @@ class Instance:
         return _Group(variables, buffer, get, set_)
 
     def _call(self, name: str, *arguments: Any) -> int:
-        """Call a function of the instance.
-
-        **Raises:** `FMUError` where it fails.
-        """
+        """Call a function of the instance, once."""
         return self._prepared(name, *arguments)()
 
     def _prepared(self, name: str, *arguments: Any) -> Callable[[], int]:
@@ -217,21 +197,17 @@ class Instance:
                 function = partial(self._function(name, c_int), self._component, *arguments)
             status = function()
             if status > passes:
-                raise FMUError(
-                    f"{self._prefix}{name} of {self.description.file.name} failed with status "
-                    f"{status}{self._said()}"
-                )
+                what = f"{self._prefix}{name} of {self.description.file.name}"
+                raise FMUError(f"{what} failed with status {status}{self._said()}")
             return status
 
         return call
 
     def _function(self, name: str, returns: Any) -> Any:
-        try:
-            function = getattr(self._library, f"{self._prefix}{name}")
-        except AttributeError:
-            raise FMUError(
-                f"the binary of {self.description.file.name} has no {self._prefix}{name}"
-            ) from None
+        function = getattr(self._library, f"{self._prefix}{name}", None)
+        if function is None:
+            file = self.description.file.name
+            raise FMUError(f"the binary of {file} has no {self._prefix}{name}")
         function.restype = returns
         return function
 
