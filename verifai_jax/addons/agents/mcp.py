@@ -304,22 +304,13 @@ def _line(number: object, **answer: object) -> str:
     "--folder", type=click.Path(path_type=Path), default=".", help="Folder of the project."
 )
 @click.option(
-    "--budget",
-    type=click.IntRange(1),
-    default=100_000,
-    help="Maximum simulations in a call.",
+    "--budget", type=click.IntRange(1), default=100_000, help="Maximum simulations in a call."
 )
 @click.option(
-    "--total",
-    type=click.IntRange(1),
-    default=1_000_000,
-    help="Maximum simulations in all.",
+    "--total", type=click.IntRange(1), default=1_000_000, help="Maximum simulations in all."
 )
 @click.option(
-    "--seconds",
-    type=click.FloatRange(1),
-    default=600.0,
-    help="Maximum seconds for a call.",
+    "--seconds", type=click.FloatRange(1), default=600.0, help="Maximum seconds for a call."
 )
 def mcp(folder: Path, budget: int, total: int, seconds: float) -> None:
     """Serve an agent over standard input and output, by the Model Context Protocol.

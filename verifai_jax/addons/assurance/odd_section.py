@@ -4,10 +4,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from verifai_jax.addons.analysis import OddCoverage
-from verifai_jax.addons.reports.markup import (
-    paragraph,
-    table,
-)
+from verifai_jax.addons.reports.markup import paragraph, table
 from verifai_jax.addons.reports.page import Page, Section, before_limits
 from verifai_jax.addons.reports.run_question import NO_REASON
 from verifai_jax.core.messages.text import format_percent

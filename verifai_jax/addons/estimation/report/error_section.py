@@ -5,11 +5,7 @@ from dataclasses import asdict, replace
 
 from verifai_jax.addons.estimation.error_budgets.result import ErrorBudget
 from verifai_jax.addons.reports.claims import Claim
-from verifai_jax.addons.reports.markup import (
-    Child,
-    paragraph,
-    table,
-)
+from verifai_jax.addons.reports.markup import Child, paragraph, table
 from verifai_jax.addons.reports.page import Page, Section, before_limits
 
 ADDED = (
