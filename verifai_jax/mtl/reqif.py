@@ -41,14 +41,11 @@ MAX_BYTES = 2**28
 def read_reqif(path: Path, fields: Sequence[str]) -> list[dict[str, object]]:
     """Read the objects of a ReqIF file, or of all ReqIF files in a `.reqifz` archive.
 
-    **Arguments:**
-    - `fields`: the fields of a requirement; other attributes are left out.
-    **Returns:** a dictionary of texts for each object with at least one of the fields, in the order
-    of the specifications. An attribute without a value has the default of its definition; an object
-    that its tool marks as deleted is left out. An object without an id gets its identifier in the
-    file. Its `links` are its own, and the targets of its relations.
-    **Raises:** `ValueError` for a file that is not ReqIF, declares a document type, or has no
-    requirement.
+    Each object with at least one of the fields becomes a dictionary of these, in the order of the
+    specifications, unless its tool marks it as deleted. An attribute without a value has the
+    default of its definition, an object without an id its identifier in the file. Its `links` are
+    its own, and the targets of its relations.
+    **Raises:** `ValueError` for a file that is not ReqIF, declares a document type, or is empty.
     """
     elements: list[Element] = []
     for name, data in _documents(path):
@@ -181,12 +178,7 @@ def _text(value: Element, choices: Mapping[str, str]) -> str:
 def reqif_document(
     entries: Sequence[Mapping[str, str]], fields: Sequence[str], title: str
 ) -> bytes:
-    """Write entries as a ReqIF document: an object for each, in one specification.
-
-    **Arguments:**
-    - `entries`: texts by field, one dictionary for each object.
-    - `fields`: the possible fields of an object.
-    """
+    """Write texts by field as a ReqIF document: an object for each entry, in one specification."""
     now = datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
 
     def add(parent: Element, tag: str, text: str = "", **given: str) -> Element:

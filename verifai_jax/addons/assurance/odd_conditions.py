@@ -48,10 +48,7 @@ Conversions: TypeAlias = Mapping[tuple[str, str], tuple[float, float]]
 
 
 def convert(value: float, unit: str, to: str, own: Conversions | None = None) -> float:
-    """Convert a number to another unit, preferring the file's `own` conversions.
-
-    **Raises:** `ValueError` for incompatible units.
-    """
+    """Convert a number to another, compatible unit, preferring the file's `own` conversions."""
     one, other = plain_unit(unit), plain_unit(to)
     for (source, target), (scale, offset) in (own or {}).items():
         if source == unit:
@@ -231,17 +228,10 @@ Resolve: TypeAlias = Callable[[str], Attribute | None]
 
 
 def read_group(
-    where: str,
-    section: object,
-    every: bool,
-    resolve: Resolve,
-    modules: Sequence[str],
+    where: str, section: object, every: bool, resolve: Resolve, modules: Sequence[str],
     conversions: Conversions,
-) -> Group:
-    """Read a section of conditions: a mapping from names to expressions.
-
-    **Raises:** `ValueError` for a text that is not a condition, with the position.
-    """
+) -> Group:  # fmt: skip
+    """Read a section of conditions: a mapping from names to expressions."""
     if not isinstance(section, Mapping) or not section:
         raise ValueError(f"{where} maps attributes to expressions; got {section!r}")
     parts: list[Condition] = []

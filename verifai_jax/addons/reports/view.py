@@ -50,13 +50,9 @@ MAX_COMPONENTS = 6
 def view_data(
     run: Run, traces: Mapping[int, Mapping[str, Any]], command: str | None = None
 ) -> dict[str, Any]:
-    """Describe a run's table for `view.js`.
+    """Describe the table of a run with rows for `view.js`, those with `traces` among them.
 
-    **Arguments:**
-    - `run`: a run with at least one row.
-    - `traces`: traces by row number, from `trace_data`; these rows are among those shown.
-    - `command`: the command that simulates a row again, to which its number is appended.
-    **Returns:** plain data; `shown` and `simulations` tell how many rows were left out.
+    The number of a row is appended to `command`, which simulates it again.
     """
     table = run.table.all
     columns = {str(name): table[name].to_numpy() for name in table.columns}
@@ -141,11 +137,7 @@ def _number(value: float) -> float | int | None:
 
 
 def trace_data(replay: Replay, label: str = "") -> dict[str, Any]:
-    """Describe the trace of a replay: the signals of its formulas, their bounds, the instant.
-
-    **Arguments:**
-    - `label`: its name in the list of traces; the row number when left out.
-    """
+    """Describe the trace of a replay: the signals of its formulas, their bounds, the instant."""
     trace, problem = replay.trace, replay.problem
     clock = np.asarray(trace.clock())
     samples = np.unique(np.linspace(0, len(clock) - 1, MAX_SAMPLES).astype(int))
@@ -183,13 +175,9 @@ def trace_data(replay: Replay, label: str = "") -> dict[str, Any]:
 
 
 def rows_to_trace(run: Run, maximum: int, first: Sequence[int] = ()) -> dict[int, str]:
-    """Choose the most important rows, each with a word of explanation.
+    """Choose the most important rows, after the `first`, each with a word of explanation.
 
     These are the worst claimed rows, those nearest to the bound on both sides, and unclaimed ones.
-
-    **Arguments:**
-    - `maximum`: maximum number of rows.
-    - `first`: rows that come first, such as the failures shown in a report.
     """
     chosen = {int(number): f"row {number}: shown above" for number in first[:maximum]}
     table = run.table

@@ -53,12 +53,7 @@ class Bounds(NamedTuple):
 
 
 class Enclosure:
-    """The program of one simulation of a problem, evaluated with sets of features.
-
-    **Arguments:**
-    - `problem`: a checked problem.
-    - `precision`: the precision of simulations, `"float32"` or `"float64"`.
-    """
+    """The program of one simulation of a checked problem, evaluated with sets of features."""
 
     def __init__(self, problem: Problem, precision: str) -> None:
         self.problem, self.precision = problem, precision

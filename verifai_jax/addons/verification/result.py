@@ -316,10 +316,7 @@ class Verification(Drawn, Reported, InNotebook):
         return [picture_html(self.plot()), frame_html(self.table)]
 
     def check_same(self, problem: Problem, precision: str, continuous: bool = False) -> None:
-        """Refuse a problem other than the one that was verified.
-
-        **Raises:** `ValueError` that names the difference.
-        """
+        """Refuse a problem other than the verified one by a `ValueError` on the difference."""
         if continuous != self.continuous:
             raise ValueError(
                 f"this verification is about {self.subject}; verify with continuous={continuous}"
@@ -333,10 +330,7 @@ class Verification(Drawn, Reported, InNotebook):
                 )
 
     def left(self, problem: Problem, precision: str) -> Rest:
-        """Return the part of the feature space where neither all points fail nor none does.
-
-        **Raises:** the errors of `check_same`.
-        """
+        """Return the part of the feature space where neither all points fail nor none does."""
         self.check_same(problem, precision)
         return Rest(self.boxes, (PROVED, BROKEN))
 
@@ -352,10 +346,8 @@ class Verification(Drawn, Reported, InNotebook):
         First come points that fail when simulated, then middles of boxes by increasing lower bound
         of the robustness.
 
-        **Arguments:**
-        - `problem`: the problem returned by `rest`.
-        - `budget`: number of simulations of the search; these rows take at most an eighth of it.
-        **Returns:** the rows; None if everything is proved.
+        They take at most an eighth of the search's budget; None if everything is proved. The
+        problem is the one that `rest` returned.
         """
         boxes = self.boxes[~np.isin(self.boxes.state, (PROVED, OUTSIDE))]
         boxes = boxes[np.lexsort((-boxes.mass, boxes.lowest, ~boxes.has_witness))]
@@ -399,10 +391,7 @@ class Verification(Drawn, Reported, InNotebook):
 
 
 def as_verification(result: "Verification | str | Path") -> Verification:
-    """Return a result; a path is read.
-
-    **Raises:** the errors of `load_verification`.
-    """
+    """Return a result; a path is read by `load_verification`."""
     return load_verification(result) if isinstance(result, str | Path) else result
 
 

@@ -32,10 +32,8 @@ OUTCOMES = (VIOLATED, ERROR, SKIPPED, NOT_RUN, MET)
 
 
 class Result(NamedTuple):
-    """A finding of a test or a run on a requirement.
+    """A finding of a test or a run (`link`), with its `name` or folder, on a requirement.
 
-    - `link`: `"tests"` or `"runs"`.
-    - `name`: its name or folder.
     - `outcome`: one of `OUTCOMES`; `"error"` if simulations, or the test, came to no verdict.
     - `text`: a sentence on the outcome.
     """
