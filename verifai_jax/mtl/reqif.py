@@ -133,9 +133,8 @@ def _named(elements: Iterable[Element], tag: str) -> Iterator[Element]:
 
 
 def _values(within: Iterable[Element]) -> Iterator[Element]:
-    """Yield the values of attributes in elements."""
-    for element in within:
-        yield from (each for each in element.iter() if _tag(each).startswith("ATTRIBUTE-VALUE-"))
+    parts = (each for element in within for each in element.iter())
+    return (each for each in parts if _tag(each).startswith("ATTRIBUTE-VALUE-"))
 
 
 def _field(name: str) -> str:
@@ -193,18 +192,13 @@ def reqif_document(
     root = Element("REQ-IF", xmlns=NAMESPACE)
     header = add(add(root, "THE-HEADER"), "REQ-IF-HEADER", IDENTIFIER="_header")
     add(header, "CREATION-TIME", now)
-    for tag, text in (
-        ("REQ-IF-TOOL-ID", "verifai_jax"),
-        ("REQ-IF-VERSION", "1.0"),
-        ("SOURCE-TOOL-ID", "verifai_jax"),
-        ("TITLE", title),
-    ):
-        add(header, tag, text)
+    for tag in ("REQ-IF-TOOL-ID", "REQ-IF-VERSION", "SOURCE-TOOL-ID"):
+        add(header, tag, "1.0" if tag == "REQ-IF-VERSION" else "verifai_jax")
+    add(header, "TITLE", title)
     content = add(add(root, "CORE-CONTENT"), "REQ-IF-CONTENT")
-    known(
-        add(content, "DATATYPES"), "DATATYPE-DEFINITION-STRING", "_text",
-        LONG_NAME="text", MAX_LENGTH=str(MAX_LENGTH),
-    )  # fmt: skip
+    types = add(content, "DATATYPES")
+    size = str(MAX_LENGTH)
+    known(types, "DATATYPE-DEFINITION-STRING", "_text", LONG_NAME="text", MAX_LENGTH=size)
     kinds = add(content, "SPEC-TYPES")
     kind = known(kinds, "SPEC-OBJECT-TYPE", "_requirement", LONG_NAME="requirement")
     attributes = add(kind, "SPEC-ATTRIBUTES")
@@ -214,9 +208,8 @@ def reqif_document(
         add(add(attribute, "TYPE"), "DATATYPE-DEFINITION-STRING-REF", "_text")
     known(kinds, "SPECIFICATION-TYPE", "_document", LONG_NAME="document")
     objects = add(content, "SPEC-OBJECTS")
-    specification = known(
-        add(content, "SPECIFICATIONS"), "SPECIFICATION", "_specification", LONG_NAME=title
-    )
+    whole = add(content, "SPECIFICATIONS")
+    specification = known(whole, "SPECIFICATION", "_specification", LONG_NAME=title)
     add(add(specification, "TYPE"), "SPECIFICATION-TYPE-REF", "_document")
     children = add(specification, "CHILDREN")
     for index, entry in enumerate(entries, 1):

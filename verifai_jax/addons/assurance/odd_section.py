@@ -23,16 +23,13 @@ def with_odd(page: Page, found: OddCoverage) -> Page:
         f"Of {found.rows:,} rows with a verdict {found.outside:,} are outside the domain, and not "
         "counted below. A cell is a part of an attribute's range, or one of its values."
     )
-    section = Section(
-        "domain",
-        f"The operational design domain {found.domain.name}",
-        (
-            paragraph(text),
-            table(["attribute", "feature", "inside", "reason", "source", *shares], rows),
-            table(["attribute", "with", *shares], pairs, "Pairs of attributes"),
-        ),
+    content = (
+        paragraph(text),
+        table(["attribute", "feature", "inside", "reason", "source", *shares], rows),
+        table(["attribute", "with", *shares], pairs, "Pairs of attributes"),
     )
-    return before_limits(page, section)
+    title = f"The operational design domain {found.domain.name}"
+    return before_limits(page, Section("domain", title, content))
 
 
 def _shares(row: Mapping[str, Any]) -> tuple[str, str, str]:

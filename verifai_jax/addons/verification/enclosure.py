@@ -87,10 +87,7 @@ class Enclosure:
         self.ranges = FeatureRanges(space, precision)
 
     def __call__(self, low: Corners, high: Corners) -> Bounds:
-        """Return bounds over boxes `[n, dim]` between these points of the unit cube.
-
-        **Raises:** `MissingRule` for an operation of the system that sets cannot go through.
-        """
+        """Return bounds over boxes `[n, dim]` between these points, or raise `MissingRule`."""
         blocks = [slice(i, i + TOGETHER) for i in range(0, len(low), TOGETHER)]
         leaves = self._leaves(low, high)
 

@@ -287,20 +287,13 @@ class Verification(Drawn, Reported, InNotebook):
         proved, broken, undecided = self.proved, self.broken, self.undecided
         shares = [format_percent(part.mass) for part in (proved, broken, undecided)]
         count = counted(int(self.boxes.samples.sum()), "sample")
+        inside, bound = map(format_percent, (self.throughout.low, self.failure_bound))
+        certain = f"boxes with a point that fails for certain; in {inside}"
         lines = [
             f"{self.name}: {shares[0]} {of} is proved, {shares[1]} broken, {shares[2]} undecided",
             line("proved", proved, "no point of it fails"),
-            line(
-                "broken",
-                broken,
-                "boxes with a point that fails for certain; in "
-                f"{format_percent(self.throughout.low)} of the prior every point does",
-            ),
-            line(
-                "undecided",
-                undecided,
-                f"at most {format_percent(self.failure_bound)} of it fails, at {sure} by {count}",
-            ),
+            line("broken", broken, f"{certain} of the prior every point does"),
+            line("undecided", undecided, f"at most {bound} of it fails, at {sure} by {count}"),
             f"  failing      {format_percent(low)} {of} at least, "
             f"{format_percent(high)} at most{f' at {sure}' if undecided.high > 0 else ''}",
             f"  boxes        {len(self.boxes):,} of {self.looked_at:,} that were looked at, "
