@@ -73,15 +73,15 @@ def view_data(
     names = [column["name"] for column in described]
     wanted = [names.index(name) for name in features if name in names]
     axes = [*wanted, 0, 0][:2]
-    counts = [int(np.sum(group == i)) for i in range(len(GROUPS))]
+    groups = [
+        {"name": name, "color": color, "count": f"{np.sum(group == i):,}"}
+        for i, (name, color, _) in enumerate(GROUPS)
+    ]
     return {
         "columns": described,
-        "rows": [int(number) for number in numbers[indices]],
-        "group": [int(each) for each in group[indices]],
-        "groups": [
-            {"name": name, "color": color, "count": f"{count:,}"}
-            for (name, color, _), count in zip(GROUPS, counts, strict=True)
-        ],
+        "rows": numbers[indices].tolist(),
+        "group": group[indices].tolist(),
+        "groups": groups,
         "axes": axes,
         "parallel": [*wanted[: MAX_PARALLEL - 1], 0],
         "traces": {str(number): dict(trace) for number, trace in traces.items()},
@@ -117,11 +117,7 @@ def _column(name: str, values: "pd.Series") -> dict[str, Any] | None:
     if not levels or len(levels) > MAX_CHOICES:
         return None
     codes = {text: i for i, text in enumerate(levels)}
-    return {
-        "name": name,
-        "levels": levels,
-        "values": [None if text is None else codes[text] for text in texts],
-    }
+    return {"name": name, "levels": levels, "values": [codes.get(text) for text in texts]}
 
 
 def numbers_of(values: Any) -> list[float | int | None]:
@@ -153,13 +149,9 @@ def trace_data(replay: Replay, label: str = "") -> dict[str, Any]:
             for limit in map(constant_value, limits)
             if limit is not None
         ]
-        signals.append(
-            {
-                "name": one_line(name),
-                "values": [numbers_of(each) for each in values[samples].T[:MAX_COMPONENTS]],
-                "bounds": numbers_of(list(dict.fromkeys(bounds))),
-            }
-        )
+        shown = [numbers_of(each) for each in values[samples].T[:MAX_COMPONENTS]]
+        bounds = numbers_of(list(dict.fromkeys(bounds)))
+        signals.append({"name": one_line(name), "values": shown, "bounds": bounds})
     decisive = decisive_instant(problem.formulas[replay.worst], trace, problem.end)
     verdict = "violates" if replay.violated else "keeps"
     words = f"Row {replay.row} {verdict} the property, robustness {replay.rho[replay.worst]:z.4g}."

@@ -101,10 +101,8 @@ class Boxes:
 
     def with_more(self, others: "Boxes") -> "Boxes":
         """Return these boxes followed by others."""
-        return Boxes(
-            *(np.concatenate([getattr(self, f.name), getattr(others, f.name)])
-              for f in fields(self))
-        )  # fmt: skip
+        pairs = ((getattr(self, f.name), getattr(others, f.name)) for f in fields(self))
+        return Boxes(*map(np.concatenate, pairs))
 
     @property
     def mass(self) -> Float[np.ndarray, " n"]:

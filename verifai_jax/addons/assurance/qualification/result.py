@@ -135,16 +135,13 @@ _BY_ORACLE = {
     "formulas": (
         "the last instant of a window is left out",
         "always takes the greatest value, or eventually the least",
-        "until forgets what holds before",
-        "a negation is dropped",
-        "an implication is read backwards",
-        "a comparison is read as its opposite",
+        "until forgets what holds before", "a negation is dropped",
+        "an implication is read backwards", "a comparison is read as its opposite",
         "a formula is written as another one",
         "after the end of a trace another value than the last one holds",
     ),
     "zeros": (
-        "x > 0 holds at zero",
-        "x >= 0 fails at zero",
+        "x > 0 holds at zero", "x >= 0 fails at zero",
         "a robustness of zero is a violation, whatever the comparison",
     ),
     "gradients": (
@@ -152,13 +149,9 @@ _BY_ORACLE = {
         "the smooth robustness does not tend to the robustness",
     ),
     "table": (
-        "a violation counts as safe",
-        "a safe simulation counts as a violation",
-        "a row is lost",
-        "a row is in the table twice",
-        "a row has the robustness of another one",
-        "violations are counted wrongly",
-        "the worst row is not the worst",
+        "a violation counts as safe", "a safe simulation counts as a violation",
+        "a row is lost", "a row is in the table twice", "a row has the robustness of another one",
+        "violations are counted wrongly", "the worst row is not the worst",
         "samples of the prior are biased",
     ),
     "statuses": (
@@ -176,15 +169,12 @@ _BY_ORACLE = {
         "the guaranteed bound is too low",
     ),
     "priors": (
-        "an interval is scaled wrongly",
-        "a normal feature has another spread",
-        "a logarithmic feature is uniform",
-        "weights of choices are ignored",
+        "an interval is scaled wrongly", "a normal feature has another spread",
+        "a logarithmic feature is uniform", "weights of choices are ignored",
     ),
     "steps": ("an integrator is of lower order than it says", "a finer step is not finer"),
     "replays": (
-        "the same seed gives another table",
-        "another seed gives the same table",
+        "the same seed gives another table", "another seed gives the same table",
         "a row is replayed under another random key",
     ),
     "kills": (
@@ -223,7 +213,7 @@ _BY_ORACLE = {
         "a violation is not shown in the trace matrix",
         "claims that were edited are believed",
     ),
-}
+}  # fmt: skip
 HAZARDS = {
     f"E{number:02}": hazard
     for number, hazard in enumerate(
