@@ -41,14 +41,11 @@ MAX_BYTES = 2**28
 def read_reqif(path: Path, fields: Sequence[str]) -> list[dict[str, object]]:
     """Read the objects of a ReqIF file, or of all ReqIF files in a `.reqifz` archive.
 
-    **Arguments:**
-    - `fields`: the fields of a requirement; other attributes are left out.
-    **Returns:** a dictionary of texts for each object with at least one of the fields, in the order
-    of the specifications. An attribute without a value has the default of its definition; an object
-    that its tool marks as deleted is left out. An object without an id gets its identifier in the
-    file. Its `links` are its own, and the targets of its relations.
-    **Raises:** `ValueError` for a file that is not ReqIF, declares a document type, or has no
-    requirement.
+    Each object with at least one of the fields becomes a dictionary of these, in the order of the
+    specifications, unless its tool marks it as deleted. An attribute without a value has the
+    default of its definition, an object without an id its identifier in the file. Its `links` are
+    its own, and the targets of its relations.
+    **Raises:** `ValueError` for a file that is not ReqIF, declares a document type, or is empty.
     """
     elements: list[Element] = []
     for name, data in _documents(path):
@@ -136,9 +133,8 @@ def _named(elements: Iterable[Element], tag: str) -> Iterator[Element]:
 
 
 def _values(within: Iterable[Element]) -> Iterator[Element]:
-    """Yield the values of attributes in elements."""
-    for element in within:
-        yield from (each for each in element.iter() if _tag(each).startswith("ATTRIBUTE-VALUE-"))
+    parts = (each for element in within for each in element.iter())
+    return (each for each in parts if _tag(each).startswith("ATTRIBUTE-VALUE-"))
 
 
 def _field(name: str) -> str:
@@ -181,12 +177,7 @@ def _text(value: Element, choices: Mapping[str, str]) -> str:
 def reqif_document(
     entries: Sequence[Mapping[str, str]], fields: Sequence[str], title: str
 ) -> bytes:
-    """Write entries as a ReqIF document: an object for each, in one specification.
-
-    **Arguments:**
-    - `entries`: texts by field, one dictionary for each object.
-    - `fields`: the possible fields of an object.
-    """
+    """Write texts by field as a ReqIF document: an object for each entry, in one specification."""
     now = datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
 
     def add(parent: Element, tag: str, text: str = "", **given: str) -> Element:
@@ -201,18 +192,13 @@ def reqif_document(
     root = Element("REQ-IF", xmlns=NAMESPACE)
     header = add(add(root, "THE-HEADER"), "REQ-IF-HEADER", IDENTIFIER="_header")
     add(header, "CREATION-TIME", now)
-    for tag, text in (
-        ("REQ-IF-TOOL-ID", "verifai_jax"),
-        ("REQ-IF-VERSION", "1.0"),
-        ("SOURCE-TOOL-ID", "verifai_jax"),
-        ("TITLE", title),
-    ):
-        add(header, tag, text)
+    for tag in ("REQ-IF-TOOL-ID", "REQ-IF-VERSION", "SOURCE-TOOL-ID"):
+        add(header, tag, "1.0" if tag == "REQ-IF-VERSION" else "verifai_jax")
+    add(header, "TITLE", title)
     content = add(add(root, "CORE-CONTENT"), "REQ-IF-CONTENT")
-    known(
-        add(content, "DATATYPES"), "DATATYPE-DEFINITION-STRING", "_text",
-        LONG_NAME="text", MAX_LENGTH=str(MAX_LENGTH),
-    )  # fmt: skip
+    types = add(content, "DATATYPES")
+    size = str(MAX_LENGTH)
+    known(types, "DATATYPE-DEFINITION-STRING", "_text", LONG_NAME="text", MAX_LENGTH=size)
     kinds = add(content, "SPEC-TYPES")
     kind = known(kinds, "SPEC-OBJECT-TYPE", "_requirement", LONG_NAME="requirement")
     attributes = add(kind, "SPEC-ATTRIBUTES")
@@ -222,9 +208,8 @@ def reqif_document(
         add(add(attribute, "TYPE"), "DATATYPE-DEFINITION-STRING-REF", "_text")
     known(kinds, "SPECIFICATION-TYPE", "_document", LONG_NAME="document")
     objects = add(content, "SPEC-OBJECTS")
-    specification = known(
-        add(content, "SPECIFICATIONS"), "SPECIFICATION", "_specification", LONG_NAME=title
-    )
+    whole = add(content, "SPECIFICATIONS")
+    specification = known(whole, "SPECIFICATION", "_specification", LONG_NAME=title)
     add(add(specification, "TYPE"), "SPECIFICATION-TYPE-REF", "_document")
     children = add(specification, "CHILDREN")
     for index, entry in enumerate(entries, 1):

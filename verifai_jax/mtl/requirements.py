@@ -26,32 +26,19 @@ from verifai_jax.mtl.setting import as_formula
 
 ENDINGS = (".toml", ".yaml", ".yml", ".csv", ".reqif", ".reqifz")
 """Endings of files of requirements."""
-FIELDS: tuple[str, ...] = (
-    "id",
-    "formula",
-    "text",
-    "unit",
-    "source",
-    "rationale",
-    "severity",
-    "links",
-)
+FIELDS = ("id", "formula", "text", "unit", "source", "rationale", "severity", "links")
 """What an entry may say; each has an `id`, and a `formula` where recordings are judged by it."""
 
 
 @dataclass(frozen=True)
 class Requirement:
-    """A requirement with an identifier, and its formula.
+    """A requirement with its identifier, and the `file` from which it was read.
 
-    - `id`: its identifier in tables and reports.
     - `formula`: the required property; None if a problem has the formula, or it is not written yet.
-    - `text`: the sentence that the formula formalises.
-    - `unit`: the unit of its robustness.
-    - `source`: a standard or a document, with its number.
-    - `rationale`: the reason for the requirement.
+    - `text`: the sentence that it formalises; `unit`: the unit of its robustness.
+    - `source`: a standard or a document, with its number; `rationale`: the reason for it.
     - `severity`: the severity of a violation, in the project's terms.
     - `links`: other requirements or documents from which it is derived.
-    - `file`: the file from which it was read.
     """
 
     id: str
@@ -66,10 +53,7 @@ class Requirement:
 
     @property
     def formalized(self) -> Formula:
-        """The formula.
-
-        **Raises:** `ValueError` for a requirement without one.
-        """
+        """The formula; `ValueError` for a requirement without one."""
         if self.formula is None:
             raise ValueError(f"requirement {self.id!r} has no formula: give it one in its file")
         return self.formula

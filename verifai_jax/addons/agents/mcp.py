@@ -51,11 +51,9 @@ class Tool(NamedTuple):
     def schema(self) -> dict[str, Any]:
         """Return the schema of all arguments."""
         return {
-            "type": "object",
-            "properties": dict(self.arguments),
-            "required": list(self.required),
+            "type": "object", "properties": dict(self.arguments), "required": list(self.required),
             "additionalProperties": False,
-        }
+        }  # fmt: skip
 
 
 _RUN, _PROBLEM = ("run",), ("problem",)
@@ -109,12 +107,9 @@ class Refused(ValueError):
 
 @dataclass
 class Server:
-    """A server of tools on one folder.
+    """A server of tools on one folder, which contains all paths.
 
-    - `folder`: the folder that contains all paths.
-    - `budget`: maximum number of simulations in one call.
-    - `total`: maximum number of simulations in all calls.
-    - `seconds`: maximum number of seconds for one call.
+    A call makes `budget` simulations at most, and takes so many `seconds`; all make `total`.
     """
 
     folder: Path
@@ -131,17 +126,14 @@ class Server:
             except (ValueError, RecursionError):
                 yield _line(None, error={"code": -32700, "message": "the message is not JSON"})
                 continue
-            if not isinstance(request, dict):
-                yield _line(None, error={"code": -32600, "message": "this is not a request"})
-                continue
-            number = request.get("id")
+            given = request if isinstance(request, dict) else {"id": None}
+            number, method, params = given.get("id"), given.get("method"), given.get("params", {})
             whole = isinstance(number, str | int) and not isinstance(number, bool)
-            valid = whole or ("id" not in request)
-            method, params = request.get("method"), request.get("params", {})
+            valid = whole or "id" not in given
             if not valid or not isinstance(method, str) or not isinstance(params, dict):
                 error = {"code": -32600, "message": "this is not a request"}
                 yield _line(number if whole else None, error=error)
-            elif "id" in request:  # Nothing is answered to a notification.
+            elif "id" in given:  # Nothing is answered to a notification.
                 try:
                     yield self._answer(number, method, params)
                 except Exception as error:
@@ -225,8 +217,8 @@ class Server:
                 env={**os.environ, "MPLBACKEND": "agg", FENCE: str(self.folder)},
             )  # fmt: skip
         except subprocess.TimeoutExpired:
-            text = f"it was ended after {self.seconds:zg} s; take a smaller budget"
-            raise Refused(text) from None
+            after = f"{self.seconds:zg} s"
+            raise Refused(f"it was ended after {after}; take a smaller budget") from None
 
     def _fence(self, key: str, value: str) -> None:
         """Refuse a path outside of the folder, and a problem that is not in a file of it."""
@@ -304,22 +296,13 @@ def _line(number: object, **answer: object) -> str:
     "--folder", type=click.Path(path_type=Path), default=".", help="Folder of the project."
 )
 @click.option(
-    "--budget",
-    type=click.IntRange(1),
-    default=100_000,
-    help="Maximum simulations in a call.",
+    "--budget", type=click.IntRange(1), default=100_000, help="Maximum simulations in a call."
 )
 @click.option(
-    "--total",
-    type=click.IntRange(1),
-    default=1_000_000,
-    help="Maximum simulations in all.",
+    "--total", type=click.IntRange(1), default=1_000_000, help="Maximum simulations in all."
 )
 @click.option(
-    "--seconds",
-    type=click.FloatRange(1),
-    default=600.0,
-    help="Maximum seconds for a call.",
+    "--seconds", type=click.FloatRange(1), default=600.0, help="Maximum seconds for a call."
 )
 def mcp(folder: Path, budget: int, total: int, seconds: float) -> None:
     """Serve an agent over standard input and output, by the Model Context Protocol.

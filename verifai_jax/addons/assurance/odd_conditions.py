@@ -11,7 +11,7 @@ import math
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import reduce
+from functools import partial, reduce
 from typing import TypeAlias
 
 import jax
@@ -48,10 +48,7 @@ Conversions: TypeAlias = Mapping[tuple[str, str], tuple[float, float]]
 
 
 def convert(value: float, unit: str, to: str, own: Conversions | None = None) -> float:
-    """Convert a number to another unit, preferring the file's `own` conversions.
-
-    **Raises:** `ValueError` for incompatible units.
-    """
+    """Convert a number to another, compatible unit, preferring the file's `own` conversions."""
     one, other = plain_unit(unit), plain_unit(to)
     for (source, target), (scale, offset) in (own or {}).items():
         if source == unit:
@@ -66,13 +63,11 @@ def convert(value: float, unit: str, to: str, own: Conversions | None = None) ->
 
 @dataclass(frozen=True)
 class Attribute:
-    """An attribute of a domain, and the feature that varies it.
+    """An attribute of a domain, and the feature that varies it, if any.
 
     - `name`: its name with those of the concepts that contain it, `dynamic.ego_speed`.
     - `kind`: `"float"`, `"integer"`, `"boolean"`, `"string"` or `"literal"`.
-    - `literals`: its possible values, if they are listed.
-    - `groups`: named groups of literals, which conditions may use.
-    - `feature`: the feature that varies it; empty for none.
+    - `literals`, `groups`: its possible values, if they are listed, and named groups of them.
     - `unit`: the unit of the feature; by default the SI unit of its quantity.
     - `reason`, `source`: the reason for its values, and the source of that.
     """
@@ -196,24 +191,18 @@ def _hull(attribute: Attribute, each: Condition, modules: Mapping[str, Module]) 
             return hull_of(attribute, module, modules)
         case Group(every, parts):
             hulls = [_hull(attribute, part, modules) for part in parts]
-            return reduce(both if every else _either, hulls)
+            return reduce(partial(both, every=every), hulls)
         case _:
             return attribute.everything
 
 
-def both(one: Hull, other: Hull) -> Hull:
-    """Return the intersection of two intervals, or of two sets."""
+def both(one: Hull, other: Hull, every: bool = True) -> Hull:
+    """Return the intersection of two intervals, or of two sets; unless `every`, their hull."""
     if isinstance(one, frozenset) or isinstance(other, frozenset):
         assert isinstance(one, frozenset) and isinstance(other, frozenset)  # noqa: PT018
-        return one & other
-    return max(one[0], other[0]), min(one[1], other[1])
-
-
-def _either(one: Hull, other: Hull) -> Hull:
-    if isinstance(one, frozenset) or isinstance(other, frozenset):
-        assert isinstance(one, frozenset) and isinstance(other, frozenset)  # noqa: PT018
-        return one | other
-    return min(one[0], other[0]), max(one[1], other[1])
+        return one & other if every else one | other
+    (low, high), (first, last) = one, other
+    return (max(low, first), min(high, last)) if every else (min(low, first), max(high, last))
 
 
 def _complement(attribute: Attribute, hull: Hull) -> Hull:
@@ -231,17 +220,10 @@ Resolve: TypeAlias = Callable[[str], Attribute | None]
 
 
 def read_group(
-    where: str,
-    section: object,
-    every: bool,
-    resolve: Resolve,
-    modules: Sequence[str],
+    where: str, section: object, every: bool, resolve: Resolve, modules: Sequence[str],
     conversions: Conversions,
-) -> Group:
-    """Read a section of conditions: a mapping from names to expressions.
-
-    **Raises:** `ValueError` for a text that is not a condition, with the position.
-    """
+) -> Group:  # fmt: skip
+    """Read a section of conditions: a mapping from names to expressions."""
     if not isinstance(section, Mapping) or not section:
         raise ValueError(f"{where} maps attributes to expressions; got {section!r}")
     parts: list[Condition] = []
@@ -256,10 +238,8 @@ def read_group(
                 raise ValueError(f"{inside}: {error}") from None
         elif name in modules:
             if not isinstance(value, bool):
-                raise ValueError(
-                    f"{inside}: must be true (the module holds) or false (it does not); got "
-                    f"{value!r}"
-                )
+                needed = "must be true (the module holds) or false (it does not)"
+                raise ValueError(f"{inside}: {needed}; got {value!r}")
             parts.append(Reference(name, value))
         else:
             raise unknown_name(f"attribute or module of {where}", name, modules)
@@ -279,8 +259,7 @@ def _read_test(attribute: Attribute, value: object, conversions: Conversions) ->
         raise ValueError(f"an attribute of kind {attribute.kind} has no values to compare with")
     text = str(value).strip()
     if found := RANGE.fullmatch(text):
-        low, high, unit = float(found[1]), float(found[2]), found[3]
-        word = ""
+        word, low, high, unit = "", float(found[1]), float(found[2]), found[3]
     elif found := COMPARED.fullmatch(text):
         word, unit = found[1] or "", found[3]
         low = high = float(found[2])

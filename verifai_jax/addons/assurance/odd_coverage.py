@@ -90,9 +90,8 @@ class OddCoverage(Tabular):
         return found.assign(new=new)
 
     def __str__(self) -> str:
-        lines = [
-            f"{self.domain.name}: {self.rows:,} rows, {self.outside:,} of them outside the domain"
-        ]
+        outside = f"{self.outside:,} of them outside the domain"
+        lines = [f"{self.domain.name}: {self.rows:,} rows, {outside}"]
         if self.prior_inside == self.prior_inside:
             lines[0] += f"; {format_percent(self.prior_inside)} of the prior is inside"
         for name, row in self.table.to_dict("index").items():

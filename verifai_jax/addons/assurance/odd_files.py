@@ -132,13 +132,14 @@ def _domain(
             for label in _listed(section.get(word) if isinstance(section, Mapping) else None):
                 labels.setdefault(label, []).append(str(key))
     conversions = _conversions(tree.get("conversion") or {}, where)
-    modules = {
-        str(key): _module(
-            f"module {key} of {where}", section, resolve, [*sections, *labels], conversions
-        )
-        for key, section in sections.items()
+    modules, known = {}, [*sections, *labels]
+    for key, section in sections.items():
+        name_of = f"module {key} of {where}"
+        modules[str(key)] = _module(name_of, section, resolve, known, conversions)
+    uses = {
+        name: {each.module for each in module.conditions() if isinstance(each, Reference)}
+        for name, module in modules.items()
     }
-    uses = {name: _used(module) for name, module in modules.items()}
     for label in set().union(*uses.values()) - set(modules):
         # A label holds where any active module with it does.
         own = [Reference(each, True) for each in labels[label] if modules[each].active]
@@ -165,14 +166,10 @@ def _module(
         if word in section:
             verb = word[:7]
             if verb in groups:
-                raise ValueError(
-                    f"{where} has both {verb}_AND and {verb}_OR: use only one, and put a group "
-                    "into it"
-                )
-            every = word.endswith("AND")
-            groups[verb] = read_group(
-                f"{where}, {word}", section[word], every, resolve, names, conversions
-            )
+                both = f"{where} has both {verb}_AND and {verb}_OR"
+                raise ValueError(f"{both}: use only one, and put a group into it")
+            every, inside = word.endswith("AND"), f"{where}, {word}"
+            groups[verb] = read_group(inside, section[word], every, resolve, names, conversions)
     active = section.get("ACTIVE", True) is not False
     return Module(groups.get("INCLUDE"), groups.get("EXCLUDE"), active)
 
@@ -241,10 +238,6 @@ def _conversions(section: object, where: str) -> dict[tuple[str, str], tuple[flo
         raise ValueError(
             f"conversion of {where} must be {{KIND: {{UNIT: {{OTHER: {{scale: NUMBER}}}}}}}}"
         ) from None
-
-
-def _used(module: Module) -> set[str]:
-    return {each.module for each in module.conditions() if isinstance(each, Reference)}
 
 
 def _refuse_circles(name: str, above: tuple[str, ...], uses: Mapping[str, set[str]]) -> None:

@@ -4,10 +4,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from verifai_jax.addons.assurance.odd_coverage import OddCoverage
-from verifai_jax.addons.reports.markup import (
-    paragraph,
-    table,
-)
+from verifai_jax.addons.reports.markup import paragraph, table
 from verifai_jax.addons.reports.page import Page, Section, before_limits
 from verifai_jax.addons.reports.run_question import NO_REASON
 from verifai_jax.core.messages.text import format_percent
@@ -26,16 +23,13 @@ def with_odd(page: Page, found: OddCoverage) -> Page:
         f"Of {found.rows:,} rows with a verdict {found.outside:,} are outside the domain, and not "
         "counted below. A cell is a part of an attribute's range, or one of its values."
     )
-    section = Section(
-        "domain",
-        f"The operational design domain {found.domain.name}",
-        (
-            paragraph(text),
-            table(["attribute", "feature", "inside", "reason", "source", *shares], rows),
-            table(["attribute", "with", *shares], pairs, "Pairs of attributes"),
-        ),
+    content = (
+        paragraph(text),
+        table(["attribute", "feature", "inside", "reason", "source", *shares], rows),
+        table(["attribute", "with", *shares], pairs, "Pairs of attributes"),
     )
-    return before_limits(page, section)
+    title = f"The operational design domain {found.domain.name}"
+    return before_limits(page, Section("domain", title, content))
 
 
 def _shares(row: Mapping[str, Any]) -> tuple[str, str, str]:

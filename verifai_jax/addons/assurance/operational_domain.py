@@ -156,10 +156,7 @@ class OperationalDomain:
 def choices_of(
     attribute: odd_conditions.Attribute, hull: odd_conditions.Hull
 ) -> tuple[float, float] | list[str] | list[bool]:
-    """Return the ends of an attribute's interval, or its literals.
-
-    **Raises:** `ValueError` for an unbounded interval, and for an empty one.
-    """
+    """Return the ends of an attribute's interval, which must have some, or its literals."""
     if isinstance(hull, frozenset):
         found = [attribute.literals[code] for code in sorted(hull)]
         if not found:

@@ -95,12 +95,7 @@ INK = {"fill": "none", "stroke": "#30323d"}
 
 
 def claims_tree(subject: str, headline: str, claims: Sequence[Mapping[str, Any]]) -> Markup:
-    """Draw the tree: the headline, the strategy, and a row for each claim.
-
-    **Arguments:**
-    - `headline`: the goal at the root.
-    - `claims`: the claims as plain data.
-    """
+    """Draw the tree: the headline at the root, the strategy, and a row for each claim."""
     shared = list(dict.fromkeys(text for each in claims for text in each["assumptions"]))
     parts: list[Markup] = []
     top = _box(parts, GOALS, 10, 420, f"G0 {headline}") + 10

@@ -12,8 +12,6 @@ from typing import Any
 
 FORMAT = 1
 """Number of the format of claims as JSON."""
-
-
 PAGE, SEAL = "report_sha256", "claims_sha256"
 """Entries of a file of claims: the hashes of its report, and of all its other entries."""
 
@@ -29,10 +27,8 @@ def sealed(claims: Mapping[str, Any]) -> dict[str, Any]:
 class Claim:
     """A sentence that the evidence supports.
 
-    - `identifier`: the identifier for safety cases to cite, such as `C2`.
-    - `claim`: the sentence.
-    - `evidence`: the evidence on which it rests.
-    - `assumptions`: assumptions under which the claim holds.
+    - `identifier`: the identifier for safety cases to cite, such as `C2`; `claim`: the sentence.
+    - `evidence`, `assumptions`: on what it rests, and under what it holds.
     - `requirements`: identifiers of its requirements; empty for all requirements of the report.
     """
 
@@ -46,41 +42,26 @@ class Claim:
 def claims_json(
     subject: str, claims: Sequence[Claim], chain: str, about: Mapping[str, Any] | None = None
 ) -> dict[str, Any]:
-    """Describe claims as plain data.
+    """Describe claims as plain data, with the last hash of the chain over a report's inputs.
 
-    **Arguments:**
-    - `chain`: last hash of the chain over all inputs of the report.
-    - `about`: the subject of the claims, for comparison in `vj.trace_matrix`; see `about_json`.
+    `about` is what they are about, for comparison in `vj.trace_matrix`; see `about_json`.
     """
     return {
-        "format": FORMAT,
-        "subject": subject,
-        "inputs_sha256_chain": chain,
-        "about": dict(about or {}),
-        "claims": [asdict(claim) for claim in claims],
-    }
+        "format": FORMAT, "subject": subject, "inputs_sha256_chain": chain,
+        "about": dict(about or {}), "claims": [asdict(claim) for claim in claims],
+    }  # fmt: skip
 
 
 def about_json(
-    result: str,
-    formulas: Mapping[str, str],
-    requirements: Mapping[str, Mapping[str, str]],
-    model: str = "",
-    backend: str | None = None,
-) -> dict[str, Any]:
-    """Describe the subject of claims as plain data.
+    result: str, formulas: Mapping[str, str], requirements: Mapping[str, Mapping[str, str]],
+    model: str = "", backend: str | None = None,
+) -> dict[str, Any]:  # fmt: skip
+    """Describe the subject of claims as plain data: a run, say, with its formulas by name.
 
-    **Arguments:**
-    - `result`: `"run"` or `"estimate"`.
-    - `formulas`: their texts by name.
-    - `requirements`: the requirements of the formulas, by name.
-    - `model`: a hash of the simulated model; empty if unknown.
-    - `backend`: the backend that simulated it.
+    `model` is a hash of what was simulated, empty if unknown, on `backend`.
     """
+    said = {name: dict(each) for name, each in requirements.items()}
     return {
-        "result": result,
-        "formulas": dict(formulas),
-        "requirements": {name: dict(each) for name, each in requirements.items()},
-        "model": model,
+        "result": result, "formulas": dict(formulas), "requirements": said, "model": model,
         "backend": backend,
-    }
+    }  # fmt: skip

@@ -1,6 +1,7 @@
 """`verifai-jax report runs/balance-1`: the evidence report on a folder of results."""
 
 from pathlib import Path
+from typing import Any
 
 import click
 
@@ -20,12 +21,9 @@ from verifai_jax.cli.json_output import command, give_result
 )
 @option("--unit", "units", multiple=True, metavar="FEATURE=UNIT", help="Unit of a feature.")
 @option(
-    "--reason",
-    "reasons",
-    multiple=True,
-    metavar="FEATURE=TEXT",
+    "--reason", "reasons", multiple=True, metavar="FEATURE=TEXT",
     help="Reason for the range of a feature.",
-)
+)  # fmt: skip
 @option("--traces", type=int, help="Maximum rows simulated for the report  [default: chosen]")
 @click.option(
     "--studies/--no-studies",
@@ -62,13 +60,10 @@ def report(
     output: Path | None,
     units: tuple[str, ...],
     reasons: tuple[str, ...],
-    traces: int | None,
-    studies: bool | None,
-    modes: int | None,
     odd: Path | None,
     sections: tuple[str, ...],
-    assessment: bool,
     without_problem: bool,
+    **options: Any,
 ) -> None:
     """Write the evidence report on a run or a sweep: one HTML file, and its claims as JSON.
 
@@ -88,10 +83,10 @@ def report(
         from verifai_jax import load_sweep
 
         result = load_sweep(folder)
+    elif without_problem:
+        result = arguments.read_run(folder)
     else:
-        result = (
-            arguments.read_run(folder) if without_problem else arguments.load_run(folder, target)
-        )
+        result = arguments.load_run(folder, target)
     if odd is not None:
         from verifai_jax import read_odd
     path = write_report(
@@ -99,14 +94,11 @@ def report(
         output,
         units=dict(arguments.split_pairs("--unit", units)),
         reasons=dict(arguments.split_pairs("--reason", reasons)),
-        traces=traces,
-        studies=studies,
-        modes=modes,
         odd=None if odd is None else read_odd(odd),
-        assessment=assessment,
         sections=[extension("verifai_jax.sections", name)(result) for name in sections],
         problem=problem,
         files=[folder] if folder.is_file() else [],
+        **options,
     )
     give_result(report=path, claims=claims_path(path))
     click.echo(f"  report       {path}")

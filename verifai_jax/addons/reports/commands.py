@@ -60,20 +60,15 @@ def run_python(run: Run) -> str:
         f"                 precision={run.precision!r}, confirm={run.confirm})",
     ]
     if run.derived:
-        lines[2:] = [
-            f"run = vj.{run.derived['verb']}(problem, budget={run.budget}, seed={run.seed})"
-        ]
+        verb = run.derived["verb"]
+        lines[2:] = [f"run = vj.{verb}(problem, budget={run.budget}, seed={run.seed})"]
     return "\n".join(lines)
 
 
 def report_command(
-    folder: Path,
-    units: Mapping[str, str],
-    reasons: Mapping[str, str],
-    traces: int | None = None,
-    studies: bool | None = None,
-    modes: int | None = None,
-) -> str:
+    folder: Path, units: Mapping[str, str], reasons: Mapping[str, str], traces: int | None = None,
+    studies: bool | None = None, modes: int | None = None,
+) -> str:  # fmt: skip
     """Return the command that builds a report from a folder again, including its options."""
     words = ["verifai-jax", "report", shown_folder(folder)]
     for option, texts in (("--unit", units), ("--reason", reasons)):

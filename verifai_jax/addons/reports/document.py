@@ -27,7 +27,7 @@ from verifai_jax.problem.problem import Problem
 
 @runtime_checkable
 class AddedSection(Protocol):
-    """An object that adds a section to a report: an error budget, a covered domain, yours."""
+    """A section of a report: an error budget, a covered design domain, one of yours."""
 
     def on_page(self, page: Page) -> Page:
         """Return the page with the section."""
@@ -108,10 +108,8 @@ def write_report(
     they were written; `TypeError` for an object that is not a result.
     """
     path = Path(path)
-    about = About(
-        {**(odd.units if odd else {}), **(units or {})},
-        {**(odd.reasons if odd else {}), **(reasons or {})},
-    )
+    own = ({}, {}) if odd is None else (odd.units, odd.reasons)
+    about = About({**own[0], **(units or {})}, {**own[1], **(reasons or {})})
     if modes is not None:
         check_count("modes", modes)
     if isinstance(result, Run):

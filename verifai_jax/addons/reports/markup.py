@@ -36,24 +36,17 @@ def join(*children: Child) -> Markup:
     """Return the HTML of several children, concatenated."""
     parts = []
     for child in children:
-        if child is None:
-            continue
         if isinstance(child, Markup):
             parts.append(child)
         elif isinstance(child, str | int | float):
             parts.append(escape(child))
-        else:
+        elif child is not None:
             parts.append(join(*child))
     return Markup("".join(parts))
 
 
 def element(tag: str, *children: Child, **attributes: str | int | None) -> Markup:
-    """Return an HTML element.
-
-    **Arguments:**
-    - `attributes`: attributes by name; `class_` is `class`, `aria_label` is `aria-label`, None is
-      left out.
-    """
+    """Return an HTML element; `class_` is `class`, `aria_label` is `aria-label`, None left out."""
     words = [
         f' {name.rstrip("_").replace("_", "-")}="{escape(value)}"'
         for name, value in attributes.items()
@@ -79,55 +72,26 @@ def preformatted(text: str) -> Markup:
 
 
 def table(heads: Sequence[str], rows: Iterable[Sequence[Child]], caption: str = "") -> Markup:
-    """Return a table that scrolls on its own on narrow pages.
-
-    **Arguments:**
-    - `heads`: the headings of the columns.
-    - `rows`: their cells; the first cell is the heading of its row.
-    - `caption`: the text above the table, if any.
-    """
+    """Return a table that scrolls on narrow pages; the first cell of a row is its heading."""
     body = [
         element("tr", element("th", first, scope="row"), [element("td", cell) for cell in others])
         for first, *others in rows
     ]
-    return element(
-        "div",
-        element(
-            "table",
-            element("caption", caption) if caption else None,
-            element("thead", element("tr", [element("th", head, scope="col") for head in heads])),
-            element("tbody", body),
-        ),
-        class_="scroll",
-        tabindex=0,
-        role="region",
-        aria_label=caption or ", ".join(heads),
-    )
+    head = element("thead", element("tr", [element("th", head, scope="col") for head in heads]))
+    above = element("caption", caption) if caption else None
+    whole, name = element("table", above, head, element("tbody", body)), caption or ", ".join(heads)
+    return element("div", whole, class_="scroll", tabindex=0, role="region", aria_label=name)
 
 
 def picture(content: bytes, alternative: str, caption: str = "", kind: str = "png") -> Markup:
-    """Return a figure with an embedded picture.
-
-    **Arguments:**
-    - `alternative`: text for readers who cannot see the picture.
-    - `caption`: the text below it; by default the alternative text.
-    - `kind`: `"png"` or `"gif"`.
-    """
-    data = base64.b64encode(content).decode()
-    return element(
-        "figure",
-        element("img", src=f"data:image/{kind};base64,{data}", alt=alternative),
-        element("figcaption", caption or alternative),
-    )
+    """Return a figure with an embedded PNG or GIF, and a text for those who cannot see it."""
+    data = f"data:image/{kind};base64,{base64.b64encode(content).decode()}"
+    image = element("img", src=data, alt=alternative)
+    return element("figure", image, element("figcaption", caption or alternative))
 
 
 def data_block(name: str, value: Mapping[str, Any] | Sequence[Any]) -> Markup:
-    """Return plain data as an embedded JSON block that no text in the data can close.
-
-    **Arguments:**
-    - `name`: id of the block.
-    - `value`: plain data without NaN and infinities.
-    """
+    """Return plain data, all finite, as an embedded JSON block that no text in it can close."""
     text = json.dumps(value, allow_nan=False, separators=(",", ":"))
     for character in "<>&":
         text = text.replace(character, f"\\u{ord(character):04x}")

@@ -33,13 +33,10 @@ class Section:
 class Page:
     """The parts of a report before it is rendered.
 
-    - `title`: the title of the page.
-    - `headline`: the finding in a sentence.
+    - `headline`: the finding in a sentence, with `warnings` below it.
     - `tone`: the marking of the headline: `"fails"`, `"holds"` or `"open"`.
-    - `sections`: the sections in order.
     - `claims`: the claims as plain data.
     - `view`: data of the interactive table; None without one.
-    - `warnings`: warnings below the headline.
     """
 
     title: str
@@ -63,10 +60,7 @@ def asset(name: str) -> str:
 
 
 def write_page(page: Page, path: str | Path) -> None:
-    """Write a page as an HTML file, atomically.
-
-    **Raises:** `OSError` that names the file, if the file system refuses.
-    """
+    """Write a page as an HTML file, atomically."""
     with replacing(path) as partial:
         partial.write_text(render(page), encoding="utf-8", newline="\n")
 
@@ -75,15 +69,10 @@ def render(page: Page) -> str:
     """Convert a page to HTML."""
     style = asset("page.css") + asset("view.css")
     script = "" if page.view is None else asset("view.js") + asset("page.js")
-    policy = "; ".join(
-        [
-            "default-src 'none'",
-            "img-src data:",
-            f"style-src {_source(style)}",
-            f"script-src {_source(script)}" if script else "script-src 'none'",
-            "base-uri 'none'",
-            "form-action 'none'",
-        ]
+    allowed = _source(script) if script else "'none'"
+    policy = (
+        f"default-src 'none'; img-src data:; style-src {_source(style)}; "
+        f"script-src {allowed}; base-uri 'none'; form-action 'none'"
     )
     head = join(
         element("meta", charset="utf-8"),

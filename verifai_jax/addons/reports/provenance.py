@@ -39,11 +39,7 @@ def chained(inputs: Iterable[Input]) -> list[Link]:
 
 
 def folder_inputs(folder: Path, roles: Sequence[tuple[str, str]]) -> list[Input]:
-    """Hash files of a folder of results.
-
-    **Arguments:**
-    - `roles`: patterns of file names with their description, in the order of the chain.
-    """
+    """Hash files of a folder, by patterns of names with their role, in the order of the chain."""
     return [
         Input(file.relative_to(folder).as_posix(), role, file_hash(file))
         for pattern, role in roles

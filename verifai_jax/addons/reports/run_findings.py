@@ -50,11 +50,9 @@ def number_rows(run: Run) -> list[tuple[str, Child]]:
         ("without a verdict", f"{counts.without_verdict:,}"),
         ("violating, as simulated", f"{counts.violating:,}"),
     ]
-    rows += [
-        (f"of these {verdict}", f"{run.verdict_counts[verdict]:,} ({MEANING[verdict]})")
-        for verdict in VERDICTS
-        if run.verdict_counts.get(verdict)
-    ]
+    for verdict in VERDICTS:
+        if count := run.verdict_counts.get(verdict):
+            rows.append((f"of these {verdict}", f"{count:,} ({MEANING[verdict]})"))
     if counts.repetitions.moved or counts.repetitions.rounded:
         rows.append(("simulated again", str(counts.repetitions)))
     rows.append(("claimed as failures", f"{counts.claimed:,}"))
@@ -68,11 +66,8 @@ def number_rows(run: Run) -> list[tuple[str, Child]]:
             rows.append(("failure rate, confirmed", str(run.confirmed_failure_rate)))
     else:
         rows.append(("failure rate", no_rate(run)))
-    if len(run.formulas) > 1:
-        rows += [
-            (f"property {name} fails in", f"{counts.failing_alone[name]:,}")
-            for name in run.formulas
-        ]
+    for name in run.formulas if len(run.formulas) > 1 else ():
+        rows.append((f"property {name} fails in", f"{counts.failing_alone[name]:,}"))
     return rows
 
 
@@ -87,11 +82,8 @@ def failures(run: Run, studies: Studies, about: About) -> Section:
     """Write a few failures with their values, pictures and the commands that repeat them."""
     shown = studies.failures
     if not shown:
-        return Section(
-            "failures",
-            "Failures",
-            (paragraph("The run claims no failure, so there is none to show."),),
-        )
+        nothing = paragraph("The run claims no failure, so there is none to show.")
+        return Section("failures", "Failures", (nothing,))
     claimed = run.table.counts.claimed
     more = f" Of {claimed:,} failures {len(shown)} are shown." if claimed > len(shown) else ""
     content = [
@@ -107,15 +99,11 @@ def _failure(run: Run, failure: Failure, studies: Studies, about: About) -> Mark
     # Control points of signals by their time.
     labels = {} if run.problem is None else run.problem.space.labels(run.problem.duration)
     rare = _improbability(run, failure.row)
-    values = [
-        (
-            labels.get(name, name),
-            f"{number(row[name])} {about.units.get(name, '')}".strip(),
-            *([format_percent(rare[name]) if name in rare else ""] if rare else []),
-        )
-        for name in features[:MAX_FEATURES]
-    ]
-    heads = ["feature", "value", *(["the prior has one as far out in"] if rare else [])]
+    values, heads = [], ["feature", "value", *(["the prior has one as far out in"] if rare else [])]
+    for name in features[:MAX_FEATURES]:
+        value = f"{number(row[name])} {about.units.get(name, '')}".strip()
+        share = [format_percent(rare[name]) if name in rare else ""] if rare else []
+        values.append((labels.get(name, name), value, *share))
     verdict = str(row.get("verdict", "") or "not looked at more closely")
     meaning = f", {MEANING[verdict]}" if verdict in MEANING else ""
     content: list[Child] = [
@@ -133,12 +121,8 @@ def _failure(run: Run, failure: Failure, studies: Studies, about: About) -> Mark
         # The first with all signals, the others with those that the property speaks of.
         own = [name for name in run.problem.monitored if name in failure.replay.trace.signals]
         signals = None if failure.number == 1 or not own else own
-        content.append(
-            picture(
-                png(failure.replay.plot(signals=signals)),
-                f"Signals of row {failure.row} over time, with bounds and the deciding instant",
-            )
-        )
+        words = f"Signals of row {failure.row} over time, with bounds and the deciding instant"
+        content.append(picture(png(failure.replay.plot(signals=signals)), words))
     if failure.number == 1 and studies.animation is not None:
         caption = f"Row {failure.row} as an animation"
         content.append(picture(studies.animation, caption, kind="gif"))
@@ -179,9 +163,8 @@ def analysis(studies: Studies) -> Section:
     found = studies.analysis
     content: list[Markup] = []
     if found.samples is not None:
-        content.append(
-            picture(png(found.plot()), "Failures over the two most important features, with rules")
-        )
+        words = "Failures over the two most important features, with rules"
+        content.append(picture(png(found.plot()), words))
     for part in found.parts[1:]:
         content += [element("h3", part.title), preformatted(part.words)]
         if part.name in DRAWN and hasattr(part.result, "plot"):
@@ -191,32 +174,21 @@ def analysis(studies: Studies) -> Section:
 
 def explore(run: Run, view: dict, studies: Studies) -> Section:
     """Write the element of the interactive table, with its replacement without JavaScript."""
-    shown, all_rows = view["shown"], run.simulations
-    thinned = (
-        f"Of {all_rows:,} rows {shown:,} are shown, spread evenly over each verdict."
-        if shown < all_rows
-        else f"All {shown:,} rows are shown."
+    shown, all_rows, features = view["shown"], run.simulations, run.table.features
+    thinned = f"All {shown:,} rows are shown."
+    if shown < all_rows:
+        thinned = f"Of {all_rows:,} rows {shown:,} are shown, spread evenly over each verdict."
+    if hidden := len(features) - sum(column["name"] in features for column in view["columns"]):
+        thinned += f" {hidden} of {len(features)} features are left out."
+    thinned += (
+        " With JavaScript, a row under the pointer shows its values, and a click its trace: "
+        f"{len(studies.traces)} rows were simulated beforehand."
     )
-    hidden = len(run.table.features) - sum(
-        column["name"] in run.table.features for column in view["columns"]
-    )
-    if hidden:
-        thinned += f" {hidden} of {len(run.table.features)} features are left out."
-    content = [
-        paragraph(
-            thinned,
-            " With JavaScript, a row under the pointer shows its values, and a click its trace: "
-            f"{len(studies.traces)} rows were simulated beforehand.",
-        ),
-        # Without JavaScript it stays hidden, and the picture is there.
-        Markup('<div id="explore" hidden></div>'),
-        element(
-            "div",
-            picture(png(plot_features(run)), "Simulations over pairs of features, by verdict"),
-            id="still",
-        ),
-    ]
-    return Section("table", "The table, to look at", tuple(content))
+    still = picture(png(plot_features(run)), "Simulations over pairs of features, by verdict")
+    # Without JavaScript the first stays hidden, and the picture is there.
+    hidden_view = Markup('<div id="explore" hidden></div>')
+    content = paragraph(thinned), hidden_view, element("div", still, id="still")
+    return Section("table", "The table, to look at", content)
 
 
 def not_claimed_rows(run: Run, maximum: int = 20) -> Iterable[Child]:
@@ -256,8 +228,8 @@ def not_sampled(run: Run, studies: Studies) -> list[str]:
         "Values outside of the ranges above: nothing is known of them.",
         "Whatever the system does not take from the features, such as other disturbances, parts "
         "and faults: it is as the model fixes it.",
+        what_lies_between(run),
     ]
-    items.append(what_lies_between(run))
     try:
         covered = studies.analysis["coverage"] if studies.analysis.samples is not None else None
     except UnknownNameError:
@@ -280,9 +252,8 @@ def _without_verdict(run: Run) -> list[Markup]:
         )
     ]
     if (first := first_message(run)) is not None:
-        row_number, message = first
-        content.append(paragraph(f"The first message, of row {row_number}:"))
-        content.append(preformatted(message[:2000]))
+        content.append(paragraph(f"The first message, of row {first[0]}:"))
+        content.append(preformatted(first[1][:2000]))
     return content
 
 

@@ -73,37 +73,28 @@ def _unknown(features: Any) -> Any:
 def property_content(
     texts: Mapping[str, str], problem: Problem | None, requirements: Mapping[str, Mapping[str, str]]
 ) -> list[Markup]:
-    """Write properties as formulas and in English.
-
-    **Arguments:**
-    - `texts`: the texts of the formulas by name.
-    - `problem`: the problem, for further information; None if not available.
-    - `requirements`: the requirements of the formulas, by name.
-    """
+    """Write properties as formulas and in English, with what the problem says, if there is one."""
     rows = [
         (name, element("code", text), formula_words(parse(text))) for name, text in texts.items()
     ]
+    kept = "this property" if len(rows) == 1 else f"all of these {len(rows)} properties"
     described = "" if problem is None else problem.description
     content = [paragraph(f"{described[:1].upper()}{described[1:]}.")] if described else []
     content += [
-        paragraph("Every simulation was to keep ", _all(len(rows)), "."),
+        paragraph(f"Every simulation was to keep {kept}."),
         table(["property", "formula", "in words"], rows),
     ]
     if requirements:
-        about = [
-            (name, *(requirements.get(name, {}).get(each, NO_REASON) for each in DEMANDED))
-            for name in texts
-        ]
+        about = []
+        for name in texts:
+            known = requirements.get(name, {})
+            about.append((name, *(known.get(each, NO_REASON) for each in DEMANDED)))
         content.append(table(["requirement", *DEMANDED], about, "The requirements they stand for"))
     if problem is not None:
         content.append(paragraph(ENDS[problem.end]))
         if problem.priority is not None:
             content.append(paragraph(f"Priority among them: {problem.priority}."))
     return content
-
-
-def _all(count: int) -> str:
-    return "this property" if count == 1 else f"all of these {count} properties"
 
 
 def prior_rows(space: FeatureSpace) -> list[tuple[str, str]]:
@@ -113,10 +104,8 @@ def prior_rows(space: FeatureSpace) -> list[tuple[str, str]]:
 
 def _space(run: Run, space: FeatureSpace | None, about: About) -> Markup:
     if space is None:
-        columns = ", ".join(run.table.features)
-        return paragraph(
-            f"The record of the run does not describe its feature space; its columns are {columns}."
-        )
+        text = "The record of the run does not describe its feature space; its columns are"
+        return paragraph(f"{text} {', '.join(run.table.features)}.")
     return space_table(space, {} if run.problem is None else dict(run.problem.nominal or {}), about)
 
 
@@ -127,8 +116,7 @@ def space_table(space: FeatureSpace, nominal: Mapping[str, Any], about: About) -
         usual = _nominal(nominal[name]) if name in nominal else NO_REASON
         unit, reason = about.units.get(name, NO_REASON), about.reasons.get(name, NO_REASON)
         rows.append([name, words, unit, usual, reason])
-    heads = ["feature", "values and prior", "unit", "nominal", "reason of the range"]
-    return table(heads, rows)
+    return table(["feature", "values and prior", "unit", "nominal", "reason of the range"], rows)
 
 
 def _nominal(value: Any) -> str:
@@ -141,15 +129,13 @@ def _constraint(run: Run, space: FeatureSpace | None) -> list[Markup]:
     named = (run.space_data or {}).get("where")
     if named is None and (space is None or space.where is None):
         return []
-    share = (
-        "" if run.acceptance is None else f" It let through {run.acceptance:z.3g} of the proposals."
+    text = (
+        f"A constraint, {named or 'a function'}, decides which of these combinations count: "
+        "the prior is the one above under that condition."
     )
-    return [
-        paragraph(
-            f"A constraint, {named or 'a function'}, decides which of these combinations count: "
-            f"the prior is the one above under that condition.{share}"
-        )
-    ]
+    if run.acceptance is not None:
+        text += f" It let through {run.acceptance:z.3g} of the proposals."
+    return [paragraph(text)]
 
 
 def system_rows(run: Run) -> list[tuple[str, Child]]:

@@ -4,20 +4,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from verifai_jax.addons.reports import run_findings
 from verifai_jax.addons.reports.claims import Claim, about_json, claims_json
 from verifai_jax.addons.reports.commands import report_command, run_command, run_python
 from verifai_jax.addons.reports.markup import element, paragraph, preformatted
 from verifai_jax.addons.reports.page import Page, Section
 from verifai_jax.addons.reports.provenance import Input, Link, Model, chained, folder_inputs
-from verifai_jax.addons.reports.run_findings import (
-    analysis,
-    explore,
-    failures,
-    findings,
-    limits,
-    no_rate,
-    reasons,
-)
 from verifai_jax.addons.reports.run_question import About, prior_rows, question, space_of
 from verifai_jax.addons.reports.sections import (
     MODEL,
@@ -75,18 +67,12 @@ class Reproduction:
 
 
 def run_page(
-    run: Run,
-    about: About,
-    traces: int | None = None,
-    studies: bool | None = None,
-    modes: int | None = None,
-    words: str | None = "",
-) -> Page:
-    """Make the report on a run.
+    run: Run, about: About, traces: int | None = None, studies: bool | None = None,
+    modes: int | None = None, words: str | None = "",
+) -> Page:  # fmt: skip
+    """Make the report on a run, with `traces`, `studies` and `modes` as in `write_report`.
 
-    **Arguments:**
-    - `traces`, `studies`, `modes`: as in `write_report`.
-    - `words`: further words of the command that builds the report again; None without a command.
+    `words` are further ones of the command that builds it again; None leaves that out.
     """
     found = study(run, traces, studies, modes)
     now = None if run.problem is None else run.problem.sources()
@@ -106,27 +92,23 @@ def run_page(
     sections = [
         _answers(run, found, reproduction),
         question(run, about),
-        findings(run),
-        failures(run, found, about),
-        reasons(found),
+        run_findings.findings(run),
+        run_findings.failures(run, found, about),
+        run_findings.reasons(found),
         None if found.modes is None else found.modes.section(about),
-        explore(run, view, found) if run.simulations else None,
-        analysis(found),
-        limits(run, found, assumptions(run)),
+        run_findings.explore(run, view, found) if run.simulations else None,
+        run_findings.analysis(found),
+        run_findings.limits(run, found, assumptions(run)),
         claims_section(claims),
         _reproduce(run, reproduction),
     ]
+    subject = about_json("run", run.formulas, run.requirements, run.model, run.backend)
     return Page(
         title=f"{run.name}: evidence report",
         headline=headline(run),
         tone="fails" if run.table.counts.claimed else "open",
         sections=tuple(section for section in sections if section is not None),
-        claims=claims_json(
-            run.name,
-            claims,
-            reproduction.chain,
-            about_json("run", run.formulas, run.requirements, run.model, run.backend),
-        ),
+        claims=claims_json(run.name, claims, reproduction.chain, subject),
         view=view if run.simulations else None,
         warnings=model_warnings(model, found.findings),
     )
@@ -161,14 +143,11 @@ def assumptions(run: Run) -> list[str]:
     """Return the assumptions under which the numbers are valid."""
     items = [FROM_DATA.format(run.precision), MODEL]
     if (rate := run.failure_rate) is not None:
-        items.append(
-            "Interval of the failure rate: the rows are independent samples of the prior above; "
-            + (
-                "it holds whatever decided when sampling ended (a confidence sequence)."
-                if rate.at_any_time
-                else f"{ENDED.get(run.stopped, BROKE_DOWN)} (Clopper and Pearson's exact interval)."
-            )
-        )
+        text = "Interval of the failure rate: the rows are independent samples of the prior above;"
+        why = f"{ENDED.get(run.stopped, BROKE_DOWN)} (Clopper and Pearson's exact interval)."
+        if rate.at_any_time:
+            why = "it holds whatever decided when sampling ended (a confidence sequence)."
+        items.append(f"{text} {why}")
         if run.table.counts.repetitions.moved:
             items.append(
                 "The system has memory or chance of its own, and a simulation may depend on those "
@@ -187,8 +166,7 @@ def run_claims(run: Run, studies: Studies) -> list[Claim]:
     """Return the claims that a run supports."""
     counts, table_ = run.table.counts, "the table of all simulations"
     common = (FROM_DATA.format(run.precision), MODEL)
-    texts: list[tuple[str, tuple[str, ...], tuple[str, ...]]] = []
-    texts.append((_finding(run), (table_,), common))
+    texts: list[tuple[str, tuple[str, ...], tuple[str, ...]]] = [(_finding(run), (table_,), common)]
     if confirmed := run.verdict_counts.get("confirmed"):
         checked = describe_checks(run.checks, of_step=False)
         sentence = f"{confirmed:,} of these failures were seen again {checked}."
@@ -200,24 +178,20 @@ def run_claims(run: Run, studies: Studies) -> list[Claim]:
             f"{counts.not_replayed:,} that were not replayed."
         )
         texts.append((sentence, ("closer replays, column verdict",), common))
-    for name, rate in (
-        ("as simulated", run.failure_rate),
-        ("confirmed", run.confirmed_failure_rate),
-    ):
+    rates = {"as simulated": run.failure_rate, "confirmed": run.confirmed_failure_rate}
+    for name, rate in rates.items():
         if rate is not None:
             sentence = f"The failure rate under the prior is {rate}, {name}."
             texts.append((sentence, (table_,), tuple(assumptions(run))))
     for failure in studies.failures[:1]:
         row = run.table.row(failure.row).to_dict()
         where = format_features({name: row[name] for name in run.table.features})
-        sentence = (
-            f"The property fails at {where}, by {abs(float(row['rho'])):z.4g}: row {failure.row}."
-        )
+        depth = f"{abs(float(row['rho'])):z.4g}"
+        sentence = f"The property fails at {where}, by {depth}: row {failure.row}."
         texts.append((sentence, (f"row {failure.row} of the table", "its replay"), common))
     if (small := studies.shrunk) is not None and small.count:
-        sentence = (
-            f"{small.count} of {len(small.u)} inputs away from nominal are enough for a failure."
-        )
+        apart = f"{small.count} of {len(small.u)} inputs away from nominal"
+        sentence = f"{apart} are enough for a failure."
         less = "That fewer are not enough is not claimed: the search for fewer had a budget."
         texts.append((sentence, ("a simulation of the shrunk form",), (*common, less)))
     if studies.modes is not None:
@@ -253,51 +227,41 @@ def run_inputs(run: Run) -> list[Input]:
 
 
 def _reproduce(run: Run, reproduction: Reproduction) -> Section:
-    command = run_command(run)
-    content = [
-        element("h3", "The run"),
-        *([preformatted(command)] if command else []),
+    content = [element("h3", "The run")]
+    if command := run_command(run):
+        ended = f"The run was ended by {run.stopped}; repeated, it makes as many simulations as it"
+        early = run.stopped not in ("budget", "exhausted")
+        content += [paragraph(f"{ended} had made then.")] if early else []
+        content.append(preformatted(command))
+    worst = run.table.counts.best or 0
+    content += [
         preformatted(run_python(run)),
         element("h3", "A failure"),
-        preformatted(replay_command(run, _worst(run)) if run.simulations else ""),
+        preformatted(replay_command(run, worst) if run.simulations else ""),
     ]
-    if command and run.stopped not in ("budget", "exhausted"):
-        content.insert(
-            1,
-            paragraph(
-                f"The run was ended by {run.stopped}; repeated, it makes as many simulations as it "
-                "had made then."
-            ),
-        )
     if reproduction.command is not None:
-        content += [
-            element("h3", "This report"),
-            preformatted(reproduction.command),
-            paragraph(
-                "From the same folder, with the versions below, the file is the same byte for byte."
-            ),
-        ]
-    content += [
-        paragraph(f"The run was made with verifai_jax {run.version}, this report with:"),
-        *provenance_content(reproduction.links, reproduction.model),
-    ]
+        text = "From the same folder, with the versions below, the file is the same byte for byte."
+        content += [element("h3", "This report"), preformatted(reproduction.command)]
+        content.append(paragraph(text))
+    content.append(paragraph(f"The run was made with verifai_jax {run.version}, this report with:"))
+    content += provenance_content(reproduction.links, reproduction.model)
     return Section("reproduce", "How to reproduce it", tuple(content))
-
-
-def _worst(run: Run) -> int:
-    best = run.table.counts.best
-    return 0 if best is None else best
 
 
 def _answers(run: Run, studies: Studies, reproduction: Reproduction) -> Section:
     """Answer the questions of an auditor in a few words each, with links to the long answers."""
-    counts = run.table.counts
-    space = space_of(run)
-    prior = (
-        "see the table" if space is None else "; ".join(f"{n}: {w}" for n, w in prior_rows(space))
-    )
+    counts, space, prior = run.table.counts, space_of(run), "see the table"
+    if space is not None:
+        prior = "; ".join(f"{name}: {words}" for name, words in prior_rows(space))
     words = "; ".join(formula_words(parse(text)) for text in run.formulas.values())
     verdicts = ", ".join(f"{count:,} {verdict}" for verdict, count in run.verdict_counts.items())
+    rate = run_findings.no_rate(run)
+    if run.failure_rate is not None:
+        rate = f"{run.failure_rate}. {assumptions(run)[2]}"
+    again = replay_command(run, studies.failures[0].row) if studies.failures else "there is none"
+    made = f"Seed {run.seed}, verifai_jax {run.version}; chain {reproduction.chain[:16]}."
+    decided = " ".join(f"{note}." for note in run.notes) or "Nothing that it noted."
+    outside = "Values outside of the ranges above, and what follows."
     rows = [
         ("What was claimed?", headline(run), "claims"),
         ("What was the property?", words, "asked"),
@@ -305,33 +269,11 @@ def _answers(run: Run, studies: Studies, reproduction: Reproduction) -> Section:
         ("How many simulations were there?", f"{run.simulations:,}", "found"),
         ("How many of them had no verdict?", f"{counts.without_verdict:,}", "limits"),
         ("How many violations were confirmed?", verdicts or "none was replayed", "found"),
-        (
-            "Which interval holds, under which assumption?",
-            no_rate(run)
-            if run.failure_rate is None
-            else f"{run.failure_rate}. {assumptions(run)[2]}",
-            "limits",
-        ),
-        (
-            "What was not sampled?",
-            "Values outside of the ranges above, and what follows.",
-            "limits",
-        ),
-        (
-            "How is a failure reproduced?",
-            replay_command(run, studies.failures[0].row) if studies.failures else "there is none",
-            "failures",
-        ),
-        (
-            "With which seed, code and versions?",
-            f"Seed {run.seed}, verifai_jax {run.version}; chain {reproduction.chain[:16]}.",
-            "reproduce",
-        ),
+        ("Which interval holds, under which assumption?", rate, "limits"),
+        ("What was not sampled?", outside, "limits"),
+        ("How is a failure reproduced?", again, "failures"),
+        ("With which seed, code and versions?", made, "reproduce"),
         model_answer(reproduction.model),
-        (
-            "What did the tool decide by itself?",
-            " ".join(f"{note}." for note in run.notes) or "Nothing that it noted.",
-            "limits",
-        ),
+        ("What did the tool decide by itself?", decided, "limits"),
     ]
     return answers_section(rows)

@@ -4,11 +4,12 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
-from verifai_jax.addons.reports.claims import Claim, claims_json
+from verifai_jax.addons.reports.claims import Claim, about_json, claims_json
 from verifai_jax.addons.reports.markup import Child, Markup, bullets, element, paragraph, table
 from verifai_jax.addons.reports.page import Page, Section, before_limits
 from verifai_jax.addons.reports.provenance import Input, Link, Model, chained, versions
 from verifai_jax.addons.reports.run_question import About, property_content, space_table
+from verifai_jax.problem.model_digest import digest_of_model
 from verifai_jax.problem.problem import Problem
 
 MODEL = (
@@ -21,6 +22,7 @@ NOT_SEEN = (
     "guaranteed bound needs no such assumption."
 )
 """Assumption of an interval that a search has helped to find."""
+
 MAX_FINDINGS = 5
 """Rows that do not give their numbers again that are listed on the first page."""
 SAMPLES = "The guaranteed bound rests on independent samples of the prior, and on nothing else."
@@ -30,68 +32,45 @@ SAMPLES = "The guaranteed bound rests on independent samples of the prior, and o
 def claims_section(claims: list[Claim]) -> Section:
     """Write claims with their evidence, and shared assumptions only once."""
     shared = list(dict.fromkeys(text for each in claims for text in each.assumptions))
-    rows = [
-        (
-            each.identifier,
-            each.claim,
-            "; ".join(each.evidence),
-            ", ".join(f"A{shared.index(text) + 1}" for text in each.assumptions),
-        )
-        for each in claims
-    ]
-    return Section(
-        "claims",
-        "Claims, for a safety case",
-        (
-            paragraph(
-                "The same is in this file as JSON, in the element ",
-                element("code", "claims-json"),
-                ", and in a file beside it.",
-            ),
-            table(["claim", "sentence", "evidence", "assumes"], rows),
-            table(["assumption", "sentence"], [(f"A{i + 1}", t) for i, t in enumerate(shared)]),
-        ),
-    )
+    rows = []
+    for each in claims:
+        assumed = ", ".join(f"A{shared.index(text) + 1}" for text in each.assumptions)
+        rows.append((each.identifier, each.claim, "; ".join(each.evidence), assumed))
+    name = element("code", "claims-json")
+    content = (
+        paragraph("The same is in this file as JSON, in the element ", name,
+                  ", and in a file beside it."),
+        table(["claim", "sentence", "evidence", "assumes"], rows),
+        table(["assumption", "sentence"], [(f"A{i + 1}", t) for i, t in enumerate(shared)]),
+    )  # fmt: skip
+    return Section("claims", "Claims, for a safety case", content)
 
 
 def model_warnings(model: Model, findings: Sequence[str] = ()) -> tuple[Markup, ...]:
-    """Write that the model has changed, with both hashes of each file; often empty.
-
-    **Arguments:**
-    - `model`: the files of the model. `findings`: sentences on rows that did not reproduce their
-      numbers.
-    - `findings`: sentences on rows that did not reproduce their numbers.
-    """
+    """Write how the model has changed, and which rows did not give their numbers; often empty."""
     content: list[Markup] = []
     if model.changes:
-        content.append(
-            paragraph(
-                element("strong", "The model has changed since this result was made. "),
-                "Numbers of the result are of the model as it was; whatever was simulated for this "
-                "report is of the model as it is now.",
-            )
+        changed = element("strong", "The model has changed since this result was made. ")
+        text = (
+            "Numbers of the result are of the model as it was; whatever was simulated for this "
+            "report is of the model as it is now."
         )
-        rows = [
-            (
-                change.name,
-                element("code", change.was or "had no part in it"),
-                element("code", change.now or "is missing"),
+        rows = []
+        for name, was, now in model.changes:
+            codes = (
+                element("code", was or "had no part in it"),
+                element("code", now or "is missing"),
             )
-            for change in model.changes
-        ]
-        content.append(table(["file", "SHA-256 when it ran", "SHA-256 now"], rows))
+            rows.append((name, *codes))
+        hashes = table(["file", "SHA-256 when it ran", "SHA-256 now"], rows)
+        content += [paragraph(changed, text), hashes]
     if len(model.parts) > 1:
-        notes = [f"from row {part.first} on" for part in model.parts[1:]]
-        content.append(
-            paragraph(
-                "The result is of several models or versions: it went on with others "
-                f"{' and '.join(notes)}."
-            )
-        )
+        notes = " and ".join(f"from row {part.first} on" for part in model.parts[1:])
+        text = "The result is of several models or versions: it went on with others"
+        content.append(paragraph(f"{text} {notes}."))
     if findings:
-        content.append(
-            paragraph(element("strong", "Simulated again, rows do not give their numbers:"))
-        )
+        text = "Simulated again, rows do not give their numbers:"
+        content.append(paragraph(element("strong", text)))
         shown = [*findings[:MAX_FINDINGS]]
         if len(findings) > MAX_FINDINGS:
             shown.append(f"and {len(findings) - MAX_FINDINGS} more")
@@ -106,15 +85,10 @@ def model_answer(model: Model) -> tuple[str, str, str]:
 
 def chain_table(links: tuple[Link, ...]) -> Markup:
     """Write the inputs of a report with their hashes."""
-    code = [
-        (link.input.name, link.input.role, element("code", link.input.sha256), _short(link.chain))
-        for link in links
-    ]
-    return table(["input", "what it is", "SHA-256", "chain"], code)
-
-
-def _short(text: str) -> Markup:
-    return element("code", text[:16])
+    rows = []
+    for (name, role, sha256), chain in links:
+        rows.append((name, role, element("code", sha256), element("code", chain[:16])))
+    return table(["input", "what it is", "SHA-256", "chain"], rows)
 
 
 def version_table(model: Model) -> Markup:
@@ -128,12 +102,11 @@ def version_table(model: Model) -> Markup:
 
 def chain_words(chain: str) -> Markup:
     """Explain the chain, and write its last hash."""
-    return paragraph(
+    text = (
         "Each link is the SHA-256 of the link before (empty for the first), a line break, the name "
-        "of the input, a line break, and its SHA-256. The last link stands for all inputs: ",
-        element("code", chain),
-        ".",
+        "of the input, a line break, and its SHA-256. The last link stands for all inputs: "
     )
+    return paragraph(text, element("code", chain), ".")
 
 
 def provenance_content(links: Sequence[Link], model: Model) -> list[Markup]:
@@ -163,20 +136,24 @@ def problem_content(problem: Problem, about: About) -> list[Markup]:
     ]
 
 
-def answers_section(rows: Sequence[tuple[str, str, str]]) -> Section:
-    """Answer an auditor's questions, with links to the detailed answers.
+def subject_of(
+    kind: str, problem: Problem | None, model: Model, formulas: Mapping[str, str] | None = None
+) -> dict[str, Any]:
+    """Return what claims are about, as far as a problem says it; by default on its formulas."""
+    if problem is None:
+        return {}
+    texts = {name: str(each) for name, each in (formulas or problem.formulas).items()}
+    digest = "" if model.changes else digest_of_model(problem)
+    return about_json(kind, texts, problem.requirement_entries(), digest)
 
-    **Arguments:**
-    - `rows`: question, answer, and the anchor of the section with details.
-    """
+
+def answers_section(rows: Sequence[tuple[str, str, str]]) -> Section:
+    """Answer an auditor's questions; each row has the anchor of the section with details, too."""
     cells: list[list[Child]] = [
         [asked, answer, element("a", anchor, href=f"#{anchor}")] for asked, answer, anchor in rows
     ]
-    return Section(
-        "answers",
-        "In short: the questions of an auditor",
-        (table(["question", "answer", "section"], cells),),
-    )
+    content = table(["question", "answer", "section"], cells)
+    return Section("answers", "In short: the questions of an auditor", (content,))
 
 
 def result_page(
@@ -199,26 +176,23 @@ def result_page(
     """Make the report on a result; all kinds of results have the same sections.
 
     **Arguments:**
-    - `name`, `kind`: the subject of the claims, and the kind of report, which is its title.
-    - `headline`, `tone`, `claims`: the finding, as in `Page`, and the supported claims.
-    - `model`, `files`: files of the model, and of the result.
-    - `answers`: further questions and answers, as in `answers_section`.
-    - `asked`, `found`, `limits`, `reproduce`: content of these sections.
-    - `about`: the subject of the claims, as in `claims_json`.
-    - `warned`: the model whose changes the page warns of, if it is not `model`.
+    - `name`, `kind`: the subject of the claims, and the kind of report; both are its title.
+    - `headline`, `tone`, `claims`, `about`: as in `Page` and `claims_json`.
+    - `model`, `files`: files of the model, and of the result; `warned`: the model whose changes the
+      page warns of, if it is another.
+    - `answers`, `asked`, `found`, `limits`, `reproduce`: content of these sections.
     """
     links = tuple(chained([*files, *model.inputs]))
     chain = links[-1].chain if links else ""
     first = ("What was claimed?", headline, "claims")
+    again = (*reproduce, *provenance_content(links, model))
     sections = (
         answers_section([first, *answers, model_answer(model)]),
         Section("asked", "What was asked", tuple(asked)),
         Section("found", "What was found", tuple(found)),
         Section("limits", "What was not shown", (bullets(limits),)),
         claims_section(claims),
-        Section(
-            "reproduce", "How to reproduce it", (*reproduce, *provenance_content(links, model))
-        ),
+        Section("reproduce", "How to reproduce it", again),
     )
     claimed = claims_json(name, claims, chain, about)
     warnings = model_warnings(warned or model)

@@ -19,13 +19,9 @@ READERS = "verifai_jax.reports"
 
 
 def read_result(file: Path, space: FeatureSpace | None = None) -> Any:
-    """Read an estimate, a comparison or a verification from the JSON written by a command.
+    """Read an estimate, a comparison without its pairs, or a verification, written by a command.
 
-    **Arguments:**
-    - `file`: the output of `verifai-jax estimate --json` or `verifai-jax compare --json`, or the
-      file of `verifai-jax verify --into`.
-    - `space`: the space of the compared problems, which the JSON does not contain.
-    **Returns:** the result; a comparison does not have its single pairs.
+    `space` is that of the compared problems, which the JSON does not contain.
     **Raises:** `FileNotFoundError` if there is no such file; `ValueError` for other content.
     """
     try:
@@ -46,20 +42,12 @@ def read_result(file: Path, space: FeatureSpace | None = None) -> Any:
 
 
 def sources_of(data: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the record of what a result was made of, empty if it has none.
-
-    **Raises:** `ValueError` for one of another form.
-    """
+    """Return the record of what a result was made of, checked; empty if it has none."""
     return Sources.from_json(data).to_json() if data else {}
 
 
-def values_of(
-    kind: type, data: Mapping[str, Any], optional: Collection[str] = ()
-) -> dict[str, Any]:
-    """Return the entries that are fields of a class, each of the kind of its annotation.
-
-    - `optional`: the names of entries that may be null.
-    """
+def values_of(kind: type, data: Mapping[str, Any], null: Collection[str] = ()) -> dict[str, Any]:
+    """Return the entries that are fields of a class, as annotated; those of `null` may be it."""
     values = {}
     for field in fields(kind):
         if field.name not in data:
@@ -67,7 +55,7 @@ def values_of(
                 raise KeyError(field.name)
             continue
         value = data[field.name]
-        if value is None and field.name not in optional:
+        if value is None and field.name not in null:
             raise KeyError(field.name)
         wanted = {int: int, float: (int, float), str: str}.get(field.type)
         if wanted is not None and value is not None and not isinstance(value, wanted):

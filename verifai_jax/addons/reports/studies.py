@@ -71,12 +71,9 @@ class Failure:
 class Studies:
     """The studies of a run for its report.
 
-    - `failures`: a few failures, the worst first.
-    - `traces`: data of rows simulated for the report, by row number.
-    - `animation`: the animation of the first failure, a GIF; None without one.
-    - `explained`, `shrunk`: those of the worst failure; None if not possible.
-    - `analysis`: the analysis of the table.
-    - `modes`: the modes of failure with their probabilities; None if not requested.
+    - `failures`: a few failures, the worst first; `traces`: data of simulated rows by number.
+    - `animation` (a GIF), `explained`, `shrunk`: those of the worst failure, if possible.
+    - `analysis`, `modes`: of the table, and those of failure, if they were asked for.
     - `left_out`: whole sentences on what was not done, and why.
     - `findings`: sentences on rows that did not reproduce their numbers.
     """
@@ -95,19 +92,10 @@ class Studies:
 def study(
     run: Run, traces: int | None = None, studies: bool | None = None, modes: int | None = None
 ) -> Studies:
-    """Study a run for its report; the run and its seed determine the result.
-
-    **Arguments:**
-    - `run`: the run.
-    - `traces`: maximum number of rows to simulate; a default when left out.
-    - `studies`: whether to explain and shrink the worst failure, with up to 2000 simulations; by
-      default unless the system is a slow black box.
-    - `modes`: number of simulations for the modes of failure and their probabilities; or none.
-    """
-    left_out: list[str] = []
-    found = analyze(run)
+    """Study a run for its report, as `write_report` says; run and seed decide the result."""
+    left_out, findings, data = list[str](), list[str](), {}
+    found, problem = analyze(run), run.problem
     rows = _failures_to_show(run, found)
-    problem = run.problem
     if problem is None:
         left_out.append(
             "The run was read without its problem, so that nothing was simulated again: there are "
@@ -118,8 +106,7 @@ def study(
     slow = problem.black_box and STUDIED * run.run_seconds > PATIENCE * run.simulations
     if traces is None:
         traces = TRACES_OF_A_BLACK_BOX if slow else TRACES
-    failures, data = [], {}
-    findings: list[str] = []
+    failures = []
 
     def replayed(row: int) -> Replay:
         again = run.replay(row)
@@ -138,41 +125,26 @@ def study(
     animation = None if worst is None else _animated(worst, left_out)
     explained = shrunk = None
     if failures and (studies if studies is not None else not slow):
-        explained = _attempt(
-            f"{WORST} be explained", lambda: explain(run, failures[0].row), left_out
-        )
-        shrunk = _attempt(f"{WORST} be shrunk", lambda: shrink(run, failures[0].row), left_out)
+        row = failures[0].row
+        explained = _attempt(f"{WORST} be explained", lambda: explain(run, row), left_out)
+        shrunk = _attempt(f"{WORST} be shrunk", lambda: shrink(run, row), left_out)
     elif failures:
-        left_out.append("The worst failure was not explained and not shrunk, as was asked.")
-        if studies is None:
-            left_out[-1] = (
-                "The worst failure was not explained and not shrunk, since simulations of this "
-                "black box take long; studies=True does both."
-            )
+        long = "since simulations of this black box take long; studies=True does both"
+        why = long if studies is None else "as was asked"
+        left_out.append(f"The worst failure was not explained and not shrunk, {why}.")
     directions = None if modes is None else _attempt(MODES, lambda: _modes(run, modes), left_out)
     return Studies(
-        tuple(failures),
-        data,
-        animation,
-        explained,
-        shrunk,
-        found,
-        directions,
-        tuple(left_out),
+        tuple(failures), data, animation, explained, shrunk, found, directions, tuple(left_out),
         tuple(findings),
-    )
+    )  # fmt: skip
 
 
 def _modes(run: Run, budget: int) -> ModesSection:
     assert run.problem is not None
     return extension("verifai_jax.reports", "modes")(
-        run.problem,
-        budget,
-        seed=run.seed,
-        precision=run.precision,
-        backend=run.backend,
+        run.problem, budget, seed=run.seed, precision=run.precision, backend=run.backend,
         progress=False,
-    )
+    )  # fmt: skip
 
 
 def _failures_to_show(run: Run, found: Analysis) -> list[tuple[int, str]]:
@@ -211,8 +183,7 @@ def _attempt(what: str, work: Callable[[], Result], left_out: list[str]) -> Resu
     try:
         return work()
     except Exception as error:  # A drawing or a system of somebody else may raise anything.
-        why = one_line(format_error(error))
-        left_out.append(f"{what}: {why}.")
+        left_out.append(f"{what}: {one_line(format_error(error))}.")
         return None
 
 

@@ -50,13 +50,9 @@ MAX_COMPONENTS = 6
 def view_data(
     run: Run, traces: Mapping[int, Mapping[str, Any]], command: str | None = None
 ) -> dict[str, Any]:
-    """Describe a run's table for `view.js`.
+    """Describe the table of a run with rows for `view.js`, those with `traces` among them.
 
-    **Arguments:**
-    - `run`: a run with at least one row.
-    - `traces`: traces by row number, from `trace_data`; these rows are among those shown.
-    - `command`: the command that simulates a row again, to which its number is appended.
-    **Returns:** plain data; `shown` and `simulations` tell how many rows were left out.
+    The number of a row is appended to `command`, which simulates it again.
     """
     table = run.table.all
     columns = {str(name): table[name].to_numpy() for name in table.columns}
@@ -77,15 +73,15 @@ def view_data(
     names = [column["name"] for column in described]
     wanted = [names.index(name) for name in features if name in names]
     axes = [*wanted, 0, 0][:2]
-    counts = [int(np.sum(group == i)) for i in range(len(GROUPS))]
+    groups = [
+        {"name": name, "color": color, "count": f"{np.sum(group == i):,}"}
+        for i, (name, color, _) in enumerate(GROUPS)
+    ]
     return {
         "columns": described,
-        "rows": [int(number) for number in numbers[indices]],
-        "group": [int(each) for each in group[indices]],
-        "groups": [
-            {"name": name, "color": color, "count": f"{count:,}"}
-            for (name, color, _), count in zip(GROUPS, counts, strict=True)
-        ],
+        "rows": numbers[indices].tolist(),
+        "group": group[indices].tolist(),
+        "groups": groups,
         "axes": axes,
         "parallel": [*wanted[: MAX_PARALLEL - 1], 0],
         "traces": {str(number): dict(trace) for number, trace in traces.items()},
@@ -121,11 +117,7 @@ def _column(name: str, values: "pd.Series") -> dict[str, Any] | None:
     if not levels or len(levels) > MAX_CHOICES:
         return None
     codes = {text: i for i, text in enumerate(levels)}
-    return {
-        "name": name,
-        "levels": levels,
-        "values": [None if text is None else codes[text] for text in texts],
-    }
+    return {"name": name, "levels": levels, "values": [codes.get(text) for text in texts]}
 
 
 def numbers_of(values: Any) -> list[float | int | None]:
@@ -141,11 +133,7 @@ def _number(value: float) -> float | int | None:
 
 
 def trace_data(replay: Replay, label: str = "") -> dict[str, Any]:
-    """Describe the trace of a replay: the signals of its formulas, their bounds, the instant.
-
-    **Arguments:**
-    - `label`: its name in the list of traces; the row number when left out.
-    """
+    """Describe the trace of a replay: the signals of its formulas, their bounds, the instant."""
     trace, problem = replay.trace, replay.problem
     clock = np.asarray(trace.clock())
     samples = np.unique(np.linspace(0, len(clock) - 1, MAX_SAMPLES).astype(int))
@@ -161,13 +149,9 @@ def trace_data(replay: Replay, label: str = "") -> dict[str, Any]:
             for limit in map(constant_value, limits)
             if limit is not None
         ]
-        signals.append(
-            {
-                "name": one_line(name),
-                "values": [numbers_of(each) for each in values[samples].T[:MAX_COMPONENTS]],
-                "bounds": numbers_of(list(dict.fromkeys(bounds))),
-            }
-        )
+        shown = [numbers_of(each) for each in values[samples].T[:MAX_COMPONENTS]]
+        bounds = numbers_of(list(dict.fromkeys(bounds)))
+        signals.append({"name": one_line(name), "values": shown, "bounds": bounds})
     decisive = decisive_instant(problem.formulas[replay.worst], trace, problem.end)
     verdict = "violates" if replay.violated else "keeps"
     words = f"Row {replay.row} {verdict} the property, robustness {replay.rho[replay.worst]:z.4g}."
@@ -183,13 +167,9 @@ def trace_data(replay: Replay, label: str = "") -> dict[str, Any]:
 
 
 def rows_to_trace(run: Run, maximum: int, first: Sequence[int] = ()) -> dict[int, str]:
-    """Choose the most important rows, each with a word of explanation.
+    """Choose the most important rows, after the `first`, each with a word of explanation.
 
     These are the worst claimed rows, those nearest to the bound on both sides, and unclaimed ones.
-
-    **Arguments:**
-    - `maximum`: maximum number of rows.
-    - `first`: rows that come first, such as the failures shown in a report.
     """
     chosen = {int(number): f"row {number}: shown above" for number in first[:maximum]}
     table = run.table

@@ -19,10 +19,7 @@ def explore(run: Run) -> Any:
     """Return a widget of a run's table, or a picture if widgets are not available.
 
     Hovering over a row shows its values. Clicking on it simulates it again and shows its trace.
-
-    **Arguments:**
-    - `run`: a run with at least one row.
-    **Returns:** a widget of anywidget; without that package the figure of `run.plot()`.
+    Without the package anywidget it is the figure of `run.plot()`.
     """
     try:
         widget = _widget_class()

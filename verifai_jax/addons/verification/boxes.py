@@ -101,10 +101,8 @@ class Boxes:
 
     def with_more(self, others: "Boxes") -> "Boxes":
         """Return these boxes followed by others."""
-        return Boxes(
-            *(np.concatenate([getattr(self, f.name), getattr(others, f.name)])
-              for f in fields(self))
-        )  # fmt: skip
+        pairs = ((getattr(self, f.name), getattr(others, f.name)) for f in fields(self))
+        return Boxes(*map(np.concatenate, pairs))
 
     @property
     def mass(self) -> Float[np.ndarray, " n"]:
@@ -122,10 +120,8 @@ class Boxes:
         for j in range(wide.shape[1]):
             edges = enclosure.ranges.edges[j]
             if edges is not None:
-                inside = np.searchsorted(edges, self.high[:, j]) - np.searchsorted(
-                    edges, self.low[:, j]
-                )
-                wide[:, j] = inside > 1
+                first, last = (np.searchsorted(edges, end[:, j]) for end in (self.low, self.high))
+                wide[:, j] = last - first > 1
         return wide
 
     def halves(self, coordinate: Int[np.ndarray, " n"], enclosure: Enclosure) -> "Boxes":
@@ -142,10 +138,8 @@ class Boxes:
                 own = coordinate == j
                 first, last = (np.searchsorted(edges, end[own]) for end in (low, high))
                 middle[own] = edges[(first + last) // 2]
-        left, right = (
-            Boxes.between(self.low, self.high.copy(), self.inside),
-            Boxes.between(self.low.copy(), self.high, self.inside),
-        )
+        left = Boxes.between(self.low, self.high.copy(), self.inside)
+        right = Boxes.between(self.low.copy(), self.high, self.inside)
         left.high[rows, coordinate] = right.low[rows, coordinate] = middle
         left.lowest[:] = right.lowest[:] = self.lowest
         known = self.has_witness

@@ -121,10 +121,9 @@ class BranchAndBound:
             self.boxes = self.boxes.with_more(parts)
 
     def star(self, some: Boxes) -> tuple[Float[np.ndarray, "n k"], Float[np.ndarray, "n k"]]:
-        """Simulate the middle of boxes, and points on both sides of it along each coordinate.
+        """Return robustness (or NaN) and failures at the middle of boxes and on its sides.
 
-        **Returns:** the robustness, NaN without a verdict, and which points fail. A failing point
-        becomes the witness of its box.
+        The other points are on both sides along each coordinate; a failing one becomes the witness.
         """
         dim = some.low.shape[1]
         offsets = np.concatenate([np.zeros((1, dim)), *(

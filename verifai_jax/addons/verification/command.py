@@ -52,6 +52,5 @@ def verify(
         click.echo(f"  result       {found.save(into)}")
     if report is not None:
         click.echo(f"  report       {found.report(report, problem=problem)}")
-    check_gate(
-        fail_on, {"counterexample": found.broken.mass > 0, "undecided": found.proved.mass < 1}
-    )
+    failed = {"counterexample": found.broken.mass > 0, "undecided": found.proved.mass < 1}
+    check_gate(fail_on, failed)

@@ -53,12 +53,7 @@ class Bounds(NamedTuple):
 
 
 class Enclosure:
-    """The program of one simulation of a problem, evaluated with sets of features.
-
-    **Arguments:**
-    - `problem`: a checked problem.
-    - `precision`: the precision of simulations, `"float32"` or `"float64"`.
-    """
+    """The program of one simulation of a checked problem, evaluated with sets of features."""
 
     def __init__(self, problem: Problem, precision: str) -> None:
         self.problem, self.precision = problem, precision
@@ -92,10 +87,7 @@ class Enclosure:
         self.ranges = FeatureRanges(space, precision)
 
     def __call__(self, low: Corners, high: Corners) -> Bounds:
-        """Return bounds over boxes `[n, dim]` between these points of the unit cube.
-
-        **Raises:** `MissingRule` for an operation of the system that sets cannot go through.
-        """
+        """Return bounds over boxes `[n, dim]` between these points, or raise `MissingRule`."""
         blocks = [slice(i, i + TOGETHER) for i in range(0, len(low), TOGETHER)]
         leaves = self._leaves(low, high)
 

@@ -2,17 +2,16 @@
 
 from typing import Any
 
-from verifai_jax.addons.reports.claims import Claim, about_json
+from verifai_jax.addons.reports.claims import Claim
 from verifai_jax.addons.reports.markup import Child, paragraph, picture, preformatted, table
 from verifai_jax.addons.reports.page import Page
 from verifai_jax.addons.reports.provenance import Model
 from verifai_jax.addons.reports.run_question import About
-from verifai_jax.addons.reports.sections import MODEL, problem_content, result_page
+from verifai_jax.addons.reports.sections import MODEL, problem_content, result_page, subject_of
 from verifai_jax.addons.reports.studies import png
 from verifai_jax.addons.verification.picture import plot_verification, with_unit
 from verifai_jax.addons.verification.result import Verification
 from verifai_jax.core.messages.text import format_percent
-from verifai_jax.problem.model_digest import digest_of_model
 from verifai_jax.problem.problem import Problem
 
 SAMPLED = (
@@ -25,11 +24,7 @@ MAX_BOXES = 40
 
 
 def verification_page(result: Verification, about: About, problem: Problem | None) -> Page:
-    """Make the report on a verification.
-
-    **Arguments:**
-    - `problem`: the verified problem; None if not available.
-    """
+    """Make the report on a verification, with its problem if that is available."""
     about.check(None, result.features)
     model = Model.of([result.sources], None if problem is None else problem.sources())
     proved, broken, undecided = result.proved, result.broken, result.undecided
@@ -74,21 +69,21 @@ def verification_page(result: Verification, about: About, problem: Problem | Non
         [f"{v:z.4g}" if isinstance(v, float) else str(v) for v in values]
         for values in largest[[*columns, *ends]].itertuples(index=False)
     ]
+    largest_boxes = "The most probable boxes, between these values of the features."
+    open_part = (
+        f"{shares[2]} {of} is undecided; at most {format_percent(result.failure_bound)} of it "
+        f"fails, at {sure}."
+    )
+    python = (
+        f"vj.verify(problem, boxes={result.looked_at}, precision={result.precision!r}, "
+        f"confidence={result.confidence}, continuous={result.continuous})"
+    )
     drawn = png(plot_verification(result, units=about.units))
     asked = [] if problem is None else problem_content(problem, about)
-    subject: dict[str, Any] = {}
-    if problem is not None:
-        digest = "" if model.changes else digest_of_model(problem)
-        entries = problem.requirement_entries()
-        subject = about_json("verification", result.formulas, entries, digest)
     return result_page(
-        result.name,
-        "evidence report on a verification",
-        headline,
-        "fails" if broken.mass else "open",
-        claims,
-        model,
-        about=subject,
+        result.name, "evidence report on a verification", headline,
+        "fails" if broken.mass else "open", claims, model,
+        about=subject_of("verification", problem, model, result.formulas),
         answers=[
             ("What was the prior?", "see what was asked", "asked"),
             ("How many boxes are there?", boxes, "found"),
@@ -99,26 +94,8 @@ def verification_page(result: Verification, about: About, problem: Problem | Non
         found=[
             table(["part", "of the prior", "of the volume"], parts),
             picture(drawn, "The parts, two coordinates at a time"),
-            table(
-                [*columns, *heads],
-                rows,
-                "The most probable boxes, between these values of the features.",
-            ),
+            table([*columns, *heads], rows, largest_boxes),
         ],
-        limits=[
-            f"{shares[2]} {of} is undecided; at most "
-            f"{format_percent(result.failure_bound)} of it fails, at {sure}.",
-            verified,
-            SAMPLED,
-            MODEL,
-            *tails,
-            *result.notes,
-        ],
-        reproduce=[
-            preformatted(
-                f"vj.verify(problem, boxes={result.looked_at}, precision={result.precision!r}, "
-                f"confidence={result.confidence}, continuous={result.continuous})"
-            ),
-            paragraph(f"Made with verifai_jax {result.version}."),
-        ],
-    )
+        limits=[open_part, verified, SAMPLED, MODEL, *tails, *result.notes],
+        reproduce=[preformatted(python), paragraph(f"Made with verifai_jax {result.version}.")],
+    )  # fmt: skip

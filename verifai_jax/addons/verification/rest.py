@@ -27,11 +27,7 @@ where there is no cut any more."""
 
 
 class Rest:
-    """The part of the unit cube that is not decided, and that the constraint accepts.
-
-    **Arguments:**
-    - `boxes`: the partition of the cube.
-    - `states`: the states that count as decided.
+    """The part of the unit cube in no box of these states, which are decided, or refused.
 
     `mass` is its probability with what the constraint refuses of its boxes, and `cut` whether it
     may refuse some. `decided` is the probability of the decided boxes, which it accepts, and
@@ -61,12 +57,9 @@ class Rest:
     def is_decided(
         self, points: Float[Any, "*n dim"], margin: float = 0.0, xp: Any = np
     ) -> Bool[Any, "*n"]:
-        """Return whether points lie in decided boxes, and not near their faces inside the cube.
+        """Return which points lie in decided boxes, at a margin from their faces in the cube.
 
-        **Arguments:**
-        - `points`: points of the unit cube.
-        - `margin`: required distance from the faces.
-        - `xp`: NumPy, or `jax.numpy`, which may trace the points.
+        `xp` is NumPy, or `jax.numpy`, which may trace the points.
         """
         axis, cut, after, low, high = map(xp.asarray, self._nodes)
         node = xp.zeros(points.shape[:-1], int)

@@ -287,20 +287,13 @@ class Verification(Drawn, Reported, InNotebook):
         proved, broken, undecided = self.proved, self.broken, self.undecided
         shares = [format_percent(part.mass) for part in (proved, broken, undecided)]
         count = counted(int(self.boxes.samples.sum()), "sample")
+        inside, bound = map(format_percent, (self.throughout.low, self.failure_bound))
+        certain = f"boxes with a point that fails for certain; in {inside}"
         lines = [
             f"{self.name}: {shares[0]} {of} is proved, {shares[1]} broken, {shares[2]} undecided",
             line("proved", proved, "no point of it fails"),
-            line(
-                "broken",
-                broken,
-                "boxes with a point that fails for certain; in "
-                f"{format_percent(self.throughout.low)} of the prior every point does",
-            ),
-            line(
-                "undecided",
-                undecided,
-                f"at most {format_percent(self.failure_bound)} of it fails, at {sure} by {count}",
-            ),
+            line("broken", broken, f"{certain} of the prior every point does"),
+            line("undecided", undecided, f"at most {bound} of it fails, at {sure} by {count}"),
             f"  failing      {format_percent(low)} {of} at least, "
             f"{format_percent(high)} at most{f' at {sure}' if undecided.high > 0 else ''}",
             f"  boxes        {len(self.boxes):,} of {self.looked_at:,} that were looked at, "
@@ -316,10 +309,7 @@ class Verification(Drawn, Reported, InNotebook):
         return [picture_html(self.plot()), frame_html(self.table)]
 
     def check_same(self, problem: Problem, precision: str, continuous: bool = False) -> None:
-        """Refuse a problem other than the one that was verified.
-
-        **Raises:** `ValueError` that names the difference.
-        """
+        """Refuse a problem other than the verified one by a `ValueError` on the difference."""
         if continuous != self.continuous:
             raise ValueError(
                 f"this verification is about {self.subject}; verify with continuous={continuous}"
@@ -333,10 +323,7 @@ class Verification(Drawn, Reported, InNotebook):
                 )
 
     def left(self, problem: Problem, precision: str) -> Rest:
-        """Return the part of the feature space where neither all points fail nor none does.
-
-        **Raises:** the errors of `check_same`.
-        """
+        """Return the part of the feature space where neither all points fail nor none does."""
         self.check_same(problem, precision)
         return Rest(self.boxes, (PROVED, BROKEN))
 
@@ -352,10 +339,8 @@ class Verification(Drawn, Reported, InNotebook):
         First come points that fail when simulated, then middles of boxes by increasing lower bound
         of the robustness.
 
-        **Arguments:**
-        - `problem`: the problem returned by `rest`.
-        - `budget`: number of simulations of the search; these rows take at most an eighth of it.
-        **Returns:** the rows; None if everything is proved.
+        They take at most an eighth of the search's budget; None if everything is proved. The
+        problem is the one that `rest` returned.
         """
         boxes = self.boxes[~np.isin(self.boxes.state, (PROVED, OUTSIDE))]
         boxes = boxes[np.lexsort((-boxes.mass, boxes.lowest, ~boxes.has_witness))]
@@ -399,10 +384,7 @@ class Verification(Drawn, Reported, InNotebook):
 
 
 def as_verification(result: "Verification | str | Path") -> Verification:
-    """Return a result; a path is read.
-
-    **Raises:** the errors of `load_verification`.
-    """
+    """Return a result; a path is read by `load_verification`."""
     return load_verification(result) if isinstance(result, str | Path) else result
 
 

@@ -48,11 +48,8 @@ def qualify(only: Sequence[str] | None = None) -> Qualification:
         outcomes.append(Outcome(name, what, not message, round(seconds, 2), message))
     now = datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC")
     complete = len(outcomes) == len(ORACLES)
-    unseen = tuple(
-        not_exercised(
-            [each for name in outcomes if isinstance(each := ORACLES[name.name], FunctionType)]
-        )
-    )
+    run = [ORACLES[outcome.name] for outcome in outcomes]
+    unseen = tuple(not_exercised([each for each in run if isinstance(each, FunctionType)]))
     return Qualification(tuple(outcomes), dict(versions()), package_hash(), now, complete, unseen)
 
 

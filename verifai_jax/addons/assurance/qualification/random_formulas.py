@@ -13,19 +13,13 @@ Tree = tuple[object, ...]
 
 def _random_tree(rng: np.random.Generator, depth: int) -> Tree:
     if depth == 0:
-        return (
-            ">" if rng.random() < 0.5 else "<",
-            rng.choice(["x", "y"]),
-            float(rng.integers(-3, 4)),
-        )
+        sign = ">" if rng.random() < 0.5 else "<"
+        return sign, rng.choice(["x", "y"]), float(rng.integers(-3, 4))
     kind = str(rng.choice(["always", "eventually", "until", "and", "or", "not", "->"]))
     low = int(rng.integers(0, 3))
     window = (low, low + int(rng.integers(0, 4)))
-    parts = [
-        _random_tree(rng, depth - 1)
-        for _ in range(2 if kind in ("until", "and", "or", "->") else 1)
-    ]
-    return (kind, window, *parts)
+    count = 2 if kind in ("until", "and", "or", "->") else 1
+    return (kind, window, *(_random_tree(rng, depth - 1) for _ in range(count)))
 
 
 def _text(tree: Tree) -> str:

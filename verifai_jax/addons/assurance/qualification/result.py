@@ -14,7 +14,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import NamedTuple
 
-from verifai_jax.addons.reports.markup import Markup, bullets, element, paragraph, table
+from verifai_jax.addons.reports.markup import bullets, element, paragraph, table
 from verifai_jax.addons.reports.page import Page, Section, write_page
 from verifai_jax.addons.reports.signing import signing_section
 from verifai_jax.core.display.notebook import InNotebook
@@ -24,11 +24,7 @@ from verifai_jax.core.store.atomic_files import replacing
 
 @dataclass(frozen=True)
 class Outcome:
-    """The outcome of one oracle.
-
-    - `what`: a sentence that describes the check.
-    - `message`: the error; empty if it passed.
-    """
+    """The outcome of one oracle: `what` it checks, and the `message` of its error, if any."""
 
     name: str
     what: str
@@ -83,92 +79,53 @@ class Qualification(InNotebook):
 
     def save(self, folder: str | Path) -> Path:
         """Write `qualification.html`, to be signed, and `qualification.json`; return the former."""
-        known = {each.name: each for each in self.outcomes}
-        errors = {
-            number: {**hazard._asdict(), "caught": hazard.oracle in known}
-            for number, hazard in HAZARDS.items()
-        }
+        known = {each.name: "passed" if each.passed else "fell" for each in self.outcomes}
+        errors, caught = {}, []
+        for number, hazard in HAZARDS.items():
+            errors[number] = {**hazard._asdict(), "caught": hazard.oracle in known}
+            here = known.get(hazard.oracle, "not run")
+            caught.append((number, hazard.error, hazard.oracle, here))
         plain = {**asdict(self), "passed": self.passed, "errors": errors}
         path = Path(folder) / "qualification.html"
         with replacing(path.with_suffix(".json")) as partial:
             partial.write_text(json.dumps(plain, indent=2) + "\n", encoding="utf-8")
+        outcomes = [
+            (e.name, e.what, "passed" if e.passed else f"fell: {e.message}", f"{e.seconds:z.1f}")
+            for e in self.outcomes
+        ]
+        oracles = table(["oracle", "what it checks", "outcome", "seconds"], outcomes)
+        planted = (
+            "Each of these errors was planted in a copy of the package, and the oracle next to it "
+            "fell (the tests of this add-on)."
+        )
+        unnamed = "No oracle above names these public functions; nothing is said about them:"
+        used = (
+            table(["what", "version"], sorted(self.versions.items())),
+            paragraph("SHA-256 of the package: ", element("code", self.package_sha256)),
+            paragraph(f"Run on {self.date}."),
+        )
+        errors_table = table(["error", "what it is", "oracle", "here"], caught)
+        unseen = bullets([element("code", name) for name in self.not_exercised])
         page = Page(
             title="Qualification of verifai_jax on this machine",
             headline=self.verdict,
             tone="holds" if self.passed and self.complete else "fails",
             sections=(
-                Section("oracles", "What was run", (self._oracles(),)),
-                Section(
-                    "errors",
-                    "Possible errors of the tool, and what catches them",
-                    (
-                        paragraph(
-                            "Each of these errors was planted in a copy of the package, and the "
-                            "oracle next to it fell (the tests of this add-on)."
-                        ),
-                        table(
-                            ["error", "what it is", "oracle", "here"],
-                            [
-                                (n, h.error, h.oracle, _state(known.get(h.oracle)))
-                                for n, h in HAZARDS.items()
-                            ],
-                        ),
-                    ),
-                ),
-                Section(
-                    "scope",
-                    "What was not exercised",
-                    (
-                        paragraph(
-                            "No oracle above names these public functions; nothing is "
-                            "said about them:"
-                        ),
-                        bullets([element("code", name) for name in self.not_exercised]),
-                    ),
-                ),
-                Section(
-                    "versions",
-                    "Versions and files",
-                    (
-                        table(["what", "version"], sorted(self.versions.items())),
-                        paragraph("SHA-256 of the package: ", element("code", self.package_sha256)),
-                        paragraph(f"Run on {self.date}."),
-                    ),
-                ),
+                Section("oracles", "What was run", (oracles,)),
+                Section("errors", "Possible errors of the tool, and what catches them",
+                        (paragraph(planted), errors_table)),
+                Section("scope", "What was not exercised", (paragraph(unnamed), unseen)),
+                Section("versions", "Versions and files", used),
                 signing_section("the tool is fit for the use that is described above"),
             ),
             claims={"package_sha256": self.package_sha256, "passed": self.passed},
-        )
+        )  # fmt: skip
         write_page(page, path)
         return path
 
-    def _oracles(self) -> Markup:
-        return table(
-            ["oracle", "what it checks", "outcome", "seconds"],
-            [
-                (
-                    e.name,
-                    e.what,
-                    "passed" if e.passed else f"fell: {e.message}",
-                    f"{e.seconds:z.1f}",
-                )
-                for e in self.outcomes
-            ],
-        )
-
-
-def _state(outcome: Outcome | None) -> str:
-    if outcome is None:
-        return "not run"
-    return "passed" if outcome.passed else "fell"
-
 
 class Hazard(NamedTuple):
-    """A possible error of the tool.
-
-    - `oracle`: the name of the check that catches it.
-    - `error`: a description of the error.
-    """
+    """A possible error of the tool, and the name of the oracle that catches it."""
 
     oracle: str
     error: str
@@ -178,16 +135,13 @@ _BY_ORACLE = {
     "formulas": (
         "the last instant of a window is left out",
         "always takes the greatest value, or eventually the least",
-        "until forgets what holds before",
-        "a negation is dropped",
-        "an implication is read backwards",
-        "a comparison is read as its opposite",
+        "until forgets what holds before", "a negation is dropped",
+        "an implication is read backwards", "a comparison is read as its opposite",
         "a formula is written as another one",
         "after the end of a trace another value than the last one holds",
     ),
     "zeros": (
-        "x > 0 holds at zero",
-        "x >= 0 fails at zero",
+        "x > 0 holds at zero", "x >= 0 fails at zero",
         "a robustness of zero is a violation, whatever the comparison",
     ),
     "gradients": (
@@ -195,13 +149,9 @@ _BY_ORACLE = {
         "the smooth robustness does not tend to the robustness",
     ),
     "table": (
-        "a violation counts as safe",
-        "a safe simulation counts as a violation",
-        "a row is lost",
-        "a row is in the table twice",
-        "a row has the robustness of another one",
-        "violations are counted wrongly",
-        "the worst row is not the worst",
+        "a violation counts as safe", "a safe simulation counts as a violation",
+        "a row is lost", "a row is in the table twice", "a row has the robustness of another one",
+        "violations are counted wrongly", "the worst row is not the worst",
         "samples of the prior are biased",
     ),
     "statuses": (
@@ -219,15 +169,12 @@ _BY_ORACLE = {
         "the guaranteed bound is too low",
     ),
     "priors": (
-        "an interval is scaled wrongly",
-        "a normal feature has another spread",
-        "a logarithmic feature is uniform",
-        "weights of choices are ignored",
+        "an interval is scaled wrongly", "a normal feature has another spread",
+        "a logarithmic feature is uniform", "weights of choices are ignored",
     ),
     "steps": ("an integrator is of lower order than it says", "a finer step is not finer"),
     "replays": (
-        "the same seed gives another table",
-        "another seed gives the same table",
+        "the same seed gives another table", "another seed gives the same table",
         "a row is replayed under another random key",
     ),
     "kills": (
@@ -266,7 +213,7 @@ _BY_ORACLE = {
         "a violation is not shown in the trace matrix",
         "claims that were edited are believed",
     ),
-}
+}  # fmt: skip
 HAZARDS = {
     f"E{number:02}": hazard
     for number, hazard in enumerate(

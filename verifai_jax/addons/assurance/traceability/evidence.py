@@ -30,13 +30,11 @@ CLAIMS = ".claims.json"
 
 
 class ModelNow(NamedTuple):
-    """The present model of a problem.
+    """The present model of a problem: its `space` as plain data, if possible, and `sources`.
 
-    - `space`: its features as plain data; None if that is impossible.
     - `digests`: hashes of what it simulates, by backend; empty texts if unknown.
-    - `sources`: its files.
-    - `chains`: last hashes of the chains that reports on its runs would have now.
-    - `chain`: that of a report on another result with the same files.
+    - `chains`, `chain`: the last hashes of the chains that reports on its runs would have now, and
+      of a report on another result with the same files.
     """
 
     space: Mapping[str, Any] | None
@@ -50,18 +48,11 @@ class ModelNow(NamedTuple):
 class Evidence:
     """A run, or the claims of a report.
 
-    - `kind`: `"runs"` or `"claims"`.
-    - `result`: the kind of result that the claims are about, `"run"` or `"estimate"`.
-    - `name`: its path.
-    - `problem`: the name of its problem.
-    - `formulas`: their texts by name, at that time.
-    - `requirements`: the content of their requirements at that time.
-    - `model`: hash of the simulated model; empty if not recorded.
-    - `backend`: the backend that simulated it.
-    - `sources`: the sources of a run, as it recorded them.
-    - `chain`: last hash of the chain of its inputs: the present one of a run, the recorded one of
-      claims.
-    - `space`: the features of a run as plain data; None if not recorded.
+    - `kind`: `"runs"` or `"claims"`; `result`: what claims are about, `"run"` or `"estimate"`.
+    - `name`: its path; `problem`: the name of its problem.
+    - `formulas`, `requirements`: their texts and contents by name, at that time.
+    - `model`, `backend`, `sources`, `space`: what was simulated, as far as it is recorded.
+    - `chain`: last hash of the chain of its inputs; of a run the present one.
     - `outcomes`: what a run found of each formula: the outcome, and a sentence.
     - `edited`: sentences on what does not agree with its own hashes, with the kind of link.
     """
@@ -99,11 +90,7 @@ class Evidence:
     def suspicions(
         self, name: str, formula: str, about: Requirement | None, model: ModelNow
     ) -> Iterator[str]:
-        """Yield sentences on changes since it was made.
-
-        **Arguments:**
-        - `about`: its present subject.
-        """
+        """Yield sentences on changes since it was made; `about` is its present subject."""
         if (was := self.formulas[name]) != formula:
             yield f"{name}: the formula has changed since {self.name}: {was} then, {formula} now"
         now, then = _said(about.entry() if about else {}), _said(self.requirements.get(name, {}))
@@ -145,10 +132,7 @@ def model_now(problem: Problem, about: Sequence[Evidence]) -> ModelNow:
 
 
 def runs_in(folders: Sequence[str | Path]) -> Iterator[Evidence]:
-    """Yield the runs of folders, and of the folders in them.
-
-    **Raises:** `ValueError` for a run that is damaged.
-    """
+    """Yield the runs of folders, and of the folders in them; `ValueError` for a damaged one."""
     for folder in map(Path, folders):
         for record in sorted({folder / RECORD, *folder.glob(f"*/{RECORD}")}):
             if not record.is_file():
@@ -187,10 +171,7 @@ def outcome_of(run: Run, name: str) -> tuple[str, str]:
 
 
 def claims_in(paths: Sequence[str | Path]) -> Iterator[Evidence]:
-    """Yield the claims of reports, and of folders of reports, that name their subject.
-
-    **Raises:** `ValueError` for a file of another form.
-    """
+    """Yield claims of reports, and of their folders; `ValueError` for a file of another form."""
     found: dict[Path, None] = {}
     for path in map(Path, paths):
         own = path if path.name.endswith(CLAIMS) else path.with_suffix(CLAIMS)

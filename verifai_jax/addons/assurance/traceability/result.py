@@ -24,18 +24,14 @@ SHOWN = 3
 """Results of a row that the summary lists."""
 LINKS = ("tests", "runs", "claims", "reports")
 """Links of the chain after the problem, each with a column of its own."""
-
-
 VIOLATED, ERROR, SKIPPED, NOT_RUN, MET = "violated", "error", "skipped", "not run", "met"
 OUTCOMES = (VIOLATED, ERROR, SKIPPED, NOT_RUN, MET)
 """What a test or a run may have found, the worst first."""
 
 
 class Result(NamedTuple):
-    """A finding of a test or a run on a requirement.
+    """A finding of a test or a run (`link`), with its `name` or folder, on a requirement.
 
-    - `link`: `"tests"` or `"runs"`.
-    - `name`: its name or folder.
     - `outcome`: one of `OUTCOMES`; `"error"` if simulations, or the test, came to no verdict.
     - `text`: a sentence on the outcome.
     """
@@ -163,14 +159,11 @@ class TraceMatrix(Tabular):
     def _verdict(self) -> str:
         found = Counter(row.outcome for row in self.rows)
         outcomes = listed([f"{found[each]:,} {each}" for each in OUTCOMES if found[each]])
-        return f"{self._links()}; {outcomes or 'nothing was asked'}"
-
-    def _links(self) -> str:
-        if self.complete:
-            return "every link is there, and fits"
         counts = [(len(self.missing), "missing"), (len(self.suspect), "suspect")]
         verbs = {True: "is", False: "are"}
-        return listed([f"{counted(n, 'link')} {verbs[n == 1]} {word}" for n, word in counts if n])
+        links = [f"{counted(n, 'link')} {verbs[n == 1]} {word}" for n, word in counts if n]
+        about = listed(links) or "every link is there, and fits"
+        return f"{about}; {outcomes or 'nothing was asked'}"
 
     def __str__(self) -> str:
         return self.summary()
@@ -178,11 +171,9 @@ class TraceMatrix(Tabular):
     def report(self, path: str | Path) -> Path:
         """Write the matrix as one HTML file; return its path."""
         cells: list[list[Child]] = []
-        for (requirement, text, formula, *others), row in zip(
-            self._cells(), self.rows, strict=True
-        ):
+        for requirement, text, formula, problem, *others in self._cells():
             code = element("code", formula) if formula else ""
-            cells.append([requirement or f"(none: {row.problem})", text, code, *others])
+            cells.append([requirement or f"(none: {problem})", text, code, problem, *others])
         gaps: list[list[Child]] = [[gap.subject, gap.kind, gap.link, gap.text] for gap in self.gaps]
         found = paragraph("Every link is there, and what it joins has not changed since.")
         if gaps:

@@ -68,10 +68,7 @@ class Case(NamedTuple):
 
 
 def read_cases(paths: Sequence[Location]) -> list[Case]:
-    """Read the results in files of JUnit, and in the files `*.xml` of folders.
-
-    **Raises:** `FileNotFoundError`; `ValueError` for a file of another form.
-    """
+    """Read results in files of JUnit, and in `*.xml` of folders; `ValueError` for other files."""
     cases = []
     for path in map(Path, paths):
         if not path.exists():
@@ -122,12 +119,7 @@ def results_of(test: Tested, cases: Sequence[Case]) -> list[Result]:
 def edits_of(
     test: Tested, name: str, formula: str, model: str, cases: Sequence[Case]
 ) -> Iterator[str]:
-    """Yield sentences on how a test differs from the problem, and from what was run.
-
-    **Arguments:**
-    - `name`, `formula`, `model`: a formula of the present problem, its text, and the hash of the
-      problem's model.
-    """
+    """Yield sentences on how a test differs from the problem's formula and model, and from runs."""
     if (own := str(test.problem.formulas[name])) != formula:
         yield f"{name}: {test.label} tests {own}, and the problem has {formula}"
     digest = digest_of_model(test.problem)

@@ -21,42 +21,22 @@ MAX_PAIRS = 10
 
 
 def comparison_page(comparison: Comparison, about: About, problem: Problem | None) -> Page:
-    """Make the report on a comparison.
-
-    **Arguments:**
-    - `problem`: the baseline problem; None if not available.
-    """
+    """Make the report on a comparison, with its baseline problem if that is available."""
     about.check(comparison.candidates[0].space)
     # That of one side says nothing of the files of the others.
     model = Model.of(comparison.sources.values())
     first = comparison.candidates[0]
     sure = format_percent(1 - len(comparison.candidates) * (1 - first.rates.confidence))
-    headline = (
-        "; ".join(f"{each.name} is {each.verdict}" for each in comparison.candidates)
-        + f", compared with {comparison.baseline}. All verdicts hold together at {sure}."
-    )
-    claims = [
-        Claim(
-            f"C{i + 1}",
-            f"{each.name} is {each.verdict} compared with {comparison.baseline}: {each.rates}.",
-            (f"{each.rates.pairs:,} pairs of simulations",),
-            (MODEL, PAIRED),
-        )
-        for i, each in enumerate(comparison.candidates)
-    ]
-    rows = [
-        (
-            each.name,
-            each.verdict,
-            str(each.rates),
-            f"{each.rates.pairs:,}",
-            f"{each.rates.only_second:,}",
-            f"{each.rates.only_first:,}",
-            f"{each.both:,}",
-            f"{each.rates.undecided:,}",
-        )
-        for each in comparison.candidates
-    ]
+    verdicts = "; ".join(f"{each.name} is {each.verdict}" for each in comparison.candidates)
+    compared = f"compared with {comparison.baseline}"
+    headline = f"{verdicts}, {compared}. All verdicts hold together at {sure}."
+    claims, rows = [], []
+    for i, each in enumerate(comparison.candidates, 1):
+        rates, text = each.rates, f"{each.name} is {each.verdict} {compared}: {each.rates}."
+        evidence = (f"{rates.pairs:,} pairs of simulations",)
+        claims.append(Claim(f"C{i}", text, evidence, (MODEL, PAIRED)))
+        counts = (rates.pairs, rates.only_second, rates.only_first, each.both, rates.undecided)
+        rows.append((each.name, each.verdict, str(rates), *(f"{count:,}" for count in counts)))
     heads = ["candidate", "verdict", "difference", "pairs", "only it fails"]
     heads += ["only the baseline fails", "both fail", "without both verdicts"]
     asked = space_table(first.space, {}, about)
@@ -65,13 +45,9 @@ def comparison_page(comparison: Comparison, about: About, problem: Problem | Non
         f"vj.compare(baseline, candidates, margin={first.margin}, seed={comparison.seed}, "
         f"budget={comparison.simulations})"
     )
+    tone = {WORSE: "fails", BETTER: "holds", SAME: "holds"}.get(comparison.verdict, "open")
     return result_page(
-        comparison.baseline,
-        "evidence report on a comparison",
-        headline,
-        {WORSE: "fails", BETTER: "holds", SAME: "holds"}.get(comparison.verdict, "open"),
-        claims,
-        model,
+        comparison.baseline, "evidence report on a comparison", headline, tone, claims, model,
         answers=[
             ("What was varied, and what was the prior?", "see the table", "asked"),
             ("How many simulations were there?", f"{comparison.simulations:,}", "found"),
@@ -91,14 +67,10 @@ def comparison_page(comparison: Comparison, about: About, problem: Problem | Non
             f"In {without:,} pairs a side has no verdict: they widen the intervals in both "
             "directions.",
             "Single failures were not replayed more closely.",
-            f"Sampling was ended by: {comparison.stopped}.",
-            MODEL,
-            PAIRED,
-            *comparison.notes,
+            f"Sampling was ended by: {comparison.stopped}.", MODEL, PAIRED, *comparison.notes,
         ],
-        reproduce=[preformatted(python)],
-        warned=model._replace(parts=model.parts[:1]),
-    )
+        reproduce=[preformatted(python)], warned=model._replace(parts=model.parts[:1]),
+    )  # fmt: skip
 
 
 def _pairs(comparison: Comparison) -> list[Markup]:
@@ -108,13 +80,10 @@ def _pairs(comparison: Comparison) -> list[Markup]:
         if not len(each.discordant):
             continue
         names = [str(name) for name in each.discordant.columns if name != "worse"]
-        rows = [
-            [
-                each.name if bool(row["worse"]) else comparison.baseline,
-                *(number(row[name]) for name in names),
-            ]
-            for row in each.discordant.head(MAX_PAIRS).to_dict("records")
-        ]
+        rows = []
+        for row in each.discordant.head(MAX_PAIRS).to_dict("records"):
+            fails = each.name if bool(row["worse"]) else comparison.baseline
+            rows.append([fails, *(number(row[name]) for name in names)])
         content += [
             element("h3", f"Pairs in which only one of {each.name} and the baseline fails"),
             paragraph(f"{len(rows):,} of {len(each.discordant):,}, in the order of sampling."),

@@ -1,15 +1,10 @@
 """The section of a report on the error of its number."""
 
-from collections.abc import Sequence
 from dataclasses import asdict, replace
 
 from verifai_jax.addons.estimation.error_budgets.result import ErrorBudget
 from verifai_jax.addons.reports.claims import Claim
-from verifai_jax.addons.reports.markup import (
-    Child,
-    paragraph,
-    table,
-)
+from verifai_jax.addons.reports.markup import paragraph, table
 from verifai_jax.addons.reports.page import Page, Section, before_limits
 
 ADDED = (
@@ -21,25 +16,17 @@ ADDED = (
 
 def with_errors(page: Page, errors: ErrorBudget) -> Page:
     """Return a page with this section before the limits, and its claim as `E1`."""
-    rows: list[Sequence[Child]] = [
-        (
-            part.name,
-            f"{part.low:+z.2g} to {part.high:+z.2g}" if part.measured else "not measured",
-            "yes" if part.counted and part.measured else "no",
-            part.text,
-        )
-        for part in errors.parts
-    ]
-    section = Section(
-        "errors",
-        "How wrong the number can be",
-        (
-            paragraph("Claim E1: ", errors.total),
-            table(["part", "greater by", "in the sum", "how it was found"], rows),
-            paragraph(ADDED),
-            paragraph(f"The prior: {errors.prior}"),
-        ),
+    rows = []
+    for part in errors.parts:
+        by = f"{part.low:+z.2g} to {part.high:+z.2g}" if part.measured else "not measured"
+        rows.append((part.name, by, "yes" if part.counted and part.measured else "no", part.text))
+    content = (
+        paragraph("Claim E1: ", errors.total),
+        table(["part", "greater by", "in the sum", "how it was found"], rows),
+        paragraph(ADDED),
+        paragraph(f"The prior: {errors.prior}"),
     )
+    section = Section("errors", "How wrong the number can be", content)
     evidence = (f"{errors.simulations:,} simulations", "section errors")
     claim = Claim("E1", errors.total, evidence, (ADDED,))
     claims = {**page.claims, "claims": [*page.claims["claims"], asdict(claim)]}

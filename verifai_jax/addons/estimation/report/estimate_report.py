@@ -1,32 +1,20 @@
 """The report on an estimate: the probability, its interval, the bound that rests on the prior."""
 
-from typing import Any
-
 from verifai_jax.addons.estimation.result import METHODS, Estimate
-from verifai_jax.addons.reports.claims import Claim, about_json
+from verifai_jax.addons.reports import sections
+from verifai_jax.addons.reports.claims import Claim
 from verifai_jax.addons.reports.markup import Child, paragraph, picture, preformatted, table
 from verifai_jax.addons.reports.page import Page
 from verifai_jax.addons.reports.provenance import Model
 from verifai_jax.addons.reports.run_question import About
-from verifai_jax.addons.reports.sections import (
-    MODEL,
-    NOT_SEEN,
-    SAMPLES,
-    problem_content,
-    result_page,
-)
+from verifai_jax.addons.reports.sections import MODEL, NOT_SEEN, SAMPLES
 from verifai_jax.addons.reports.studies import png
 from verifai_jax.core.messages.text import format_percent
-from verifai_jax.problem.model_digest import digest_of_model
 from verifai_jax.problem.problem import Problem
 
 
 def estimate_page(estimate: Estimate, about: About, problem: Problem | None) -> Page:
-    """Make the report on an estimate.
-
-    **Arguments:**
-    - `problem`: the problem of the estimate; None if not available.
-    """
+    """Make the report on an estimate, with its problem if that is available."""
     about.check(None if problem is None else problem.space)
     model = Model.of([estimate.sources], None if problem is None else problem.sources())
     sure = format_percent(estimate.confidence)
@@ -44,18 +32,15 @@ def estimate_page(estimate: Estimate, about: About, problem: Problem | None) -> 
     assumptions = [MODEL, SAMPLES]
     if estimate.method not in (None, "monte_carlo"):
         assumptions.append(NOT_SEEN)
+    sampled = (
+        f"{estimate.prior_failures:,} failures and {estimate.prior_no_verdict:,} without a verdict "
+        f"in {estimate.prior_simulations:,} samples of {drawn_from}"
+    )
     claims = [
         Claim("C1", headline, (f"{estimate.simulations:,} simulations",), tuple(assumptions)),
-        Claim(
-            "C2",
-            f"The failure probability is at most {bound} at {sure}.",
-            (
-                f"{estimate.prior_failures:,} failures and {estimate.prior_no_verdict:,} without a "
-                f"verdict in {estimate.prior_simulations:,} samples of {drawn_from}",
-            ),
-            (MODEL, SAMPLES),
-        ),
-    ]
+        Claim("C2", f"The failure probability is at most {bound} at {sure}.", (sampled,),
+              (MODEL, SAMPLES)),
+    ]  # fmt: skip
     if estimate.p0 is not None:
         shown = estimate.upper_bound <= estimate.p0
         words = "is shown" if shown else f"is not shown by samples of {drawn_from} alone"
@@ -76,7 +61,8 @@ def estimate_page(estimate: Estimate, about: About, problem: Problem | None) -> 
     if estimate.rest < 1:
         shares = map(format_percent, (estimate.rest, estimate.certain))
         numbers.append(("left by a proof, and certain to fail", ", ".join(shares)))
-    asked = [] if problem is None else problem_content(problem, about)
+    asked = [paragraph(f"How probable a failure of {estimate.name} is, under the prior.")]
+    asked += [] if problem is None else sections.problem_content(problem, about)
     prior = "not stated" if problem is None else "see the table of features"
     steps = [f"seed {estimate.seed}", f"precision {estimate.precision}"]
     steps += [f"backend {estimate.backend}"] if estimate.backend else []
@@ -88,14 +74,9 @@ def estimate_page(estimate: Estimate, about: About, problem: Problem | None) -> 
         f"{estimate.no_verdict:,} simulations have no verdict; the upper ends take those of the "
         "prior's samples for failing."
     )
-    return result_page(
-        estimate.name,
-        "evidence report on a probability",
-        headline,
-        "open",
-        claims,
-        model,
-        about=_about(estimate, model, problem),
+    return sections.result_page(
+        estimate.name, "evidence report on a probability", headline, "open", claims, model,
+        about=sections.subject_of("estimate", problem, model),
         answers=[
             ("What was the prior?", prior, "asked"),
             ("How many simulations were there?", f"{estimate.simulations:,}", "found"),
@@ -103,23 +84,11 @@ def estimate_page(estimate: Estimate, about: About, problem: Problem | None) -> 
             ("Which assumption is under the interval?", assumptions[-1], "limits"),
             ("With which seed?", ", ".join(steps), "reproduce"),
         ],
-        asked=[
-            paragraph(f"How probable a failure of {estimate.name} is, under the prior."),
-            *asked,
-        ],
+        asked=asked,
         found=[
             table(["number", "value"], numbers),
             picture(png(estimate.plot()), "The interval, and what the method saw"),
         ],
         limits=[without, *assumptions, *estimate.notes],
         reproduce=[preformatted(python), paragraph(f"Made with verifai_jax {estimate.version}.")],
-    )
-
-
-def _about(estimate: Estimate, model: Model, problem: Problem | None) -> dict[str, Any]:
-    """Return what the claims are about, as far as the problem says it."""
-    if problem is None:
-        return {}
-    formulas = {name: str(formula) for name, formula in problem.formulas.items()}
-    digest = "" if model.changes else digest_of_model(problem)
-    return about_json("estimate", formulas, problem.requirement_entries(), digest)
+    )  # fmt: skip

@@ -1,14 +1,7 @@
 """The section of a report on the modes of failure, and their claims."""
 
 from verifai_jax.addons.estimation.failure_modes import Mode, Modes
-from verifai_jax.addons.reports.markup import (
-    Markup,
-    bullets,
-    element,
-    paragraph,
-    picture,
-    table,
-)
+from verifai_jax.addons.reports.markup import Markup, bullets, element, paragraph, picture, table
 from verifai_jax.addons.reports.page import Section
 from verifai_jax.addons.reports.run_question import About
 from verifai_jax.addons.reports.sections import MODEL, NOT_SEEN, SAMPLES

@@ -40,27 +40,15 @@ def read_comparison(file: Path, data: Mapping[str, Any], space: FeatureSpace | N
             "a comparison does not say what its features are; give a problem that was compared: "
             "--problem FILE.py:NAME"
         )
-    candidates = tuple(
-        Compared(
-            str(each["name"]),
-            PairedRates(**values_of(PairedRates, each)),
-            int(each["both_fail"]),
-            float(each["margin"]),
-            pd.DataFrame(),
-            pd.DataFrame(),
-            space,
-        )
-        for each in data["candidates"]
-    )
+    candidates = []
+    for each in data["candidates"]:
+        rates = PairedRates(**values_of(PairedRates, each))
+        both, margin, pairs = int(each["both_fail"]), float(each["margin"]), pd.DataFrame()
+        candidates.append(Compared(str(each["name"]), rates, both, margin, pairs, pairs, space))
     if not candidates:
         raise KeyError("candidates")
+    sources = {str(name): sources_of(each) for name, each in data.get("sources", {}).items()}
     return Comparison(
-        str(data["baseline"]),
-        candidates,
-        int(data["simulations"]),
-        str(data["stopped"]),
-        float(data["seconds"]),
-        int(data["seed"]),
-        tuple(map(str, data["notes"])),
-        {str(name): sources_of(each) for name, each in data.get("sources", {}).items()},
-    )
+        str(data["baseline"]), tuple(candidates), int(data["simulations"]), str(data["stopped"]),
+        float(data["seconds"]), int(data["seed"]), tuple(map(str, data["notes"])), sources,
+    )  # fmt: skip

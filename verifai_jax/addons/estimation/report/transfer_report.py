@@ -42,25 +42,21 @@ def transfer_page(result: Transfer, about: About, problem: object = None) -> Pag
     furthest = flips.sort_values("gap", ascending=False).head(MAX_PAIRS)
     rows = [
         [f"{row:,}", *(v if isinstance(v, str) else number(v) for v in values)]
-        for row, values in zip(
-            furthest.index, furthest[columns].itertuples(index=False), strict=True
-        )
+        for row, *values in furthest[columns].itertuples()
     ]
     flipped = [paragraph("No pair has different verdicts.")]
     if rows:
-        flipped = [
-            paragraph(f"{len(rows):,} of {len(flips):,} pairs with different verdicts:"),
-            table(["row", *columns], rows),
-        ]
+        text = f"{len(rows):,} of {len(flips):,} pairs with different verdicts:"
+        flipped = [paragraph(text), table(["row", *columns], rows)]
     shares = [(name, format_percent(share)) for name, share in result.influence.items()]
     causes = [table(["feature", "share of the gap's variance"], shares)] if shares else []
+    python = (
+        f"vj.transfer(policy, problem_a, problem_b, seed={result.seed}, "
+        f"tolerance={result.tolerance:zg})"
+    )
     return result_page(
-        f"{a} and {b}",
-        "evidence report on a transfer",
-        headline,
-        "fails" if result.differs else "open",
-        claims,
-        model,
+        f"{a} and {b}", "evidence report on a transfer", headline,
+        "fails" if result.differs else "open", claims, model,
         answers=[
             ("What was varied?", "see the table", "asked"),
             ("How many pairs were there?", evidence, "found"),
@@ -85,10 +81,5 @@ def transfer_page(result: Transfer, about: About, problem: object = None) -> Pag
             MODEL,
             *result.notes,
         ],
-        reproduce=[
-            preformatted(
-                f"vj.transfer(policy, problem_a, problem_b, seed={result.seed}, "
-                f"tolerance={result.tolerance:zg})"
-            )
-        ],
-    )
+        reproduce=[preformatted(python)],
+    )  # fmt: skip

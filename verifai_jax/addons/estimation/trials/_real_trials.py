@@ -78,13 +78,9 @@ def real_trials(
     check_count("simulations", simulations)
     read, unread = read_trials(problem, trials, time=time, dt=dt)
     features: Any = read[list(problem.space.columns)]
-    same = simulate(
-        problem, features, seed=seed, precision=precision, executor=executor, progress=progress
-    )
-    prior = falsify(
-        problem, "uniform", simulations, seed=seed + 1, confirm=False, precision=precision,
-        executor=executor, progress=progress,
-    )  # fmt: skip
+    how: Any = {"precision": precision, "executor": executor, "progress": progress}
+    same = simulate(problem, features, seed=seed, **how)
+    prior = falsify(problem, "uniform", simulations, seed=seed + 1, confirm=False, **how)
     table: Any = read.assign(**_predictions(same))
     background: Any = prior.table.all[list(problem.space.columns)].assign(**_predictions(prior))
     predicted = table["predicted"].to_numpy(bool)
@@ -95,20 +91,16 @@ def real_trials(
     rate = stratified_rate(
         *((int(np.sum(failed & side)), int(np.sum(side))) for side in sides),
         share=(int(np.sum(background["predicted"].to_numpy(bool))), len(background)),
-        confidence=confidence,
         undecided=tuple(int(np.sum(open_ones & side)) for side in sides),  # pyright: ignore
-        allocated=allocated,
-        at_any_time=at_any_time,
-    )
+        confidence=confidence, allocated=allocated, at_any_time=at_any_time,
+    )  # fmt: skip
     notes = [f"{counted(n, 'recording')} without a verdict: {why}" for why, n in unread.items()]
     notes += copies(features)
     if not (allocated or at_any_time):
         notes += _unlike_prior(problem, features)
-    without = int(table["robustness"].isna().sum())
-    if without:
-        notes.append(
-            f"the simulation of {counted(without, 'trial')} has no verdict, and predicts no failure"
-        )
+    if without := int(table["robustness"].isna().sum()):
+        which = f"the simulation of {counted(without, 'trial')}"
+        notes.append(f"{which} has no verdict, and predicts no failure")
     return RealTrials(problem, table, background, rate, seed, tuple(notes))
 
 

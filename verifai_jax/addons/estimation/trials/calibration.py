@@ -134,9 +134,8 @@ def calibrate(
     import pandas as pd
 
     samples = pd.DataFrame(chosen[rows], columns=names)
-    domains = {
-        n: Empirical(samples[n]) for n in names if float(np.ptp(samples[n].to_numpy(float))) > 0
-    }
+    varied = [name for name in names if float(np.ptp(samples[name].to_numpy(float))) > 0]
+    domains = {name: Empirical(samples[name]) for name in varied}
     space = FeatureSpace({**problem.space.domains, **domains}, problem.space.where)
     return Calibration(
         samples, replace(problem, space=space, nominal=None), len(table),
@@ -167,23 +166,17 @@ def _prior(problem: Problem, names: list[str], count: int, seed: int) -> Float[n
 
 
 def _evidence(
-    problem: Problem,
-    names: list[str],
-    values: Float[np.ndarray, "n k"],
-    known: "pd.DataFrame",
-    seen: Float[np.ndarray, " trials"],
-    measured: bool,
-    seed: int,
-) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
+    problem: Problem, names: list[str], values: Float[np.ndarray, "n k"], known: "pd.DataFrame",
+    seen: Float[np.ndarray, " trials"], measured: bool, seed: int,
+) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:  # fmt: skip
     """Return the log likelihood of each row of values, and the trials that contradict it."""
     from scipy.special import betaln
 
     n = len(seen)
     rows = known.iloc[np.tile(np.arange(n), len(values))]
     rows = rows.assign(**dict(zip(names, np.repeat(values, n, axis=0).T, strict=True)))
-    table = simulate(
-        problem, rows[list(problem.space.columns)], seed=seed, progress=False
-    ).table.all
+    rows = rows[list(problem.space.columns)]
+    table = simulate(problem, rows, seed=seed, progress=False).table.all
     wrong = table["violated"].to_numpy(bool).reshape(-1, n) != (seen < 0 if measured else seen > 0)
     if not measured:
         counts = wrong.sum(axis=1)

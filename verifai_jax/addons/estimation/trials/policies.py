@@ -11,13 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from verifai_jax.addons.estimation.comparison.result import UNDECIDED, judge
-from verifai_jax.addons.estimation.trials.reading import (
-    FAILED,
-    TrialTable,
-    copies,
-    table_of,
-    verdicts_of,
-)
+from verifai_jax.addons.estimation.trials import reading
 from verifai_jax.core.display.notebook import InNotebook
 from verifai_jax.core.messages.checks import check_fraction
 from verifai_jax.core.messages.errors import missing_name, unknown_name
@@ -74,19 +68,17 @@ class TrialComparison(InNotebook):
             f"{rates.undecided:,} undecided",
         ]
         if self.verdict == UNDECIDED:
-            more = self.pairs_to_go
-            lines.append(
-                "  more than a thousand times as many pairs would be needed"
-                if more is None
-                else f"  about {more:,} more pairs like these would decide"
-            )
+            text = "  more than a thousand times as many pairs would be needed"
+            if (more := self.pairs_to_go) is not None:
+                text = f"  about {more:,} more pairs like these would decide"
+            lines.append(text)
         return "\n".join([*lines, *(f"  note: {note}" for note in self.notes)])
 
     __repr__ = __str__
 
 
 def compare_trials(
-    trials: TrialTable,
+    trials: reading.TrialTable,
     baseline: str,
     candidate: str,
     *,
@@ -110,20 +102,20 @@ def compare_trials(
     check_fraction("confidence", confidence)
     if not 0 <= margin < 1:
         raise ValueError(f"margin must be a probability, from 0 to below 1; got {margin}")
-    table, _ = table_of(trials)
+    table, _ = reading.table_of(trials)
     for column in ("pair", "policy"):
         if column not in table.columns:
             raise missing_name("the table of trials", "column", column, list(table.columns))
     names = [str(name) for name in table["policy"]]
     if key is not None:
-        codes, _ = table_of(key)
+        codes, _ = reading.table_of(key)
         policy_of = {str(c): str(p) for c, p in zip(codes["code"], codes["policy"], strict=True)}
         names = [policy_of.get(name, name) for name in names]
     for name in (baseline, candidate):
         if name not in names:
             raise unknown_name("policy", name, sorted(set(names)))
     verdicts: dict[object, dict[str, bool | None]] = {}
-    for pair, name, failed in zip(table["pair"], names, verdicts_of(table), strict=True):
+    for pair, name, failed in zip(table["pair"], names, reading.verdicts_of(table), strict=True):
         own = verdicts.setdefault(pair, {})
         if name in own:
             raise ValueError(f"pair {pair} has the policy {name!r} twice")
@@ -133,13 +125,9 @@ def compare_trials(
     ]
     if not pairs:
         raise ValueError(f"no pair has a trial of both {baseline!r} and {candidate!r}")
-    rates = paired_rates(
-        pairs.count((True, False)),
-        pairs.count((False, True)),
-        len(pairs),
-        confidence,
-        sum(None in pair for pair in pairs),
-    )
+    first, second = (pairs.count(each) for each in ((True, False), (False, True)))
+    undecided = sum(None in pair for pair in pairs)
+    rates = paired_rates(first, second, len(pairs), confidence, undecided)
     firsts = table.loc[[name == baseline for name in names]]
-    notes = tuple(copies(firsts.drop(columns=["pair", "policy", FAILED])))
+    notes = tuple(reading.copies(firsts.drop(columns=["pair", "policy", reading.FAILED])))
     return TrialComparison(baseline, candidate, rates, pairs.count((True, True)), margin, notes)

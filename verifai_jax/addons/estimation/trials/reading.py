@@ -33,14 +33,10 @@ def read_trials(
 ) -> "tuple[pd.DataFrame, dict[str, int]]":
     """Read trials, and judge those that have a recording instead of a verdict.
 
-    **Arguments:**
-    - `problem`: the problem; its features are columns of the table, its formulas judge recordings.
-    - `trials`: a file or a data frame.
-    - `time`, `dt`: time column and period of recordings, as in `mtl.read`.
+    `time` and `dt` are the time column and the period of recordings, as in `mtl.read`.
     **Returns:** the features with a column `failed` of True, False or None (undecided), and the
     reasons why recordings have no verdict, with their counts.
-    **Raises:** `FileNotFoundError`; `ValueError` for a table without trials, without a verdict or
-    without a feature, and for an invalid verdict.
+    **Raises:** `FileNotFoundError`; `ValueError` for a table without trials, verdicts or features.
     """
     table, folder = table_of(trials)
     if FAILED not in table.columns and RECORDING not in table.columns:
@@ -68,11 +64,7 @@ def read_trials(
 
 
 def copies(features: "pd.DataFrame") -> list[str]:
-    """Return a note on trials that agree in all real numbers, as copies of one trial would.
-
-    **Arguments:**
-    - `features`: a row for each trial.
-    """
+    """Return a note on trials that agree in all real numbers, as copies of one trial would."""
     real = features.select_dtypes("floating")
     real = real.loc[:, real.nunique() > 1]
     names = list(real.columns)
@@ -87,10 +79,7 @@ def copies(features: "pd.DataFrame") -> list[str]:
 
 
 def table_of(trials: TrialTable) -> "tuple[pd.DataFrame, Path]":
-    """Return trials as a data frame, and the folder to which paths in it are relative.
-
-    **Raises:** `FileNotFoundError`; `TypeError` for another type; `ValueError` for no rows.
-    """
+    """Return trials, one at least, as a frame, and the folder to which its paths are relative."""
     import pandas as pd
 
     folder = Path()
@@ -111,10 +100,7 @@ def table_of(trials: TrialTable) -> "tuple[pd.DataFrame, Path]":
 
 
 def verdicts_of(table: "pd.DataFrame") -> list[bool | None]:
-    """Return the column `failed` as True, False or None (undecided).
-
-    **Raises:** `ValueError` for a missing column, and for an entry that is not a verdict.
-    """
+    """Return the column `failed` as True, False or None (undecided)."""
     if FAILED not in table.columns:
         raise missing_name("the table of trials", "column", FAILED, list(table.columns))
     meaning = {word: value for value, words in WORDS.items() for word in words}

@@ -103,9 +103,8 @@ class RealTrials(InNotebook):
         for side, wanted in enumerate(self._allocation(count)):
             rows.append(rng.choice(np.flatnonzero(predicted == side), wanted, replace=False))
         chosen = self.background.iloc[np.concatenate(rows)]
-        return chosen.sort_values("robustness", ascending=False, kind="stable").reset_index(
-            drop=True
-        )
+        chosen = chosen.sort_values("robustness", ascending=False, kind="stable")
+        return chosen.reset_index(drop=True)
 
     def _allocation(self, count: int) -> Int[np.ndarray, " 2"]:
         """Return how many of the next trials are not predicted to fail, and how many are."""
@@ -125,9 +124,8 @@ class RealTrials(InNotebook):
         return wanted
 
     def __str__(self) -> str:
-        failures, open_ones = (
-            sum(v is wanted for v in self.table["failed"]) for wanted in (True, None)
-        )
+        verdicts = self.table["failed"]
+        failures, open_ones = (sum(v is wanted for v in verdicts) for wanted in (True, None))
         undecided = f", {open_ones:,} undecided" if open_ones else ""
         rate, simulated = self.rate, self.simulated
         lines = [

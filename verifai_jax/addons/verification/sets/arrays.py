@@ -65,9 +65,8 @@ def _broadcast(params: Params, array: np.ndarray, lead: int) -> np.ndarray:
     shape = [1] * len(params["to"])
     for axis, size in zip(params["broadcast_dimensions"], array.shape[lead:], strict=True):
         shape[axis] = size
-    return np.broadcast_to(
-        array.reshape(*array.shape[:lead], *shape), (*array.shape[:lead], *params["to"])
-    )
+    front = array.shape[:lead]
+    return np.broadcast_to(array.reshape(*front, *shape), (*front, *params["to"]))
 
 
 @_moving("transpose")
@@ -137,18 +136,13 @@ def _stack(t: Interpreter, step: Equation, inputs: list[Value]) -> list[Value]:
 def _split(t: Interpreter, step: Equation, inputs: list[Value]) -> list[Value]:
     axis, (value,) = step.params["axis"], inputs
     sizes = step.params.get("sizes", (1,) * value.shape[axis])
-    ends = np.cumsum(sizes)
-    parts = []
-    for size, end in zip(sizes, ends, strict=True):
 
-        def cut(
-            array: np.ndarray, lead: int, begin: int = end - size, end: int = end
-        ) -> np.ndarray:
-            part = array.take(range(begin, end), axis + lead)
-            return part.squeeze(axis + lead) if step.primitive.name == "unstack" else part
+    def cut(cells: range, array: np.ndarray, lead: int) -> np.ndarray:
+        part = array.take(cells, axis + lead)
+        return part.squeeze(axis + lead) if step.primitive.name == "unstack" else part
 
-        parts.append(value.moved(cut))
-    return parts
+    ranges = [range(end - size, end) for size, end in zip(sizes, np.cumsum(sizes), strict=True)]
+    return [value.moved(functools.partial(cut, cells)) for cells in ranges]
 
 
 @rule("dynamic_slice")
@@ -260,10 +254,8 @@ def _rows(value: Value, axis: int) -> list[Value]:
 
 
 _ACCUMULATED: dict[str, Callable[[Any, Any], Value]] = {
-    "cumprod": _times_each,
-    "cummax": functions.greater,
-    "cummin": functions.lesser,
-}
+    "cumprod": _times_each, "cummax": functions.greater, "cummin": functions.lesser,
+}  # fmt: skip
 
 
 @rule("cumsum", *_ACCUMULATED)

@@ -31,17 +31,10 @@ def _levelled(values: list[Value]) -> list[Value]:
 
 
 _OF_TWO: dict[str, Callable[[Form, Form], Form]] = {
-    "add": add,
-    "add_any": add,
-    "sub": lambda a, b: add(a, b, -1.0),
-    "mul": product,
-    "div": functions.quotient,
-    "rem": functions.remainder,
-    "max": functions.greater,
-    "min": functions.lesser,
-    "pow": functions.power,
-    "atan2": functions.angle,
-}
+    "add": add, "add_any": add, "sub": lambda a, b: add(a, b, -1.0), "mul": product,
+    "div": functions.quotient, "rem": functions.remainder, "max": functions.greater,
+    "min": functions.lesser, "pow": functions.power, "atan2": functions.angle,
+}  # fmt: skip
 
 
 @rule(*_OF_TWO)

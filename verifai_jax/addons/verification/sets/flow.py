@@ -66,9 +66,6 @@ def flow(
 ) -> tuple[PyTree, PyTree]:
     """Return enclosures of solutions after some seconds, and at all times until then.
 
-    **Arguments:**
-    - `derivative(time, state)`: d state / d time; smooth in both.
-    - `seconds`: the duration, equal for all boxes.
     **Raises:** `MissingRule` for dynamics that are not smooth, with the operation and its line.
     """
     leaves, tree = jax.tree.flatten(state)
@@ -169,12 +166,9 @@ def _flow(t: Interpreter, step: Equation, inputs: list[Value]) -> list[Value]:
 
 
 class _Step:
-    """One step of a differential equation, on sets.
+    """One step of a differential equation on sets, by a program of all derivatives of a state.
 
-    **Arguments:**
-    - `program`: derivatives of all orders of a state, from shared operands, a time and a state.
-    - `shared`: operands that do not change during the step.
-    - `count`: arrays of the state.
+    Its operands are the `shared` ones, which do not change, a time, and `count` arrays of a state.
     """
 
     def __init__(self, t: Interpreter, program: Program, shared: Sequence[Value], count: int):

@@ -56,7 +56,6 @@ class Frame(NamedTuple):
     - `number`: a number greater than those of earlier frames.
     - `first`, `stop`: the range of its symbols among all.
     - `outer`: the enclosing frame, whose symbols come before; None if only features do.
-    - `of_layer`: whether it belongs to a layer.
     """
 
     number: int
@@ -82,16 +81,9 @@ class Form:
     )  # fmt: skip
 
     def __init__(
-        self,
-        centre: Reals,
-        slopes: Reals | None,
-        radius: Reals,
-        size: Reals,
-        dtype: np.dtype,
-        low: Reals | None = None,
-        high: Reals | None = None,
-        frame: Frame | None = None,
-    ) -> None:
+        self, centre: Reals, slopes: Reals | None, radius: Reals, size: Reals, dtype: np.dtype,
+        low: Reals | None = None, high: Reals | None = None, frame: Frame | None = None,
+    ) -> None:  # fmt: skip
         self.centre, self.slopes, self.radius, self.size = centre, slopes, radius, size
         self.dtype, self.low, self.high = dtype, low, high
         self.frame = frame if slopes is not None else None
@@ -121,12 +113,7 @@ class Form:
 
     @classmethod
     def leaf(cls, low: Reals, high: Reals, symbols: Reals, dtype: np.dtype) -> "Form":
-        """Return numbers between ends, each the value of one symbol, or of none.
-
-        **Arguments:**
-        - `low`, `high`: `[boxes, *shape]`.
-        - `symbols`: `[symbols, *shape]`, 1 if a number is that symbol's, 0 otherwise.
-        """
+        """Return numbers between ends; `symbols`, `[symbols, *shape]`, are 1 for those of each."""
         whole = cls.between(low, high, dtype)
         slopes = symbols[:, None] * np.where(np.isfinite(whole.radius), whole.radius, 0.0)
         own = np.any(symbols != 0, axis=0)[None] & np.isfinite(whole.radius)
@@ -230,12 +217,9 @@ def rounded(
     units: float = 1.0,
     exact: bool = False,
 ) -> Form:
-    """Return the result of an operation, widened by its rounding error.
+    """Return the result of an operation, widened by its error in so many units of rounding.
 
-    **Arguments:**
-    - `ends`: an interval of the result, not yet widened.
-    - `units`: error of the operation in rounding units.
-    - `exact`: whether the result is never rounded, such as a maximum.
+    So are the `ends` of its interval; what is `exact` is never rounded, such as a maximum.
     """
     kind = rounding(dtype)
     share, absolute = (SLACK, 0.0) if exact else (kind.unit * units, kind.smallest)

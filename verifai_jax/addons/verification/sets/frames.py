@@ -38,10 +38,7 @@ _NUMBERS = itertools.count(1)
 def framed(carry: Sequence[Form | Whole], boxes: int, features: int) -> list[Form | Whole]:
     """Return what a loop carries, with its uncertainties as symbols of a new frame.
 
-    **Arguments:**
-    - `carry`: values of any shapes; integers, and values equal for all boxes, stay unchanged.
-    - `boxes`: size of the batch.
-    - `features`: number of symbols of the features.
+    Integers, and values equal for all boxes, stay unchanged.
     """
     kept = {i: v for i, v in enumerate(carry)
             if isinstance(v, Form) and (v.slopes is not None or len(v.centre) > 1)}  # fmt: skip
@@ -92,12 +89,7 @@ def framed(carry: Sequence[Form | Whole], boxes: int, features: int) -> list[For
 
 
 def of_layer(units: Form, features: int) -> Form:
-    """Return the numbers of a layer, with the radius of each as its own symbol.
-
-    **Arguments:**
-    - `units`: an array with one axis.
-    - `features`: number of symbols of the features.
-    """
+    """Return the numbers of a layer, an array with one axis, with each radius as a symbol."""
     outer, bounded = units.frame, np.isfinite(units.radius)
     first = features if outer is None else outer.stop
     count = units.shape[0]
@@ -114,12 +106,7 @@ def of_layer(units: Form, features: int) -> Form:
 
 
 def _sides(noise: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the sides of parallelepipeds around zonotopes, and what they miss by rounding.
-
-    **Arguments:**
-    - `noise`: `[boxes, numbers, symbols]`.
-    **Returns:** `[boxes, numbers, numbers]`, each column a side, and `[boxes, numbers]`.
-    """
+    """Return sides of parallelepipeds around zonotopes, as columns, and what rounding misses."""
     scale = np.abs(noise).sum(2)
     count = noise.shape[1]
     unit = noise / np.where(scale > 0, scale, 1.0)[:, :, None]

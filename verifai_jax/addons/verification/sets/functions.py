@@ -45,13 +45,11 @@ the argument itself has a rounding of a hundredth."""
 
 
 class Function(NamedTuple):
-    """A function of one number.
+    """A function of one number: its `value` in double precision.
 
-    - `value`: the function in double precision.
     - `criticals`: where its derivative equals a slope.
     - `domain`: the interval outside of which it is NaN.
-    - `units`: its error in rounding units.
-    - `tiny`: its absolute error in units of the smallest normal number.
+    - `units`, `tiny`: its error in units of rounding, and of the smallest normal number.
     - `range`: an interval that contains all results, including rounding.
     """
 
@@ -111,12 +109,7 @@ def _extremes(values: Sequence[Reals]) -> tuple[Reals, Reals]:
 
 def _even(magnitude: Callable[[Reals], Reals]) -> Criticals:
     """Return points at both signs of a magnitude that depends on the slope."""
-
-    def criticals(slope: Reals, low: Reals, high: Reals) -> Sequence[Reals]:
-        at = magnitude(slope)
-        return at, -at
-
-    return criticals
+    return lambda slope, low, high: (at := magnitude(slope), -at)
 
 
 def _single(at: Callable[[Reals], Reals]) -> Criticals:
@@ -190,20 +183,16 @@ _RSQRT = Function(
 
 
 def _of_power(n: int) -> Function:
-    def criticals(slope: Reals, low: Reals, high: Reals) -> Sequence[Reals]:
-        at = np.abs(slope / n) ** (1 / (n - 1))
-        return at, -at
-
-    even = (0.0, np.inf) if n % 2 == 0 else (-np.inf, np.inf)
+    criticals = _even(lambda slope: np.abs(slope / n) ** (1 / (n - 1)))
+    even = _POSITIVE if n % 2 == 0 else (-np.inf, np.inf)
     # It is computed by multiplications, one after another.
     return Function(lambda x: x**n, criticals, units=2.0 * n, range=even)
 
 
 FUNCTIONS: dict[str, Callable[[Form], Form]] = {
     "exp": Function(np.exp, _single(np.log), range=_POSITIVE),
-    "exp2": Function(
-        np.exp2, _single(lambda a: np.log2(a / np.log(2))), units=140.0, range=_POSITIVE
-    ),
+    "exp2": Function(np.exp2, _single(lambda a: np.log2(a / np.log(2))), units=140.0,
+                     range=_POSITIVE),
     "expm1": Function(np.expm1, _single(np.log), range=(-1.0, np.inf)),
     "log": Function(np.log, _single(lambda a: 1 / a), _POSITIVE),
     "log1p": Function(np.log1p, _single(lambda a: 1 / a - 1), (-1.0, np.inf)),
@@ -213,11 +202,9 @@ FUNCTIONS: dict[str, Callable[[Form], Form]] = {
     # Of numbers that are not normal it has the size of the root of the smallest that is.
     "cbrt": Function(np.cbrt, _even(lambda a: (3 * a) ** -1.5), units=40.0, tiny=1e26),
     "tanh": Function(np.tanh, _even(lambda a: np.arccosh(1 / np.sqrt(a))), range=(-1.0, 1.0)),
-    "logistic": Function(
-        special.expit,
-        _even(lambda a: special.logit(a / (0.5 + np.sqrt(np.maximum(0.25 - a, 0))))),
-        range=(0.0, 1.0),
-    ),
+    "logistic": Function(special.expit, _even(
+        lambda a: special.logit(a / (0.5 + np.sqrt(np.maximum(0.25 - a, 0))))
+    ), range=(0.0, 1.0)),
     "sinh": Function(np.sinh, _even(np.arccosh), units=60.0),
     "cosh": Function(np.cosh, _single(np.arcsinh), units=60.0, range=(1.0, np.inf)),
     "asinh": Function(np.arcsinh, _even(lambda a: np.sqrt(1 / a**2 - 1))),
@@ -231,22 +218,16 @@ FUNCTIONS: dict[str, Callable[[Form], Form]] = {
     "abs": Function(np.abs, _single(np.zeros_like), units=0.0, range=_POSITIVE),
     "square": _of_power(2),
     "sin": _sine(np.sin, _periodic(np.arccos, 2 * np.pi)),
-    "cos": _sine(
-        np.cos,
-        lambda a, low, high: [
-            x - np.pi / 2
-            for x in _periodic(np.arccos, 2 * np.pi)(a, low + np.pi / 2, high + np.pi / 2)
-        ],
-    ),
+    "cos": _sine(np.cos, lambda a, low, high: [
+        x - np.pi / 2 for x in _periodic(np.arccos, 2 * np.pi)(a, low + np.pi / 2, high + np.pi / 2)
+    ]),
     "tan": _tangent,
     "floor": _whole(np.floor),
     "ceil": _whole(np.ceil),
     "sign": _whole(np.sign),
 }  # fmt: skip
 """Functions of one number, by the name of JAX's primitive."""
-_RAMP = Function(
-    lambda x: np.maximum(x, 0.0), _single(np.zeros_like), units=0.0, range=(0.0, np.inf)
-)
+_RAMP = Function(lambda x: np.maximum(x, 0.0), _single(np.zeros_like), units=0.0, range=_POSITIVE)
 
 
 def nearest(x: Form, to_even: bool) -> Form:
@@ -354,9 +335,9 @@ def angle(y: Form, x: Form) -> Form:
     """Return the angle of a point `(x, y)`; the full circle if it may cross the negative x axis."""
     (low, high), (left, right) = y.bounds(), x.bounds()
     nothing = unknown(low, high) | unknown(left, right)
-    masks = [left > 0, low > 0, high < 0]
-    masks = [masks[0], ~masks[0] & masks[1], ~masks[0] & ~masks[1] & masks[2]]
-    rest = ~(masks[0] | masks[1] | masks[2])
+    right_half, above, below = left > 0, low > 0, high < 0
+    masks = [right_half, ~right_half & above, ~right_half & ~above & below]
+    rest = ~(right_half | above | below)
     # Of numbers that XLA takes for zero the angle may be NaN.
     nothing = nothing | (rest & (low <= 0) & (high >= 0) & (left <= 0) & (right >= 0))
     rest = rest | nothing
@@ -370,20 +351,13 @@ def angle(y: Form, x: Form) -> Form:
         ends = np.full(ratio.centre.shape, by)
         return add(Form.between(ends, ends, y.dtype), FUNCTIONS["atan"](ratio))
 
-    cases = [
-        turned(0.0, quotient(y, x)),
-        turned(np.pi / 2, negative(quotient(x, y))),
-        turned(-np.pi / 2, negative(quotient(x, y))),
-    ]
+    beside = negative(quotient(x, y))
+    cases = turned(0.0, quotient(y, x)), turned(np.pi / 2, beside), turned(-np.pi / 2, beside)
     return _widened(chosen([*masks, rest], [*cases, circle]), UNITS)
 
 
 def selected(truth: np.ndarray, maybe: np.ndarray, no: Form, yes: Form) -> Form:
-    """Select one of two cases by a truth value; their hull if it is undecided.
-
-    **Arguments:**
-    - `truth`, `maybe`: where it is certainly true, and where it is undecided.
-    """
+    """Select one of two cases where it is certainly true; their hull where it may be."""
     if not np.any(maybe):
         if np.all(truth):
             return yes

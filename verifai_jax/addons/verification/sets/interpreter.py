@@ -45,12 +45,9 @@ def rule(*names: str) -> Callable[[Rule], Rule]:
 
 
 class Interpreter:
-    """Evaluates programs with sets.
+    """Evaluates programs with sets, for a batch of boxes and so many symbols of features.
 
-    **Arguments:**
-    - `boxes`: size of the batch.
-    - `features`: number of symbols that stand for features.
-    - `known`: returns the rule for a custom-derivative function, given its program, or None.
+    `known` returns the rule for a custom-derivative function, given its program, or None.
     """
 
     def __init__(self, boxes: int, features: int, known: Known | None = None) -> None:
@@ -69,14 +66,9 @@ class Interpreter:
     def program(
         self, program: Program, constants: Sequence[ArrayLike], inputs: Sequence[Value]
     ) -> list[Value]:
-        """Evaluate a `Jaxpr`.
-
-        **Raises:** `MissingRule` for an operation without a rule, with its name and its line.
-        """
-        known = [
-            constant(value, variable.aval.dtype)
-            for variable, value in zip(program.constvars, constants, strict=True)
-        ]
+        """Evaluate a `Jaxpr`."""
+        pairs = zip(program.constvars, constants, strict=True)
+        known = [constant(value, variable.aval.dtype) for variable, value in pairs]
         return run_through(
             program, known, inputs, lambda each: constant(each.val, each.aval.dtype), self.step
         )
@@ -107,10 +99,7 @@ class Interpreter:
             raise MissingRule(f"{error}, by the operation {name}{_where(step)}") from error
 
     def concrete(self, step: Equation, inputs: list[Value]) -> list[Value]:
-        """Evaluate with JAX an operation on integers that are equal for all boxes.
-
-        **Raises:** `MissingRule` for any other operation.
-        """
+        """Evaluate by JAX an operation on integers equal for all boxes, or raise `MissingRule`."""
         arrays = [v.common if isinstance(v, Whole) else None for v in inputs]
         forms = [out.aval.dtype for out in step.outvars]
         exact = all(jnp.issubdtype(f, jnp.integer) or f == jnp.bool_ for f in forms)

@@ -10,8 +10,6 @@ import numpy as np
 
 Numbers = np.ndarray
 """Whole numbers, `[boxes, *shape]`, or `[1, *shape]` where all boxes have the same."""
-
-
 FAR = 2**62
 """A number from which on nothing is computed: it counts as one that leaves any type."""
 
@@ -79,10 +77,7 @@ class Whole:
 
 @cache
 def limits(dtype: np.dtype) -> tuple[int, int]:
-    """Return the smallest and the greatest number of a type.
-
-    **Raises:** `NotImplementedError` for a type whose numbers do not fit into 64 bits with a sign.
-    """
+    """Return the smallest and the greatest number of a type that fits into 64 bits with a sign."""
     if dtype == np.bool_:
         return 0, 1
     info = np.iinfo(dtype)
