@@ -39,9 +39,7 @@ _RESUMES = (
 @option("--decide", type=float, help="Stop when the rate is clearly above or below this.")
 @option("--warm-start", type=PATH, help="Earlier run from which the search learns first.")
 @option(
-    "--resume",
-    type=PATH,
-    help="Run folder to continue; with a larger --budget, up to that budget.",
+    "--resume", type=PATH, help="Run folder to continue; with a larger --budget, up to that budget."
 )
 @arguments.EVEN_IF_CHANGED
 @arguments.PRECISION
