@@ -294,14 +294,10 @@ class Trace(InNotebook):
     def _span(self) -> str:
         """Return the number of samples, the clock, and how it ended."""
         count = f"{self.length} sample{'s' * (self.length != 1)}"
-        if self.dt is not None:
-            text = f"{count} every {format_seconds(self.dt)}"
-        else:
-            known = not isinstance(self.times, Tracer | jax.ShapeDtypeStruct)
-            text = count
-            if known:
-                first, last = (format_seconds(float(self.clock()[i])) for i in (0, -1))
-                text += f" from {first} to {last}"
+        text = count if self.dt is None else f"{count} every {format_seconds(self.dt)}"
+        if self.dt is None and not isinstance(self.times, Tracer | jax.ShapeDtypeStruct):
+            first, last = (format_seconds(float(self.clock()[i])) for i in (0, -1))
+            text += f" from {first} to {last}"
         for name in ("valid", "status"):
             code = getattr(self, name)
             if code is None or np.shape(code) or not _is_known(code):
@@ -314,10 +310,7 @@ class Trace(InNotebook):
 
 
 def _check_notes(notes: object) -> None:
-    """Refuse notes that are not counts by text.
-
-    **Raises:** `TypeError`, and `ValueError` for a count below zero.
-    """
+    """Refuse notes that are not counts by text, or that count below zero."""
     wanted = 'notes must be counts by text, such as {"the solver fell back to Euler": 3}'
     if not isinstance(notes, Mapping):
         raise TypeError(f"{wanted}; got {type(notes).__name__}")
@@ -444,9 +437,8 @@ def _unflatten(static: Any, children: Any) -> Trace:
     trace = object.__new__(Trace)
     names, dt, held, finite, truths = static
     values = tuple(children)
-    fields = {"signals": dict(zip(names, values, strict=False))}
-    fields |= {"dt": dt, "held": held, "finite": finite, "notes": {}, "units": {}}
-    fields["truths"] = truths
+    fields = {"signals": dict(zip(names, values, strict=False)), "dt": dt, "held": held}
+    fields |= {"finite": finite, "notes": {}, "units": {}, "truths": truths}
     fields |= dict(zip(_CHILDREN, values[len(names) :], strict=True))
     for name, value in fields.items():
         object.__setattr__(trace, name, value)

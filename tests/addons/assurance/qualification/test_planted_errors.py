@@ -86,7 +86,7 @@ PLANTED = {
 """By identifier of the error: the file, what stands there, and what is planted in its place."""
 BY_ERROR = {
     "a row of a recording is lost below its units": (
-        "addons/monitoring/recording.py",
+        "addons/monitoring/csv_tables.py",
         "skip_rows_after_names=int(units)",
         "skip_rows_after_names=2 * int(units)",
     ),
