@@ -35,11 +35,9 @@ ROW = click.argument("row", type=int, required=False)
 TARGET = click.argument("target")
 """The problem, as FILE.py:NAME."""
 PROBLEM = option(
-    "--problem",
-    "target",
-    metavar="FILE.py:NAME",
+    "--problem", "target", metavar="FILE.py:NAME",
     help="Problem of the run  [default: the one it records]",
-)
+)  # fmt: skip
 FOLDER = option("--folder", "into", type=PATH, help="Folder to write to  [default: the run's]")
 RUN_FOLDER = option(
     "--folder", type=PATH, help="Run folder to write  [default: runs/NAME-1, -2, ...]"
@@ -53,53 +51,42 @@ PROGRESS = click.option(
 )
 SEED = option("--seed", default=0, help="Seed of all random numbers.")
 ONLY = option(
-    "--only",
-    metavar="NAMES",
+    "--only", metavar="NAMES",
     help="Features to vary, comma-separated; the others keep their nominal values.",
-)
+)  # fmt: skip
 BATCH = option("--batch", type=int, help="Simulations per call  [default: chosen]")
 MAX_SECONDS = option("--max-seconds", type=float, help="Maximum seconds, including compilation.")
 STOP_AFTER = option("--stop-after", type=int, help="Stop at this many counterexamples.")
 PRECISION = option("--precision", type=click.Choice(["float32", "float64"]), default="float32")
 BACKEND = option("--backend", help="mjx or native, for a MuJoCo model  [default: the faster one]")
 ENGINE = option(
-    "--engine",
-    type=click.Choice(["auto", "xla", "native"]),
-    default="auto",
+    "--engine", type=click.Choice(["auto", "xla", "native"]), default="auto",
     help="native: code by this machine's C++ compiler, auto: for many simulations.",
-)
+)  # fmt: skip
 CLUSTER = option(
-    "--cluster",
-    metavar="ADDRESS",
+    "--cluster", metavar="ADDRESS",
     help="Simulate on a cluster: dask://HOST:PORT, ray://HOST:PORT or slurm.",
-)
+)  # fmt: skip
 PLOT = option("--plot", type=PATH, metavar="PNG", help="Draw the result into a PNG.")
 PROVED = option(
-    "--proved",
-    type=PATH,
-    metavar="JSON",
+    "--proved", type=PATH, metavar="JSON",
     help="Result of verify --into: simulate nothing that it proved.",
-)
+)  # fmt: skip
 REPORT = option(
     "--report", type=PATH, metavar="HTML", help="Write the evidence report into an HTML file."
 )
 ERRORS = option(
-    "--errors",
-    type=click.IntRange(1),
-    metavar="PAIRS",
+    "--errors", type=click.IntRange(1), metavar="PAIRS",
     help="Add how wrong the number can be, with this many pairs of simulations for each part.",
-)
+)  # fmt: skip
 ODD = option(
-    "--odd",
-    type=PATH,
-    metavar="YAML",
+    "--odd", type=PATH, metavar="YAML",
     help="Operational design domain, an OpenODD file: report how much of it is covered.",
-)
+)  # fmt: skip
 EVEN_IF_CHANGED = option(
-    "--even-if-changed",
-    is_flag=True,
+    "--even-if-changed", is_flag=True,
     help="Accept that the model was changed, and note the differences.",
-)
+)  # fmt: skip
 SET = option("--set", "options", multiple=True, metavar="NAME=VALUE", help="Option of the search.")
 
 
@@ -315,10 +302,8 @@ def target_apart(folder: Path, target: str | None) -> str | None:
 def resuming(command: str, folder: Path, target: str | None, options: Mapping[str, object]) -> str:
     """Return the command that resumes a folder, in shell syntax.
 
-    **Arguments:**
-    - `command`: `falsify` or `sweep`.
-    - `target`: the recorded target; it is included if the record alone does not suffice.
-    - `options`: options that the record does not hold, with their values; None is left out.
+    The recorded target is included if the record alone does not suffice. Of the `options`, which
+    the record does not hold, those that are None are left out.
     """
     apart = target_apart(folder, target)
     words = ["verifai-jax", command, *([] if apart is None else [apart]), "--resume", str(folder)]

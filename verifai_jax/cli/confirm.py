@@ -16,12 +16,9 @@ from verifai_jax.cli.json_output import as_plain, command, give_result
 @ROW
 @PROBLEM
 @option(
-    "--engine",
-    "engines",
-    multiple=True,
-    metavar="NAME",
+    "--engine", "engines", multiple=True, metavar="NAME",
     help="Another backend of the system that has to agree, or `all`.",
-)
+)  # fmt: skip
 @EVEN_IF_CHANGED
 @fail_on(unconfirmed="if any is not confirmed", counterexample="if any is confirmed")
 def confirm(
@@ -39,9 +36,8 @@ def confirm(
     else:
         confirmed, examined = len(result.confirmed), len(result)
     transferable = None if result.transferable is None else confirmed
-    give_result(
-        confirmed=confirmed, examined=examined, transferable=transferable, **as_plain(result)
-    )
+    counts = {"confirmed": confirmed, "examined": examined, "transferable": transferable}
+    give_result(**counts, **as_plain(result))
     if isinstance(result, vj.Confirmations):
         give_result(counts=result.counts, rows=result.table)
     check_gate(fail_on, {"unconfirmed": confirmed < examined, "counterexample": confirmed > 0})

@@ -80,13 +80,8 @@ def doctor() -> None:
     """Report versions and known bad pairs of them, devices, cores, cache and rendering."""
     text = report()
     click.echo(text)
-    give_result(
-        packages=_installed(),
-        python=platform.python_version(),
-        cores=available_cores(),
-        tested=[each._asdict() for each in TESTED],
-        report=text.splitlines(),
-    )
+    give_result(packages=_installed(), python=platform.python_version(), cores=available_cores())
+    give_result(tested=[each._asdict() for each in TESTED], report=text.splitlines())
 
 
 def report() -> str:
@@ -133,12 +128,9 @@ def bad_pairs(installed: Mapping[str, str | None]) -> list[str]:
 
 def _tested(installed: Mapping[str, str | None]) -> list[str]:
     """Say which versions have been tested, and whether those of this process are among them."""
-    here = Tested(
-        ".".join(platform.python_version_tuple()[:2]),
-        installed["jax"] or "missing",
-        installed["numpy"] or "missing",
-        f"{platform.system()} {platform.machine()}",
-    )
+    python = ".".join(platform.python_version_tuple()[:2])
+    versions = (installed[package] or "missing" for package in ("jax", "numpy"))
+    here = Tested(python, *versions, f"{platform.system()} {platform.machine()}")
     lines = [f"tested      {each}" for each in TESTED]
     if here not in TESTED:
         lines.append(
@@ -161,9 +153,8 @@ def _within(version: str | None, minimum: str | None, below: str | None) -> bool
     if version is None:
         return False
     number = _number(version)
-    return (minimum is None or number >= _number(minimum)) and (
-        below is None or number < _number(below)
-    )
+    enough = minimum is None or number >= _number(minimum)
+    return enough and (below is None or number < _number(below))
 
 
 def _number(version: str) -> tuple[int, ...]:

@@ -47,22 +47,18 @@ _RESUMES = (
 @arguments.CLUSTER
 @arguments.PROVED
 @click.option(
-    "--confirm/--no-confirm",
-    default=True,
+    "--confirm/--no-confirm", default=True,
     help="Claim only what closer replays confirm  [default: confirm]",
-)
+)  # fmt: skip
 @option("--diverse", is_flag=True, help="Look for failures of different kinds.")
 @option(
-    "--diverse-by",
-    type=click.Choice(["inputs", "behaviour"]),
+    "--diverse-by", type=click.Choice(["inputs", "behaviour"]),
     help="Kinds differ in this  [default: inputs]",
-)
+)  # fmt: skip
 @option(
-    "--objective",
-    type=click.Choice(["robustness", "likelihood"]),
-    default="robustness",
+    "--objective", type=click.Choice(["robustness", "likelihood"]), default="robustness",
     help="Look for the largest violation, or for the likeliest failure.",
-)
+)  # fmt: skip
 @arguments.RUN_FOLDER
 @arguments.KEEP_GOING
 @arguments.PICTURES

@@ -74,14 +74,11 @@ def _describe_target(name: str, target: "vj.Problem | Any") -> dict[str, object]
 
 
 def _print_target(target: "vj.Problem | Any") -> None:
-    varied = ", ".join(target.space.domains)
+    over = f"over {', '.join(target.space.domains)}"
     formulas = getattr(target, "formulas", None)
-    if formulas is None:
-        click.echo(f"    a study of training runs, for sweep, over {varied}")
-        return
-    for formula in formulas.values():
-        click.echo(f"    {formula}")
-    click.echo(f"    over {varied}")
+    study = [f"a study of training runs, for sweep, {over}"]
+    for line in study if formulas is None else [*formulas.values(), over]:
+        click.echo(f"    {line}")
 
 
 def _no_specs() -> str:

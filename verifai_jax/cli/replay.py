@@ -16,10 +16,9 @@ from verifai_jax.cli.json_output import command, give_result
 @arguments.ROW
 @arguments.PROBLEM
 @option(
-    "--precision",
-    type=click.Choice(["float32", "float64"]),
+    "--precision", type=click.Choice(["float32", "float64"]),
     help="[default: float64, and that of the run for a system that draws random numbers]",
-)
+)  # fmt: skip
 @arguments.EVEN_IF_CHANGED
 @arguments.FOLDER
 @arguments.PICTURES

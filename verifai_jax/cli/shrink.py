@@ -18,11 +18,9 @@ from verifai_jax.cli.json_output import command, give_result, show_result
 @arguments.ROW
 @arguments.PROBLEM
 @option(
-    "--by",
-    type=click.Choice(["count", "distance", "likelihood"]),
-    default="count",
+    "--by", type=click.Choice(["count", "distance", "likelihood"]), default="count",
     help="Minimise the number of features first, or the distance; or find the likeliest failure.",
-)
+)  # fmt: skip
 @option("--budget", default=2000, help="Maximum simulations.")
 @arguments.SEED
 @option(

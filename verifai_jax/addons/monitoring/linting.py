@@ -257,11 +257,9 @@ class _Linter:
         for leaf in predicates_of(self.formula):
             if leaf in guards:
                 continue
-            margins = np.concatenate([self._within(e, leaf, e.values) for e in self.recordings])
-            truths = np.concatenate(
-                [self._within(e, leaf, e.values.truth) for e in self.recordings]
-            )
-            margins, truths = margins[np.isfinite(margins)], truths[np.isfinite(truths)]
+            seen = [[self._within(e, leaf, e.values) for e in self.recordings]]
+            seen += [[self._within(e, leaf, e.values.truth) for e in self.recordings]]
+            margins, truths = (each[np.isfinite(each)] for each in map(np.concatenate, seen))
             if not margins.size or (truths > 0).any() != (truths > 0).all():
                 continue
             never, compared = bool((truths < 0).all()), leaf.compared

@@ -281,12 +281,10 @@ def _tried(template: Parametric, name: str, satisfied: _Satisfied, values: Seque
             f"the form of the formula does not show whether it is monotone in ?{name}, and this "
             f"can be tried only for a single parameter: write a number for ?{others[0]}"
         )
-    rises = falls = False
-    for each in satisfied.values:
-        found = [each.holds(template.formula({name: value})) for value in values]
-        changes = np.diff(np.array(found, int))
-        rises |= bool((changes > 0).any())
-        falls |= bool((changes < 0).any())
+    formulas = [template.formula({name: value}) for value in values]
+    found = [[each.holds(formula) for formula in formulas] for each in satisfied.values]
+    changes = np.diff(np.array(found, int))
+    rises, falls = bool((changes > 0).any()), bool((changes < 0).any())
     if rises and falls:
         raise ValueError(
             f"{template.text!r} is not monotone in ?{name}: as it grows the formula becomes both "

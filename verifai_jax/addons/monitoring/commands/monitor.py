@@ -46,25 +46,19 @@ if TYPE_CHECKING:
 @option("--resample", "resample_to", type=float, help="Period in seconds to resample to.")
 @option("--method", type=click.Choice(["hold", "linear"]), help="Interpolation to resample.")
 @option(
-    "--missing",
-    type=click.Choice(["hold", "drop", "interpolate"]),
+    "--missing", type=click.Choice(["hold", "drop", "interpolate"]),
     help="Treatment of gaps  [default: no verdict where they matter]",
-)
+)  # fmt: skip
 @option(
-    "--end",
-    type=click.Choice(["hold", "truncate", "strict"]),
-    default="hold",
+    "--end", type=click.Choice(["hold", "truncate", "strict"]), default="hold",
     help="How a trace continues after the last sample.",
-)
+)  # fmt: skip
 @option("--compat", type=click.Choice(["pymtl"]), help="Right-open windows, as in py-mtl.")
 @NAMES
 @option(
-    "--export-c",
-    "header",
-    type=PATH,
-    metavar="FILE.h",
+    "--export-c", "header", type=PATH, metavar="FILE.h",
     help="Write FORMULA as a monitor in C (or FILE.fmu) instead, for samples --dt seconds apart.",
-)
+)  # fmt: skip
 @option("--explain", is_flag=True, help="Say which predicate decides, and when.")
 @PLOT
 @fleet_options
