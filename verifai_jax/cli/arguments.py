@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import click
 from click.core import ParameterSource
 
+import verifai_jax as vj
 from verifai_jax.cli.exit_codes import BROKEN, CommandError
 
 if TYPE_CHECKING:
-    from verifai_jax import Problem, Run
     from verifai_jax.core.compute.executors import Executor
 Command = TypeVar("Command", bound=Callable[..., object])
 COMMON = ("as_json", "pictures", "progress", "keep_going")
@@ -35,93 +35,59 @@ ROW = click.argument("row", type=int, required=False)
 TARGET = click.argument("target")
 """The problem, as FILE.py:NAME."""
 PROBLEM = option(
-    "--problem",
-    "target",
-    metavar="FILE.py:NAME",
+    "--problem", "target", metavar="FILE.py:NAME",
     help="Problem of the run  [default: the one it records]",
-)
-"""The problem of a run that does not record one of this project."""
+)  # fmt: skip
 FOLDER = option("--folder", "into", type=PATH, help="Folder to write to  [default: the run's]")
-"""Where a command that reads a run writes."""
 RUN_FOLDER = option(
     "--folder", type=PATH, help="Run folder to write  [default: runs/NAME-1, -2, ...]"
 )
-"""Where a command that makes a run writes it."""
 PICTURES = option("--pictures/--no-pictures", default=True, help="Draw pictures.")
-"""Pictures can be left out."""
 KEEP_GOING = option(
     "--keep-going", is_flag=True, help="Simulate on even if all of the first simulations raise."
 )
 PROGRESS = click.option(
     "--progress/--no-progress", default=None, help="Show a progress bar  [default: on a terminal]"
 )
-"""The progress bar can be forced or left out."""
 SEED = option("--seed", default=0, help="Seed of all random numbers.")
-"""The seed of everything random in a command."""
 ONLY = option(
-    "--only",
-    metavar="NAMES",
+    "--only", metavar="NAMES",
     help="Features to vary, comma-separated; the others keep their nominal values.",
-)
-"""Features that vary."""
+)  # fmt: skip
 BATCH = option("--batch", type=int, help="Simulations per call  [default: chosen]")
-"""Simulations per call of the simulator."""
 MAX_SECONDS = option("--max-seconds", type=float, help="Maximum seconds, including compilation.")
-"""A limit of time."""
 STOP_AFTER = option("--stop-after", type=int, help="Stop at this many counterexamples.")
-"""A number of failures that ends a run."""
 PRECISION = option("--precision", type=click.Choice(["float32", "float64"]), default="float32")
-"""Floating-point numbers of the simulations."""
 BACKEND = option("--backend", help="mjx or native, for a MuJoCo model  [default: the faster one]")
-"""Simulator of a system that has several."""
 ENGINE = option(
-    "--engine",
-    type=click.Choice(["auto", "xla", "native"]),
-    default="auto",
+    "--engine", type=click.Choice(["auto", "xla", "native"]), default="auto",
     help="native: code by this machine's C++ compiler, auto: for many simulations.",
-)
-"""What a traced system is compiled by."""
+)  # fmt: skip
 CLUSTER = option(
-    "--cluster",
-    metavar="ADDRESS",
+    "--cluster", metavar="ADDRESS",
     help="Simulate on a cluster: dask://HOST:PORT, ray://HOST:PORT or slurm.",
-)
-"""A cluster whose workers do the work."""
+)  # fmt: skip
 PLOT = option("--plot", type=PATH, metavar="PNG", help="Draw the result into a PNG.")
-"""File of the one picture of a result."""
 PROVED = option(
-    "--proved",
-    type=PATH,
-    metavar="JSON",
+    "--proved", type=PATH, metavar="JSON",
     help="Result of verify --into: simulate nothing that it proved.",
-)
-"""File of a verification."""
+)  # fmt: skip
 REPORT = option(
     "--report", type=PATH, metavar="HTML", help="Write the evidence report into an HTML file."
 )
-"""File of the evidence report on a result."""
 ERRORS = option(
-    "--errors",
-    type=click.IntRange(1),
-    metavar="PAIRS",
+    "--errors", type=click.IntRange(1), metavar="PAIRS",
     help="Add how wrong the number can be, with this many pairs of simulations for each part.",
-)
-"""Simulations by which the parts of an error are measured."""
+)  # fmt: skip
 ODD = option(
-    "--odd",
-    type=PATH,
-    metavar="YAML",
+    "--odd", type=PATH, metavar="YAML",
     help="Operational design domain, an OpenODD file: report how much of it is covered.",
-)
-"""The file of a domain."""
+)  # fmt: skip
 EVEN_IF_CHANGED = option(
-    "--even-if-changed",
-    is_flag=True,
+    "--even-if-changed", is_flag=True,
     help="Accept that the model was changed, and note the differences.",
-)
-"""Option of commands that continue work of a model that may have changed."""
+)  # fmt: skip
 SET = option("--set", "options", multiple=True, metavar="NAME=VALUE", help="Option of the search.")
-"""Options of a search that is given by name."""
 
 
 def all_of(*decorators: Callable[[Any], Any]) -> Callable[[Command], Command]:
@@ -197,16 +163,15 @@ def on_cluster(address: str | None) -> "Iterator[Executor | None]":
         yield executor
 
 
-def load_problem(target: str, only: str | None = None) -> "Problem":
+def load_problem(target: str, only: str | None = None) -> "vj.Problem":
     """Load the problem FILE.py:NAME, with only some of its features varied."""
-    from verifai_jax import Problem
     from verifai_jax.core.user_code.targets import load_target
 
-    problem = load_target(target, Problem)
+    problem = load_target(target, vj.Problem)
     return problem if only is None else problem.only(*split_names(only))
 
 
-def load_judged_run(folder: Path, target: str | None) -> "Run":
+def load_judged_run(folder: Path, target: str | None) -> "vj.Run":
     """Load the run in a folder like `load_run`; if it has no verdict, end the command."""
     run = load_run(folder, target)
     if len(run.table.failed) == run.simulations:
@@ -218,23 +183,20 @@ def load_judged_run(folder: Path, target: str | None) -> "Run":
     return run
 
 
-def load_run(folder: Path, target: str | None) -> "Run":
+def load_run(folder: Path, target: str | None) -> "vj.Run":
     """Load the run in a folder, with the named problem, or else the one that it records."""
     return read_run(folder, load_problem(target or recorded_target(folder)))
 
 
-def read_run(folder: Path, problem: "Problem | None" = None) -> "Run":
+def read_run(folder: Path, problem: "vj.Problem | None" = None) -> "vj.Run":
     """Read the run in a folder; without one, the error describes the folder."""
-    from verifai_jax import load
     from verifai_jax.core.messages.text import printable
 
     read_record(folder)
-    run = load(folder, problem)
+    run = vj.load(folder, problem)
     if run.table.damage:
         # Once, in place of a warning from each part that reads the table.
-        warnings.filterwarnings(
-            "ignore", message="the error table is damaged", category=UserWarning
-        )
+        warnings.filterwarnings("ignore", "the error table is damaged", UserWarning)
         click.echo(f"note: {printable(run.table.damage)}", err=True)
     return run
 
@@ -263,16 +225,15 @@ def read_record(folder: Path) -> dict[str, Any]:
 def _describe_folder(folder: Path, record: str, missing: str) -> str:
     """Describe a folder without a run; `missing` is true if only its record is missing."""
     if folder.is_file():
-        what = "it is a file; give the folder that verifai-jax falsify wrote"
-        return f"no run in {folder}: {what}"
+        return f"no run in {folder}: it is a file; give the folder that verifai-jax falsify wrote"
     if not folder.exists():
         parent = folder.parent
         runs = sorted(path.name for path in parent.glob("*") if (path / record).is_file())
         there = f"; in {parent} there are {', '.join(runs)}" if runs else ""
         return f"no run in {folder}: there is no such folder{there}"
     if is_sweep(folder):
-        goes_on = f"{resuming('sweep', folder, None, {})} goes on with it"
-        return f"no run in {folder}: it is the folder of a sweep; {goes_on}"
+        again = resuming("sweep", folder, None, {})
+        return f"no run in {folder}: it is the folder of a sweep; {again} goes on with it"
     runs = sorted(path.name for path in folder.glob("*") if (path / record).is_file())
     if runs:
         return f"{missing}; but its folders {', '.join(runs)} are runs"
@@ -302,12 +263,10 @@ def split_pairs(option: str, texts: tuple[str, ...]) -> list[tuple[str, str]]:
 
 def plain_values(option: str, texts: tuple[str, ...]) -> dict[str, Any]:
     """Read each NAME=VALUE of a repeated option; values are parsed as JSON if possible."""
-    values: dict[str, Any] = {}
-    for name, value in split_pairs(option, texts):
-        try:
+    values: dict[str, Any] = dict(split_pairs(option, texts))
+    for name, value in values.items():
+        with contextlib.suppress(json.JSONDecodeError):
             values[name] = json.loads(value)
-        except json.JSONDecodeError:
-            values[name] = value
     return values
 
 
@@ -343,10 +302,8 @@ def target_apart(folder: Path, target: str | None) -> str | None:
 def resuming(command: str, folder: Path, target: str | None, options: Mapping[str, object]) -> str:
     """Return the command that resumes a folder, in shell syntax.
 
-    **Arguments:**
-    - `command`: `falsify` or `sweep`.
-    - `target`: the recorded target; it is included if the record alone does not suffice.
-    - `options`: options that the record does not hold, with their values; None is left out.
+    The recorded target is included if the record alone does not suffice. Of the `options`, which
+    the record does not hold, those that are None are left out.
     """
     apart = target_apart(folder, target)
     words = ["verifai-jax", command, *([] if apart is None else [apart]), "--resume", str(folder)]

@@ -4,23 +4,19 @@ from pathlib import Path
 
 import click
 
+import verifai_jax as vj
 from verifai_jax.cli import arguments
 from verifai_jax.cli.arguments import PATH, option
 from verifai_jax.cli.gates import Gate, check_gate, fail_on
 from verifai_jax.cli.json_output import command, give_result
 
-CORPUS = "counterexamples"
+CORPUS = Path("counterexamples")
 """Usual folder of a corpus."""
 
 
 @command("save-counterexamples")
 @arguments.RUN
-@option(
-    "--into",
-    type=PATH,
-    default=Path(CORPUS),
-    help="Folder for the files, meant for version control.",
-)
+@option("--into", type=PATH, default=CORPUS, help="Folder for the files, for version control.")
 @option("--max-count", default=5, help="Maximum counterexamples.")
 @option("--shrink/--no-shrink", default=True, help="Shrink each counterexample first.")
 @option("--budget", default=1000, help="Simulations to shrink each one.")
@@ -38,18 +34,17 @@ def save_counterexamples(
 
 @command("replay-counterexamples")
 @arguments.TARGET
-@click.argument("folder", metavar="FOLDER", type=PATH, default=Path(CORPUS))
+@click.argument("folder", metavar="FOLDER", type=PATH, default=CORPUS)
 @option("--rename", multiple=True, metavar="OLD=NEW", help="Old and new name of a feature.")
 @fail_on(counterexample="unless every one is simulated and fixed")
 def replay_counterexamples(
     target: str, folder: Path, rename: tuple[str, ...], fail_on: Gate | None
 ) -> None:
     """Simulate the saved counterexamples in FOLDER (or one file) again, on TARGET as it is now."""
-    from verifai_jax import replay_counterexamples as replay
     from verifai_jax.core.messages.text import printable
 
     names = dict(arguments.split_pairs("--rename", rename))
-    result = replay(arguments.load_problem(target), folder, rename=names)
+    result = vj.replay_counterexamples(arguments.load_problem(target), folder, rename=names)
     click.echo(printable(str(result)))
     give_result(problem=result.problem, passed=result.passed, counterexamples=result.table)
     check_gate(fail_on, {"counterexample": not result.passed})

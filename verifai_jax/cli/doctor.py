@@ -1,5 +1,6 @@
 """`verifai-jax doctor`: versions, devices, cores, compile cache and rendering of this machine."""
 
+import contextlib
 import importlib.metadata
 import os
 import platform
@@ -18,24 +19,14 @@ from verifai_jax.core.compute.cores import available_cores
 
 PACKAGES = ("jax", "jaxlib", "numpy", "optax", "lark", "pandas", "pyarrow", "matplotlib", "rich")
 """Required packages whose versions are reported."""
-EXTRAS = {
-    "mujoco": "mujoco",
-    "mujoco-mjx": "mujoco",
-    "brax": "brax",
-    "gymnax": "gymnax",
-    "gymnasium": "gymnasium",
-    "diffrax": "diffrax",
-    "playground": "playground",
+EXTRAS = {"mujoco": "mujoco", "mujoco-mjx": "mujoco"} | {
+    package: package for package in ("brax", "gymnax", "gymnasium", "diffrax", "playground")
 }
 """Optional packages, and the extra of verifai_jax that installs each."""
 
 
 class Tested(NamedTuple):
-    """Versions with which this version of the package has been tested.
-
-    - `python`, `jax`, `numpy`: versions.
-    - `platform`: operating system and processor, as `platform` names them.
-    """
+    """Versions with which this version of the package has been tested, and the platform."""
 
     python: str
     jax: str
@@ -54,67 +45,34 @@ TESTED = (
 """What has been tested: the versions of constraints.txt."""
 
 
-class BadPair(NamedTuple):
-    """Versions of two packages that do not work together, or of one package with a defect.
-
-    - `package`, `versions`: a package, and its versions `[least, below)`; None means no bound.
-    - `other`, `others`: the other package and its versions; the same again for a defect of one.
-    - `problem`: a sentence on what goes wrong, its effect on verdicts, and the remedy.
-    """
-
-    package: str
-    versions: tuple[str | None, str | None]
-    other: str
-    others: tuple[str | None, str | None]
-    problem: str
-
-
-BAD_PAIRS = (
-    BadPair(
-        "mujoco",
-        ("4.0.0", "4.0.1"),
-        "mujoco",
-        (None, None),
+BAD_PAIRS = {
+    ("mujoco", "4.0.0", "4.0.1", "mujoco", None, None): (
         "with a sparse constraint Jacobian the Newton solver may give wrong accelerations "
         "(MuJoCo's issue 3767), so verdicts of native simulations may be wrong; MJX has a solver "
         "of its own. MuJoCo takes a sparse one from 60 degrees of freedom on. Write <option "
-        "jacobian='dense'/> into the model, or install mujoco 4.0.1 or newer",
+        "jacobian='dense'/> into the model, or install mujoco 4.0.1 or newer"
     ),
-    BadPair(
-        "brax",
-        (None, "0.15"),
-        "mujoco",
-        ("4.0", None),
+    ("brax", None, "0.15", "mujoco", "4.0", None): (
         "its swimmer does not work on any backend, so every simulation of it is an error and none "
-        "a verdict; the other environments work",
+        "a verdict; the other environments work"
     ),
-    BadPair(
-        "gymnax",
-        (None, "1.0"),
-        "jax",
-        ("0.5", None),
+    ("gymnax", None, "1.0", "jax", "0.5", None): (
         "pip fell back to an old gymnax, whose step returns other values, so verdicts are wrong; "
-        "pip install 'gymnax>=1.0.1'",
+        "pip install 'gymnax>=1.0.1'"
     ),
-    BadPair(
-        "gymnax",
-        ("1.0", "1.1"),
-        "jax",
-        ("0.12", None),
+    ("gymnax", "1.0", "1.1", "jax", "0.12", None): (
         "gymnax asks for jax below 0.12, so pip does not install the two together. Its "
         "environments pass our tests with jax 0.12.0 all the same, so verdicts stand; gymnax "
-        "itself promises to work with pip install 'jax<0.12'",
+        "itself promises to work with pip install 'jax<0.12'"
     ),
-    BadPair(
-        "flax",
-        (None, "0.12.9"),
-        "jax",
-        ("0.12", None),
+    ("flax", None, "0.12.9", "jax", "0.12", None): (
         "flax.nnx cannot be imported, because it asks for jax.experimental.hijax.HiPrimitive, so "
-        "vj.policy can take no module of nnx; flax.linen works. To use nnx, pip install 'jax<0.12'",
+        "vj.policy can take no module of nnx; flax.linen works. To use nnx, pip install 'jax<0.12'"
     ),
-)
-"""Known bad pairs."""
+}
+"""Versions of two packages that do not work together: a package, its least version and the first
+that is fine again (None for no bound), and the same of the other one, which is the package itself
+for a defect. Of each, what goes wrong, its effect on verdicts, and the remedy."""
 
 
 @command()
@@ -122,13 +80,8 @@ def doctor() -> None:
     """Report versions and known bad pairs of them, devices, cores, cache and rendering."""
     text = report()
     click.echo(text)
-    give_result(
-        packages={package: _version(package) for package in (*PACKAGES, *EXTRAS)},
-        python=platform.python_version(),
-        cores=available_cores(),
-        tested=[each._asdict() for each in TESTED],
-        report=text.splitlines(),
-    )
+    give_result(packages=_installed(), python=platform.python_version(), cores=available_cores())
+    give_result(tested=[each._asdict() for each in TESTED], report=text.splitlines())
 
 
 def report() -> str:
@@ -139,13 +92,12 @@ def report() -> str:
         f"verifai_jax {__version__}",
         f"Python      {platform.python_version()} on {platform.system()} {platform.machine()}",
     ]
-    for package in PACKAGES:
-        version = _version(package) or "missing: pip install verifai_jax installs it"
-        lines.append(f"{package:<12}{version}")
-    installed = {package: _version(package) for package in (*PACKAGES, *EXTRAS)}
-    for package, extra in EXTRAS.items():
-        missing = f"not installed: pip install 'verifai_jax[{extra}]'"
-        lines.append(f"{package:<12}{installed[package] or missing}")
+    installed = _installed()
+    for package, version in installed.items():
+        missing = "missing: pip install verifai_jax installs it"
+        if package in EXTRAS:
+            missing = f"not installed: pip install 'verifai_jax[{EXTRAS[package]}]'"
+        lines.append(f"{package:<12}{version or missing}")
     lines += [f"  advice: {problem}" for problem in bad_pairs(installed)]
     lines += _tested(installed)
     devices = jax.devices()
@@ -166,22 +118,19 @@ def report() -> str:
 def bad_pairs(installed: Mapping[str, str | None]) -> list[str]:
     """List known problems between installed versions, given by package name."""
     found = []
-    for pair in BAD_PAIRS:
-        one, other = installed.get(pair.package), installed.get(pair.other)
-        if _within(one, *pair.versions) and _within(other, *pair.others):
-            alongside = "" if pair.other == pair.package else f" with {pair.other} {other}"
-            found.append(f"{pair.package} {one}{alongside}: {pair.problem}")
+    for (package, *versions, other, minimum, below), problem in BAD_PAIRS.items():
+        one, two = installed.get(package), installed.get(other)
+        if _within(one, *versions) and _within(two, minimum, below):
+            alongside = "" if other == package else f" with {other} {two}"
+            found.append(f"{package} {one}{alongside}: {problem}")
     return found
 
 
 def _tested(installed: Mapping[str, str | None]) -> list[str]:
     """Say which versions have been tested, and whether those of this process are among them."""
-    here = Tested(
-        ".".join(platform.python_version_tuple()[:2]),
-        installed["jax"] or "missing",
-        installed["numpy"] or "missing",
-        f"{platform.system()} {platform.machine()}",
-    )
+    python = ".".join(platform.python_version_tuple()[:2])
+    versions = (installed[package] or "missing" for package in ("jax", "numpy"))
+    here = Tested(python, *versions, f"{platform.system()} {platform.machine()}")
     lines = [f"tested      {each}" for each in TESTED]
     if here not in TESTED:
         lines.append(
@@ -191,20 +140,21 @@ def _tested(installed: Mapping[str, str | None]) -> list[str]:
     return lines
 
 
-def _version(package: str) -> str | None:
-    try:
-        return importlib.metadata.version(package)
-    except importlib.metadata.PackageNotFoundError:
-        return None
+def _installed() -> dict[str, str | None]:
+    """Return the version of each package; None for one that is missing."""
+    found: dict[str, str | None] = dict.fromkeys((*PACKAGES, *EXTRAS))
+    for package in found:
+        with contextlib.suppress(importlib.metadata.PackageNotFoundError):
+            found[package] = importlib.metadata.version(package)
+    return found
 
 
 def _within(version: str | None, minimum: str | None, below: str | None) -> bool:
     if version is None:
         return False
     number = _number(version)
-    return (minimum is None or number >= _number(minimum)) and (
-        below is None or number < _number(below)
-    )
+    enough = minimum is None or number >= _number(minimum)
+    return enough and (below is None or number < _number(below))
 
 
 def _number(version: str) -> tuple[int, ...]:
@@ -225,12 +175,9 @@ def _rendering() -> str:
     wanted = os.environ.get("MUJOCO_GL", "egl")
     try:
         done = subprocess.run(
-            [sys.executable, "-c", _RENDER],
-            env={**os.environ, "MUJOCO_GL": wanted},
-            capture_output=True,
-            text=True,
-            timeout=60,
-        )
+            [sys.executable, "-c", _RENDER], env={**os.environ, "MUJOCO_GL": wanted},
+            capture_output=True, text=True, timeout=60,
+        )  # fmt: skip
     except subprocess.TimeoutExpired:
         return f"MUJOCO_GL={wanted} does not answer; MuJoCo scenes are not drawn"
     if done.returncode == 0:

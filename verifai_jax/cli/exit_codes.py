@@ -37,16 +37,9 @@ Exit codes:
 _MAX_ERROR_LENGTH = 4000
 """Characters of an error that are printed: it may quote a file, or the message of a system."""
 USAGE_ERRORS = (
-    ValueError,
-    TypeError,
-    IndexError,
-    MissingExtra,
-    FileNotFoundError,
-    FileExistsError,
-    NotADirectoryError,
-    IsADirectoryError,
-    PermissionError,
-)
+    ValueError, TypeError, IndexError, MissingExtra, FileNotFoundError, FileExistsError,
+    NotADirectoryError, IsADirectoryError, PermissionError,
+)  # fmt: skip
 """Errors by which the Python API refuses what it was given."""
 
 
@@ -64,12 +57,7 @@ def fail_gate() -> click.exceptions.Exit:
 
 
 def check_again(finding: str, even_if_changed: bool) -> None:
-    """End the command with code 4 if a row did not reproduce its number.
-
-    **Arguments:**
-    - `finding`: a text on the difference; empty if there is none.
-    - `even_if_changed`: whether the user has accepted a changed model.
-    """
+    """End the command with code 4 if a row did not reproduce its number, as a finding says."""
     if finding and not even_if_changed:
         raise click.exceptions.Exit(NOT_AGAIN)
 
@@ -100,20 +88,15 @@ def _message_and_code(error: BaseException) -> tuple[str, int]:
     foreseen = isinstance(error, RuntimeError) and type(error).__module__.startswith("verifai_jax.")
     if isinstance(error, OSError) and error.strerror and error.filename is None:
         # Files are named where they are written; what has no name is the standard output.
-        return (
-            f"the output cannot be written ({error.strerror}); send it to a file on another disk",
-            BROKEN,
-        )
+        advice = "send it to a file on another disk"
+        return f"the output cannot be written ({error.strerror}); {advice}", BROKEN
     if foreseen or isinstance(error, OSError):
         return str(error), BROKEN
     if isinstance(error, MemoryError):
         return "the machine has not enough memory; a smaller --batch needs less", BROKEN
-    from verifai_jax.core.user_code.user_errors import (
-        explain_user_error,
-        raised_in_callback,
-        user_line,
-    )
+    from verifai_jax.core.user_code import user_errors
 
-    if (raised := raised_in_callback(error)) is not None:
+    if (raised := user_errors.raised_in_callback(error)) is not None:
         return raised, BROKEN
-    return ("" if user_line(error) is None else explain_user_error(error)), BROKEN
+    of_user = user_errors.user_line(error) is not None
+    return user_errors.explain_user_error(error) if of_user else "", BROKEN

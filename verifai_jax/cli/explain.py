@@ -4,6 +4,7 @@ from pathlib import Path
 
 import click
 
+import verifai_jax as vj
 from verifai_jax.cli import arguments
 from verifai_jax.cli.exit_codes import check_again
 from verifai_jax.cli.json_output import command, draw, give_result
@@ -17,34 +18,22 @@ from verifai_jax.cli.json_output import command, draw, give_result
 @arguments.FOLDER
 @arguments.PICTURES
 def explain(
-    folder: Path,
-    row: int | None,
-    target: str | None,
-    even_if_changed: bool,
-    into: Path | None,
+    folder: Path, row: int | None, target: str | None, even_if_changed: bool, into: Path | None,
     pictures: bool,
-) -> None:
+) -> None:  # fmt: skip
     """Say why a ROW (by default the worst) of the run in RUN fails, and draw it."""
     import textwrap
 
-    import verifai_jax as vj
     from verifai_jax.core.messages.text import printable
 
     run = arguments.load_judged_run(folder, target)
     why = vj.explain(run, row)
     for line in printable(str(why)).splitlines():
         click.echo(textwrap.fill(line, 88, break_on_hyphens=False))
-    influences = {one.name: why.effect(one) for one in why.influences}
-    give_result(
-        row=why.row,
-        formula=why.formula,
-        robustness=why.rho,
-        text=str(why),
-        effects=influences,
-        simulations=why.simulations,
-        changed=why.replay.changed,
-        finding=why.replay.finding,
-    )
+    give_result(row=why.row, formula=why.formula, robustness=why.rho, text=str(why))
+    give_result(effects={one.name: why.effect(one) for one in why.influences})
+    again = why.replay
+    give_result(simulations=why.simulations, changed=again.changed, finding=again.finding)
     if pictures:
         draw(why, (into or folder) / f"why-{why.row}.png")
-    check_again(why.replay.finding, even_if_changed)
+    check_again(again.finding, even_if_changed)

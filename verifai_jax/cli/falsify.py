@@ -5,10 +5,11 @@ from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import click
 
+import verifai_jax as vj
 from verifai_jax.cli import arguments
 from verifai_jax.cli.arguments import PATH, option
 from verifai_jax.cli.exit_codes import BROKEN, INTERRUPTED, CommandError
@@ -16,8 +17,6 @@ from verifai_jax.cli.gates import RATE, Gate, check_gate, exceeds, fail_on
 from verifai_jax.cli.json_output import command, describe_run, give_result
 from verifai_jax.cli.next_folder import given_or_next
 
-if TYPE_CHECKING:
-    from verifai_jax import Decided, Run, Within
 _RESUMES = (
     *("resume", "target", "only", "budget", "max_seconds", "stop_after", "within", "decide"),
     *("even_if_changed", "cluster", "fail_on"),
@@ -39,9 +38,7 @@ _RESUMES = (
 @option("--decide", type=float, help="Stop when the rate is clearly above or below this.")
 @option("--warm-start", type=PATH, help="Earlier run from which the search learns first.")
 @option(
-    "--resume",
-    type=PATH,
-    help="Run folder to continue; with a larger --budget, up to that budget.",
+    "--resume", type=PATH, help="Run folder to continue; with a larger --budget, up to that budget."
 )
 @arguments.EVEN_IF_CHANGED
 @arguments.PRECISION
@@ -50,22 +47,18 @@ _RESUMES = (
 @arguments.CLUSTER
 @arguments.PROVED
 @click.option(
-    "--confirm/--no-confirm",
-    default=True,
+    "--confirm/--no-confirm", default=True,
     help="Claim only what closer replays confirm  [default: confirm]",
-)
+)  # fmt: skip
 @option("--diverse", is_flag=True, help="Look for failures of different kinds.")
 @option(
-    "--diverse-by",
-    type=click.Choice(["inputs", "behaviour"]),
+    "--diverse-by", type=click.Choice(["inputs", "behaviour"]),
     help="Kinds differ in this  [default: inputs]",
-)
+)  # fmt: skip
 @option(
-    "--objective",
-    type=click.Choice(["robustness", "likelihood"]),
-    default="robustness",
+    "--objective", type=click.Choice(["robustness", "likelihood"]), default="robustness",
     help="Look for the largest violation, or for the likeliest failure.",
-)
+)  # fmt: skip
 @arguments.RUN_FOLDER
 @arguments.KEEP_GOING
 @arguments.PICTURES
@@ -75,24 +68,12 @@ _RESUMES = (
     rate="unless the failure rate is shown to be at most P; needs --search uniform",
 )
 def falsify(
-    target: str | None,
-    search: str | None,
-    options: tuple[str, ...],
-    budget: int | None,
-    only: str | None,
-    within: float | None,
-    decide: float | None,
-    warm_start: Path | None,
-    resume: Path | None,
-    even_if_changed: bool,
-    cluster: str | None,
-    diverse: bool,
-    diverse_by: Literal["inputs", "behaviour"] | None,
-    folder: Path | None,
-    pictures: bool,
-    fail_on: Gate | None,
-    **given: Any,
-) -> None:
+    target: str | None, search: str | None, options: tuple[str, ...], budget: int | None,
+    only: str | None, within: float | None, decide: float | None, warm_start: Path | None,
+    resume: Path | None, even_if_changed: bool, cluster: str | None, diverse: bool,
+    diverse_by: Literal["inputs", "behaviour"] | None, folder: Path | None, pictures: bool,
+    fail_on: Gate | None, **given: Any,
+) -> None:  # fmt: skip
     """Search for inputs under which TARGET (specs/FILE.py:NAME) breaks its property."""
     from verifai_jax import falsification
     from verifai_jax.core.compute.compilation import while_compiling
@@ -104,7 +85,8 @@ def falsify(
     stop_when = _stopping_rule(within, decide)
     if resume is not None:
         arguments.refuse_others(_RESUMES, "is fixed in the run that --resume goes on with")
-        target = target or _resumed_target(resume)
+        remedy = f"specs/FILE.py:NAME --resume {resume}"
+        target = target or arguments.recorded_target(resume, remedy)
     if target is None:
         raise click.UsageError("Missing argument 'TARGET', such as specs/cartpole.py:balance.")
     ends = {"--max-seconds": given["max_seconds"], "--stop-after": given["stop_after"]}
@@ -112,19 +94,11 @@ def falsify(
     goes_on = partial(arguments.resuming, "falsify", target=target, options=ends)
     if resume is not None:
         problem = arguments.load_problem(target, only)
-        asked = {
-            name: given[name] for name in ("max_seconds", "stop_after", "progress", "keep_going")
-        }
+        kept = ("max_seconds", "stop_after", "progress", "keep_going")
         with given_or_next(resume, "runs", "", goes_on), arguments.on_cluster(cluster) as executor:
-            run = falsification.resume(
-                resume,
-                problem,
-                budget=budget,
-                stop_when=stop_when,
-                executor=executor,
-                even_if_changed=even_if_changed,
-                **asked,
-            )
+            asked = {name: given[name] for name in kept} | {"even_if_changed": even_if_changed}
+            asked |= {"budget": budget, "stop_when": stop_when, "executor": executor}
+            run = falsification.resume(resume, problem, **asked)
     else:
         chosen = named(search or "portfolio", **arguments.plain_values("--set", options))
         if fail_on is not None and fail_on.name == RATE and not chosen.samples_prior:
@@ -153,24 +127,15 @@ def falsify(
     check_run(run, fail_on)
 
 
-def _resumed_target(folder: Path) -> str:
-    return arguments.recorded_target(folder, remedy=f"specs/FILE.py:NAME --resume {folder}")
-
-
-def _stopping_rule(within: float | None, decide: float | None) -> "Within | Decided | None":
-    if within is None and decide is None:
-        return None
+def _stopping_rule(within: float | None, decide: float | None) -> "vj.Within | vj.Decided | None":
     if within is not None and decide is not None:
         raise click.UsageError("--within and --decide are alternatives; give one")
-    from verifai_jax import Decided, Within
-
     if within is not None:
-        return Within(within)
-    assert decide is not None
-    return Decided(decide)
+        return vj.Within(within)
+    return None if decide is None else vj.Decided(decide)
 
 
-def check_run(run: "Run", asked: Gate | None) -> None:
+def check_run(run: "vj.Run", asked: Gate | None) -> None:
     """End the command with code 1 if a run fails the requested gate."""
     high = None if run.failure_rate is None else run.failure_rate.high
     failed = {"counterexample": run.table.counts.may_fail, RATE: exceeds(asked, high)}
@@ -178,7 +143,7 @@ def check_run(run: "Run", asked: Gate | None) -> None:
 
 
 def print_run(
-    run: "Run", pictures: bool, options: Mapping[str, object] = MappingProxyType({})
+    run: "vj.Run", pictures: bool, options: Mapping[str, object] = MappingProxyType({})
 ) -> None:
     """Print the summary of a run, and the commands to see more of it.
 

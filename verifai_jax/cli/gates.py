@@ -23,11 +23,7 @@ RATE = "rate"
 
 
 class Gate(NamedTuple):
-    """A gate requested by the user.
-
-    - `name`: the name of the gate.
-    - `bound`: the largest failure rate that passes; None for other gates.
-    """
+    """A gate requested by the user; its bound is the largest failure rate that passes."""
 
     name: str
     bound: float | None = None
@@ -81,12 +77,7 @@ def fail_on(**gates: str) -> Callable[[Command], Command]:
 
 
 def check_gate(asked: Gate | None, failed: Mapping[str, bool]) -> None:
-    """End the command with code 1 if the requested gate failed.
-
-    **Arguments:**
-    - `asked`: the requested gate; None for none.
-    - `failed`: whether each gate failed, by name.
-    """
+    """End the command with code 1 if the requested gate is among those that failed, by name."""
     if asked is None:
         return
     give_result(gate={"asked": str(asked), "passed": not failed[asked.name]})

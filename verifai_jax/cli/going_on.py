@@ -40,11 +40,7 @@ class Kept:
         self._work = work
 
     def stopped(self, why: str | None) -> None:
-        """Record that the result exists, and why the work ended.
-
-        **Arguments:**
-        - `why`: the reason for an early end; None or another value if it is done.
-        """
+        """Record that the result exists, and why the work ended; None if it is done."""
         if self._work is None:
             return
         self._work.done = why not in EARLY

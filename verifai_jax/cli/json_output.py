@@ -34,13 +34,8 @@ class ReportingCommand(click.Command):
 
     def __init__(self, *arguments: Any, **options: Any) -> None:
         super().__init__(*arguments, **options)
-        self.params.append(
-            click.Option(
-                ["--json", "as_json"],
-                is_flag=True,
-                help="Write the result as JSON, and what people read to the error stream.",
-            )
-        )
+        about = "Write the result as JSON, and what people read to the error stream."
+        self.params.append(click.Option(["--json", "as_json"], is_flag=True, help=about))
 
     def invoke(self, ctx: click.Context) -> Any:
         """Run the command, and print its result as JSON if requested."""
@@ -82,11 +77,7 @@ command = functools.partial(click.command, cls=ReportingCommand)
 
 
 def give_result(**values: object) -> None:
-    """Set entries of the present command's result.
-
-    **Arguments:**
-    - `values`: values of types that `as_plain` supports.
-    """
+    """Set entries of the present command's result, of types that `as_plain` supports."""
     context = click.get_current_context(silent=True)
     if context is not None:
         context.meta.setdefault(_RESULT, {}).update({n: as_plain(v) for n, v in values.items()})
@@ -113,7 +104,7 @@ def draw(found: Any, path: Path) -> None:
     click.echo(f"  picture      {path}")
 
 
-def as_plain(value: object) -> Any:
+def as_plain(value: Any) -> Any:
     """Convert a value to JSON types: tables to lists of rows, dataclasses to objects.
 
     Fields of a dataclass that are not part of its `repr` and values without a plain form are left
@@ -134,19 +125,13 @@ def as_plain(value: object) -> Any:
         return {name: as_plain(entry) for name, entry in shown.items() if _has_form(entry)}
     if hasattr(value, "to_dict"):
         # A table has its rows, and a row its entries.
-        table: Any = value
-        whole = table.reset_index().to_dict("records") if hasattr(table, "columns") else None
-        return as_plain(table.to_dict() if whole is None else whole)
-    if hasattr(value, "tolist"):
-        array: Any = value
-        return as_plain(array.tolist())
-    return str(value)
+        is_table = hasattr(value, "columns")
+        return as_plain(value.reset_index().to_dict("records") if is_table else value.to_dict())
+    return as_plain(value.tolist()) if hasattr(value, "tolist") else str(value)
 
 
 def _has_form(value: object) -> bool:
-    simple = value is None or isinstance(
-        value, bool | int | str | float | Path | Mapping | list | tuple
-    )
+    simple = isinstance(value, bool | int | str | float | Path | Mapping | list | tuple | None)
     return simple or is_dataclass(value) or hasattr(value, "tolist") or hasattr(value, "to_dict")
 
 
@@ -156,36 +141,26 @@ def describe_run(run: Any) -> dict[str, Any]:
     best, known = None, not run.table.changed
     if known and counts.without_verdict < run.simulations:
         row = run.best
-        best = {
-            "row": int(row.name),
-            "robustness": float(row["rho"]),
-            "features": {name: row[name] for name in run.table.features},
-            "violated": bool(row["violated"]),
-            "verdict": row.get("verdict", ""),
-        }
+        best = {"row": int(row.name), "robustness": float(row["rho"])}
+        best |= {"features": {name: row[name] for name in run.table.features}}
+        best |= {"violated": bool(row["violated"]), "verdict": row.get("verdict", "")}
+    counted = {
+        "violating": counts.violating,
+        "counterexamples": counts.claimed,
+        "refused": counts.refused,
+        "not_replayed": counts.not_replayed,
+        "verdicts": run.verdict_counts,
+        "repetitions": asdict(counts.repetitions),
+        "without_verdict": counts.without_verdict,
+    }
+    times = [f"{part}_seconds" for part in ("compile", "run", "search", "simulate", "confirm")]
     return {
         "problem": run.name,
-        "target": run.target,
-        "formulas": run.formulas,
-        "simulations": run.simulations,
-        "violating": counts.violating if known else None,
-        "counterexamples": counts.claimed if known else None,
-        "refused": counts.refused if known else None,
-        "not_replayed": counts.not_replayed if known else None,
-        "verdicts": run.verdict_counts if known else None,
-        "repetitions": asdict(counts.repetitions) if known else None,
-        "without_verdict": counts.without_verdict if known else None,
+        **{name: getattr(run, name) for name in ("target", "formulas", "simulations")},
+        **(counted if known else dict.fromkeys(counted)),
         "failure_rate": rate,
         "worst": best,
-        "search": run.search,
-        "seed": run.seed,
-        "stopped": run.stopped,
-        "compile_seconds": run.compile_seconds,
-        "run_seconds": run.run_seconds,
-        "search_seconds": run.search_seconds,
-        "simulate_seconds": run.simulate_seconds,
-        "confirm_seconds": run.confirm_seconds,
-        "folder": run.folder,
+        **{name: getattr(run, name) for name in ("search", "seed", "stopped", *times, "folder")},
         "table": run.table_path,
         "notes": run.notes,
         "damage": run.damage,

@@ -2,15 +2,14 @@
 
 import shlex
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import click
 
+import verifai_jax as vj
 from verifai_jax.cli.exit_codes import WRONG_USAGE
 from verifai_jax.cli.json_output import command, give_result
 
-if TYPE_CHECKING:
-    from verifai_jax import Problem
 TARGETS = "verifai_jax.targets"
 """Entry points of classes whose objects are targets of commands, as problems are."""
 
@@ -22,7 +21,6 @@ def list_targets(location: str | None) -> None:
 
     Its Python files are run for that, those of inner folders are not.
     """
-    from verifai_jax import Problem
     from verifai_jax.core.display.extensions import extension, extensions
     from verifai_jax.core.messages.errors import MissingExtra
     from verifai_jax.core.user_code.targets import NothingDefined, TargetError, definitions
@@ -38,19 +36,16 @@ def list_targets(location: str | None) -> None:
     listed: list[dict[str, object]] = []
     for file in files:
         try:
-            targets = definitions(str(file), Problem, *studies)
+            targets = definitions(str(file), vj.Problem, *studies)
         except MissingExtra as error:
             click.echo(f"{file}: {error}")
             continue
-        except NothingDefined:
-            if not path.is_dir():
-                raise
-            continue  # A folder may hold other modules too.
         except TargetError as error:
             if not path.is_dir():
                 raise
-            click.echo(str(error), err=True)
-            broken += 1
+            if not isinstance(error, NothingDefined):  # A folder may hold other modules too.
+                click.echo(str(error), err=True)
+                broken += 1
             continue
         for name, target in targets.items():
             click.echo(f"{file}:{name}  {target.description}")
@@ -67,7 +62,7 @@ def list_targets(location: str | None) -> None:
         raise click.exceptions.Exit(WRONG_USAGE)
 
 
-def _describe_target(name: str, target: "Problem | Any") -> dict[str, object]:
+def _describe_target(name: str, target: "vj.Problem | Any") -> dict[str, object]:
     formulas = getattr(target, "formulas", None)
     return {
         "target": name,
@@ -78,15 +73,12 @@ def _describe_target(name: str, target: "Problem | Any") -> dict[str, object]:
     }
 
 
-def _print_target(target: "Problem | Any") -> None:
-    varied = ", ".join(target.space.domains)
+def _print_target(target: "vj.Problem | Any") -> None:
+    over = f"over {', '.join(target.space.domains)}"
     formulas = getattr(target, "formulas", None)
-    if formulas is None:
-        click.echo(f"    a study of training runs, for sweep, over {varied}")
-        return
-    for formula in formulas.values():
-        click.echo(f"    {formula}")
-    click.echo(f"    over {varied}")
+    study = [f"a study of training runs, for sweep, {over}"]
+    for line in study if formulas is None else [*formulas.values(), over]:
+        click.echo(f"    {line}")
 
 
 def _no_specs() -> str:

@@ -33,17 +33,9 @@ from verifai_jax.core.display.extensions import extension, extensions
 from verifai_jax.core.messages.errors import unknown_name
 
 COMMANDS = (
-    falsify,
-    list_targets,
-    replay,
-    doctor,
-    confirm,
-    explain,
-    shrink,
-    save_counterexamples,
-    replay_counterexamples,
-    new,
-)
+    falsify, list_targets, replay, doctor, confirm, explain, shrink, save_counterexamples,
+    replay_counterexamples, new,
+)  # fmt: skip
 """The sub-commands of the core. Their files import nothing heavy until a command runs."""
 GROUP = "verifai_jax.commands"
 """Entry points of the sub-commands of add-ons and of other packages."""
@@ -51,19 +43,16 @@ GROUP = "verifai_jax.commands"
 
 @contextlib.contextmanager
 def _signals_interrupt() -> Iterator[list[int]]:
-    """Let SIGTERM and SIGHUP interrupt as Ctrl-C does, so that a command saves its results.
-
-    A second one of a kind ends the process at once. Those that are ignored (`nohup`) stay ignored.
-
-    **Returns:** the signals that have come.
-    """
+    """Let SIGTERM and SIGHUP interrupt as Ctrl-C does, so that a command saves its results."""
     received: list[int] = []
 
     def interrupt(number: int, _: object) -> None:
+        # A second one of a kind ends the process at once.
         signal.signal(number, signal.SIG_DFL)
         received.append(number)
         raise KeyboardInterrupt
 
+    # Those that are ignored (`nohup`) stay ignored.
     here = threading.current_thread() is threading.main_thread()
     numbers = [signal.SIGTERM, getattr(signal, "SIGHUP", signal.SIGTERM)] if here else []
     taken = [number for number in numbers if signal.getsignal(number) == signal.SIG_DFL]

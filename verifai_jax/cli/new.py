@@ -11,14 +11,8 @@ from verifai_jax.cli.arguments import PATH
 from verifai_jax.cli.json_output import command, give_result
 from verifai_jax.core.store.atomic_files import replacing
 
-FILES = {
-    "README.md": "README.md.txt",
-    "pendulum.py": "pendulum.py.txt",
-    "spec.py": "spec.py.txt",
-    "test_spec.py": "test_spec.py.txt",
-    ".gitignore": "gitignore.txt",
-}
-"""Files of a new project, and the texts they are made of."""
+FILES = ("README.md", "pendulum.py", "spec.py", "test_spec.py", ".gitignore")
+"""Files of a new project; the text of each ends with .txt, and begins with no dot."""
 
 
 @command()
@@ -34,8 +28,8 @@ def new(folder: Path) -> None:
     if folder.exists() and not folder.is_dir():
         raise click.UsageError(f"{folder} is a file; give a folder that does not exist yet")
     templates = resources.files("verifai_jax.cli").joinpath("new_project")
-    for name, template in FILES.items():
-        text = templates.joinpath(template).read_text(encoding="utf-8")
+    for name in FILES:
+        text = templates.joinpath(f"{name.lstrip('.')}.txt").read_text(encoding="utf-8")
         text = text.replace("$name", folder.resolve().name).replace("$package", _package())
         with replacing(folder / name) as partial:
             partial.write_text(text, encoding="utf-8")

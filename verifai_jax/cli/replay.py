@@ -16,24 +16,17 @@ from verifai_jax.cli.json_output import command, give_result
 @arguments.ROW
 @arguments.PROBLEM
 @option(
-    "--precision",
-    type=click.Choice(["float32", "float64"]),
+    "--precision", type=click.Choice(["float32", "float64"]),
     help="[default: float64, and that of the run for a system that draws random numbers]",
-)
+)  # fmt: skip
 @arguments.EVEN_IF_CHANGED
 @arguments.FOLDER
 @arguments.PICTURES
 @fail_on(counterexample="if it violates the property, or has no verdict")
 def replay(
-    folder: Path,
-    row: int | None,
-    target: str | None,
-    precision: str | None,
-    even_if_changed: bool,
-    into: Path | None,
-    pictures: bool,
-    fail_on: Gate | None,
-) -> None:
+    folder: Path, row: int | None, target: str | None, precision: str | None, even_if_changed: bool,
+    into: Path | None, pictures: bool, fail_on: Gate | None,
+) -> None:  # fmt: skip
     """Simulate a ROW (by default the worst) of the run in RUN again, and draw it."""
     from verifai_jax.core.messages.text import one_line, printable
     from verifai_jax.pictures import write_replay_pictures
@@ -58,19 +51,13 @@ def replay(
         # With several formulas `rho` is the least, and each has a column of its own.
         before = stored.get(f"rho.{name}", stored["rho"])
         click.echo(f"    robustness {rho:z.6g} in {precision}, {before:z.6g} in the table")
-    verdict = "violated" if again.violated else "satisfied"
-    click.echo(f"  status {again.status.name.lower()}; {verdict}")
-    give_result(
-        row=number,
-        precision=precision,
-        features={name: stored[name] for name in run.table.features},
-        robustness=again.rho,
-        stored_robustness=stored["rho"],
-        status=again.status.name.lower(),
-        violated=again.violated,
-        changed=[change._asdict() for change in run.changes(number)],
-        finding=again.finding,
-    )
+    status = again.status.name.lower()
+    click.echo(f"  status {status}; {'violated' if again.violated else 'satisfied'}")
+    features = {name: stored[name] for name in run.table.features}
+    give_result(row=number, precision=precision, features=features, robustness=again.rho)
+    give_result(stored_robustness=stored["rho"], status=status, violated=again.violated)
+    changed = [change._asdict() for change in run.changes(number)]
+    give_result(changed=changed, finding=again.finding)
     if pictures:
         for path in write_replay_pictures(again, into or folder):
             click.echo(f"  picture      {path}")

@@ -5,6 +5,7 @@ from typing import Any
 
 import click
 
+import verifai_jax as vj
 from verifai_jax.cli import arguments
 from verifai_jax.cli.arguments import option
 from verifai_jax.cli.exit_codes import check_again
@@ -17,11 +18,9 @@ from verifai_jax.cli.json_output import command, give_result, show_result
 @arguments.ROW
 @arguments.PROBLEM
 @option(
-    "--by",
-    type=click.Choice(["count", "distance", "likelihood"]),
-    default="count",
+    "--by", type=click.Choice(["count", "distance", "likelihood"]), default="count",
     help="Minimise the number of features first, or the distance; or find the likeliest failure.",
-)
+)  # fmt: skip
 @option("--budget", default=2000, help="Maximum simulations.")
 @arguments.SEED
 @option(
@@ -31,17 +30,10 @@ from verifai_jax.cli.json_output import command, give_result, show_result
 @arguments.FOLDER
 @arguments.PICTURES
 def shrink(
-    folder: Path,
-    row: int | None,
-    target: str | None,
-    even_if_changed: bool,
-    into: Path | None,
-    pictures: bool,
-    **options: Any,
-) -> None:
+    folder: Path, row: int | None, target: str | None, even_if_changed: bool, into: Path | None,
+    pictures: bool, **options: Any,
+) -> None:  # fmt: skip
     """Make a ROW (by default the worst) of the run in RUN small: few features, near nominal."""
-    import verifai_jax as vj
-
     run = arguments.load_judged_run(folder, target)
     with kept_until_done() as kept:
         small = vj.shrink(run, row, **options)

@@ -29,20 +29,10 @@ from verifai_jax.mtl.walk import Walk
 
 Values = Float[np.ndarray, "time *lanes"]
 FUNCTIONS: dict[str, Callable[..., Values]] = {
-    "neg": np.negative,
-    "+": np.add,
-    "-": np.subtract,
-    "*": np.multiply,
-    "/": np.divide,
-    "**": np.power,
-    "abs": np.abs,
-    "sqrt": np.sqrt,
-    "sin": np.sin,
-    "cos": np.cos,
-    "exp": np.exp,
-    "min": lambda *values: _joined(values, -1),
-    "max": lambda *values: _joined(values, 1),
-}
+    "neg": np.negative, "+": np.add, "-": np.subtract, "*": np.multiply, "/": np.divide,
+    "**": np.power, "abs": np.abs, "sqrt": np.sqrt, "sin": np.sin, "cos": np.cos, "exp": np.exp,
+    "min": lambda *values: _joined(values, -1), "max": lambda *values: _joined(values, 1),
+}  # fmt: skip
 """The functions of expressions on the host, except `norm`."""
 
 
@@ -181,7 +171,8 @@ class HostValues:
             case ast.Constant(value):
                 return np.full((self.length + pad, *(1,) * self.lanes), top if value else -top)
             case ast.Predicate(comparison, left, right):
-                return self._compared(comparison, left, right, boolean, pad)
+                a, b = (self._expression(e, pad) for e in (left, right))
+                return compared(comparison, a, b, boolean, np)
             case ast.Atom(e):
                 value = alone(self._expression(e, pad), e, self.truths)
                 return compared(">", value, np.zeros(1), boolean, np)
@@ -193,27 +184,18 @@ class HostValues:
                     joined = joined + self.blend * sum(np.clip(v, -1e9, 1e9) for v in below)
                 return joined
             case ast.Window():
-                return _window(
-                    below[0], *self._span(f.interval), f.sign, top, hold, f.side == "back"
-                )
+                a, b = self._span(f.interval)
+                return _window(below[0], a, b, f.sign, top, hold, f.side == "back")
             case ast.Next():
                 return _window(below[0], self.stride, self.stride, 1, top, True)
             case ast.Prev(_, weak):
                 sign = -1 if weak else 1
                 return _window(below[0], self.stride, self.stride, sign, top, hold, True)
             case ast.Witness():
-                left, right = below
-                a, b = self._span(f.interval)
-                return _witness(left, right, a, b, top, hold, f.side == "back")
+                return _witness(*below, *self._span(f.interval), top, hold, f.side == "back")
             case ast.Derived():
                 return below[0]
         raise missing_case("the value", f)
-
-    def _compared(
-        self, comparison: str, left: Term, right: Term, boolean: bool, pad: int
-    ) -> Values:
-        a, b = (self._expression(e, pad) for e in (left, right))
-        return compared(comparison, a, b, boolean, np)
 
     def _expression(self, e: Term, pad: int) -> Values:
         values: dict[int, Values] = {}
@@ -295,14 +277,6 @@ def _joined(values: Sequence[Values], sign: int) -> Values:
     return joined
 
 
-def _extended(x: Values, count: int, fill: float | None) -> Values:
-    """Return `x` with more samples: those of its last one, or of a fill value."""
-    extended = np.empty((len(x) + count, *x.shape[1:]))
-    extended[: len(x)] = x
-    extended[len(x) :] = x[-1:] if fill is None else fill
-    return extended
-
-
 def _window(
     x: Values, a: int, b: float, sign: int, top: float, hold: bool, back: bool = False
 ) -> Values:
@@ -313,14 +287,14 @@ def _window(
     # Beyond the whole trace there is only what comes after it.
     a = min(a, n)
     b = int(min(b, a + n))
-    x = _extended(x, b, None if hold else -sign * top)
+    after = x[-1] if hold else np.full(x.shape[1:], -sign * top)
+    x = np.concatenate([x, np.broadcast_to(after, (b, *x.shape[1:]))])
     size, width = 1, b - a + 1
     extreme = np.maximum if sign > 0 else np.minimum
     while 2 * size <= width:
         x = extreme(x[:-size], x[size:])
         size *= 2
-    if width > size:
-        more = width - size
+    if more := width - size:
         x = extreme(x[:-more], x[more:])
     return x[a : a + n]
 

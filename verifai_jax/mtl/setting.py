@@ -21,10 +21,7 @@ from verifai_jax.mtl.semantics import Semantics
 
 
 class HorizonError(ValueError):
-    """An error for a formula that looks beyond the end of a trace, under `end="strict"`.
-
-    `fact` is the message without its advice.
-    """
+    """A formula looks beyond the end of a trace; `fact` is the message without its advice."""
 
     def __init__(self, fact: str) -> None:
         self.fact = fact
@@ -39,10 +36,8 @@ class SamplingError(ValueError):
 
     def __init__(self, fact: str, dt: float) -> None:
         self.fact, self.dt = fact, dt
-        super().__init__(
-            f"{fact}. Resample it first, as in "
-            f'resample(trace, dt={dt:zg}, method="hold") or method="linear"'
-        )
+        how = f'resample(trace, dt={dt:zg}, method="hold") or method="linear"'
+        super().__init__(f"{fact}. Resample it first, as in {how}")
 
 
 class Setting(NamedTuple):
@@ -177,8 +172,7 @@ def period(trace: Trace) -> float:
         k = int(np.argmax(np.abs(steps - dt)))
         raise SamplingError(
             f"the trace is not evenly sampled: steps of {format_seconds(steps.min())} to "
-            f"{format_seconds(steps.max())}, "
-            f"as at {_at(trace, k)}",
+            f"{format_seconds(steps.max())}, as at {_at(trace, k)}",
             float(np.median(steps)),
         )
     check_period(dt)
@@ -199,10 +193,15 @@ def since_first(times: Real[np.ndarray, " time"]) -> tuple[Float[np.ndarray, " t
         # Integers are exact, whatever their width and their origin.
         return np.array([int(t) - int(times[0]) for t in times], float), 0.0
     stamps = times if times.dtype.kind == "f" else times.astype(float)
-    finite = stamps[np.isfinite(stamps)]
-    resolution = float(np.spacing(np.abs(finite).max())) if len(finite) else 0.0
-    stamps = stamps.astype(float)
-    return stamps - stamps[0], resolution
+    return stamps.astype(float) - float(stamps[0]), resolution_of(stamps)
+
+
+def resolution_of(stamps: np.ndarray) -> float:
+    """Return by how much sample times are rounded, in seconds; 0 for whole numbers."""
+    known = stamps[np.isfinite(stamps)]
+    if stamps.dtype.kind != "f" or not len(known):
+        return 0.0
+    return float(np.spacing(np.abs(known).max()))
 
 
 def plain_period(dt: float, error: float) -> float:
@@ -243,10 +242,9 @@ def check_horizon(formula: Formula, trace: Trace, dt: float) -> None:
 
 def check_reach(formula: Formula, duration: float, dt: float) -> None:
     """Raise `HorizonError` for a formula that looks beyond a duration in seconds."""
-    horizon = formula.horizon(dt)
+    horizon, lasts = formula.horizon(dt), format_seconds(duration)
     if horizon > duration * (1 + 1e-9) + 1e-9 * dt:
         what = "has no end" if math.isinf(horizon) else f"looks {format_seconds(horizon)} ahead"
-        lasts = format_seconds(duration)
         raise HorizonError(f"the formula {what}, but the trace lasts {lasts}: {formula}")
 
 
@@ -257,16 +255,8 @@ def evaluator_of(
     valid: Array | None,
     lanes: int,
 ) -> Evaluator:
+    of, pymtl = setting, setting.compat == "pymtl"
     return Evaluator(
-        signals,
-        setting.length,
-        setting.dt,
-        setting.kind,
-        tau,
-        setting.end,
-        valid,
-        setting.compat == "pymtl",
-        lanes,
-        stride=setting.stride,
-        truths=setting.truths,
-    )
+        signals, of.length, of.dt, of.kind, tau, of.end, valid, pymtl, lanes,
+        stride=of.stride, truths=of.truths,
+    )  # fmt: skip

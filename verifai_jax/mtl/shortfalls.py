@@ -27,8 +27,6 @@ from verifai_jax.mtl.words import OPERATORS
 
 MAX_STATES = 5000
 """Maximum number of pairs of a part and the windows around it that are considered."""
-
-
 END_OF_TRACE = {
     "hold": "its last sample is taken for all that comes after",
     "truncate": "what comes after is left out",
@@ -40,8 +38,7 @@ class Shortfall(NamedTuple):
     """A part of a formula that says something else than it seems to say.
 
     - `kind`: `"beyond"` (the end), `"start"` (the first sample decides), or `"cut"`.
-    - `part`: the part of the formula.
-    - `sentence`: what is the matter with it.
+    - `sentence`: what is the matter with the part.
     - `meant`: the formula that was probably meant, if that is known.
     """
 
@@ -216,14 +213,14 @@ class _Walk:
             wrong = outer.sign > 0 if math.isinf(end) else end - latest > self.slack
             # One that fits nowhere is beyond the trace.
             wrong &= start <= latest
-            text += " up to the end of the trace, which cuts its window"
             if math.isfinite(self.duration):
                 at = min(outer.asked + end + outer.later, self.duration)
                 left = f"{format_seconds(self.duration - at)} of its {format_seconds(length)}"
-                lasts = format_seconds(self.duration)
-                text = text.partition(" up to")[0] + f" as late as {format_seconds(at)}, when "
-                text += f"{left} are left of a trace of {lasts}"
+                text += f" as late as {format_seconds(at)}, when {left} are left of a trace of "
+                text += format_seconds(self.duration)
                 text += "" if outer.sign > 0 else ", so that the end alone may break it"
+            else:
+                text += " up to the end of the trace, which cuts its window"
         if wrong:
             fits = {outer.window: Interval(start, latest), **fits} if latest < math.inf else {}
             self._keep(outer, inner, text, fits)

@@ -103,13 +103,12 @@ def _vectors(source: str, name: str, column: Any) -> np.ndarray:
         )
     (width,) = lengths
     rows = [[None] * width if cell is None else cell for cell in cells]
-    for row, cell in enumerate(rows, 1):
-        for entry in cell:
-            if entry is not None and not isinstance(entry, bool | int | float):
-                raise ValueError(
-                    f"column {name!r} of {source} holds lists that are not vectors of numbers; in "
-                    f"row {row} there is {_brief(entry)}"
-                )
+    for row, entry in ((row, entry) for row, cell in enumerate(rows, 1) for entry in cell):
+        if not isinstance(entry, bool | int | float | None):
+            raise ValueError(
+                f"column {name!r} of {source} holds lists that are not vectors of numbers; in "
+                f"row {row} there is {_brief(entry)}"
+            )
     entries = [entry for cell in rows for entry in cell if entry is not None]
     truths = bool(entries) and all(isinstance(entry, bool) for entry in entries)
     return np.array(rows, object if truths else float).reshape(len(rows), width)

@@ -150,10 +150,9 @@ def read_mcap(paths: Sequence[Path], time: str, notes: dict[str, int]) -> list[T
                 continue
             topics.setdefault(topic, []).append((message.log_time, row))
     for topic, errors in faults.items():
-        notes[
-            f"{counted(len(errors), 'message')} of topic {topic} cannot be decoded, and left out: "
-            f"{one_line(f'{type(errors[0]).__name__}: {errors[0]}')}"
-        ] = len(errors)
+        said, why = counted(len(errors), "message"), f"{type(errors[0]).__name__}: {errors[0]}"
+        note = f"{said} of topic {topic} cannot be decoded, and left out: {one_line(why)}"
+        notes[note] = len(errors)
     if not topics:
         said = "".join(f"; {note}" for note in notes)
         raise ValueError(f"{paths[0]} has no topic of JSON, ROS 2 or Protobuf messages{said}")
@@ -310,9 +309,9 @@ def read_parquet(path: Path, time: str, episode: int | None) -> list[Table]:
             f"{path} has episodes {numbers[0]} to {numbers[-1]}: name one, as in episode="
             f"{numbers[0]}, or judge all of them"
         )
-    if episode is not None and episode not in numbers:
-        raise ValueError(f"{path} has no episode {episode}, but {numbers[0]} to {numbers[-1]}")
     if episode is not None:
+        if episode not in numbers:
+            raise ValueError(f"{path} has no episode {episode}, but {numbers[0]} to {numbers[-1]}")
         table = table.filter(compute.field(EPISODE) == episode)
     if time not in table.column_names:
         names = [time if name == STAMP else name for name in table.column_names]

@@ -14,6 +14,7 @@ from collections.abc import Callable, Mapping
 
 import numpy as np
 
+from verifai_jax.addons.monitoring import resampling
 from verifai_jax.addons.monitoring.parametric import read_parametric
 from verifai_jax.addons.monitoring.piecewise import (
     Piecewise,
@@ -23,22 +24,14 @@ from verifai_jax.addons.monitoring.piecewise import (
     window,
     witnessed,
 )
-from verifai_jax.addons.monitoring.resampling import (
-    Method,
-    check_increasing,
-    gaps,
-    held,
-    hold_note,
-    recorded_samples,
-)
-from verifai_jax.addons.monitoring.stamps import resolution_of
+from verifai_jax.addons.monitoring.resampling import Method, gaps, hold_note
 from verifai_jax.core.values.trace import Trace
 from verifai_jax.mtl import formula as ast
 from verifai_jax.mtl.expression import Arithmetic, Component, Duration, Number, Signal
 from verifai_jax.mtl.formula import Formula, Term
 from verifai_jax.mtl.host_values import FUNCTIONS, numbers
 from verifai_jax.mtl.semantics import alone
-from verifai_jax.mtl.setting import as_formula, check_trace
+from verifai_jax.mtl.setting import as_formula, check_trace, resolution_of
 from verifai_jax.mtl.tree import missing_case, postorder
 
 SNAP = 1e-9
@@ -77,10 +70,8 @@ def dense_gradient(
     slopes: dict[str, float] = {}
     for name in template.names:
         near = STEP * max(1.0, abs(values[name]))
-        low = values[name] - near
-        if name in template.times:
-            low = max(low, 0.0)
-        sides = low, values[name] + near
+        low = 0.0 if name in template.times else -math.inf
+        sides = max(values[name] - near, low), values[name] + near
         first, last = (
             dense_robustness(template.formula({**values, name: side}), trace, method)
             for side in sides
@@ -114,9 +105,9 @@ class DenseValues:
     """
 
     def __init__(self, trace: Trace, method: Method) -> None:
-        self.trace = trace = recorded_samples(trace)
+        self.trace = trace = resampling.recorded_samples(trace)
         self.clock = np.asarray(trace.clock())
-        check_increasing(self.clock)
+        resampling.check_increasing(self.clock)
         self.times = self.clock - self.clock[0]
         self.method = method
         steps = np.diff(self.times)
@@ -234,10 +225,9 @@ class DenseValues:
                 return below[0].map(np.negative)
             case ast.Join():
                 return joined(below, f.sign)
-            case ast.Window(_, i) if f.side == "ahead":
-                return window(below[0], i.start, i.end, f.sign)
             case ast.Window(_, i):
-                return window(below[0], -i.end, -i.start, f.sign)
+                low, high = (i.start, i.end) if f.side == "ahead" else (-i.end, -i.start)
+                return window(below[0], low, high, f.sign)
             case ast.Witness():
                 return self.witness(f, *below)
             case ast.Derived():
@@ -308,7 +298,7 @@ class DenseValues:
     def samples(self, name: str, values: np.ndarray, hold: bool = False) -> Piecewise:
         # A truth value has no values between.
         hold = hold or self.method == "hold" or self.trace.is_truth(name)
-        values = held(values) if hold else values
+        values = resampling.held(values) if hold else values
         after = values if hold else np.append(values[1:], values[-1:])
         return Piecewise(self.times, values, values, after, self.snap)
 
@@ -320,8 +310,7 @@ class DenseValues:
         function: Callable[..., np.ndarray] = FUNCTIONS[name] if name != "norm" else np.positive
         operands = list(aligned(*operands))
         held = [f.steps for f in operands]
-        straight = name in ("+", "-", "neg") or (name == "*" and any(held))
-        straight = straight or (name == "/" and held[-1])
+        straight = {"+": True, "-": True, "neg": True, "*": any(held), "/": held[-1]}.get(name)
         if not (straight or all(held)) or (name == "norm" and self.method != "hold"):
             raise NotDense(
                 f"{whole} is not straight between samples: judge it with method='hold', or record "

@@ -8,7 +8,6 @@ found.plot("apart.png")
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
-from typing import ClassVar
 
 import numpy as np
 
@@ -45,10 +44,7 @@ class Distinction(Drawn, InNotebook):
     holds: tuple[bool, bool] | None
     robustness: tuple[float, float] | None
     tried: int
-    _picture: ClassVar[tuple[str, str]] = (
-        "verifai_jax.addons.monitoring.pictures",
-        "plot_distinction",
-    )
+    _picture = "verifai_jax.addons.monitoring.pictures", "plot_distinction"
 
     def __bool__(self) -> bool:
         return self.trace is not None
@@ -100,17 +96,15 @@ def distinguish(
     """
     one, other = as_formula(one), as_formula(other)
     if isinstance(signals, Simulated):
-        return lazy_import("verifai_jax.addons.monitoring.mined_bounds", "distinguish_by_search")(
-            one, other, signals, budget, seed
-        )
+        search = lazy_import("verifai_jax.addons.monitoring.mined_bounds", "distinguish_by_search")
+        return search(one, other, signals, budget, seed)
     if signals is None:
         found = free_difference(one, other, (), end, dt, duration, seed)
-        return distinction(one, other, () if found is None else (found,), "a free trace", end,
-                           GENERATIONS * LANES)  # fmt: skip
+        traces = () if found is None else (found,)
+        return distinction(one, other, traces, "a free trace", end, GENERATIONS * LANES)
     traces = named_traces(signals)
     for name, trace in traces.items():
-        found = distinction(one, other, (trace,), name, end, len(traces))
-        if found:
+        if found := distinction(one, other, (trace,), name, end, len(traces)):
             return found
     return distinction(one, other, (), "of the recordings", end, len(traces))
 

@@ -12,7 +12,6 @@ the two lies the trace that barely satisfies the formula.
 import functools
 from collections.abc import Iterable
 from dataclasses import dataclass, field
-from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -57,10 +56,7 @@ class Examples(Drawn, InNotebook):
     barely: Trace | None = field(repr=False)
     breaking: Trace | None = field(repr=False)
     robustness: dict[str, float]
-    _picture: ClassVar[tuple[str, str]] = (
-        "verifai_jax.addons.monitoring.pictures",
-        "plot_examples",
-    )
+    _picture = "verifai_jax.addons.monitoring.pictures", "plot_examples"
 
     @property
     def traces(self) -> dict[str, Trace]:
@@ -116,15 +112,11 @@ def examples(
     found["breaking"] = _example(formula, free, -1, seed)
     one, other = found["satisfying"], found["breaking"]
     found["barely"] = None if one is None or other is None else _between(formula, free, one, other)
-    named = {
-        name: None if (signals := found[name]) is None else free.trace(signals)
-        for name in ("satisfying", "barely", "breaking")
-    }
-    values = {
-        name: float(HostValues.of(trace, end)(formula)[0])
-        for name, trace in named.items()
-        if trace is not None
-    }
+    named, values = dict[str, Trace | None](), dict[str, float]()
+    for name in ("satisfying", "barely", "breaking"):
+        named[name] = None if (signals := found[name]) is None else free.trace(signals)
+        if (trace := named[name]) is not None:
+            values[name] = float(HostValues.of(trace, end)(formula)[0])
     return Examples(formula, **named, robustness=values)
 
 

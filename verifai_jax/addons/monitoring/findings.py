@@ -62,11 +62,9 @@ class Findings(InNotebook):
 
     def summary(self) -> str:
         """Write each finding as a sentence, grouped by formula."""
-        lines = [
-            f"{counted(len(self.findings), 'finding')} on "
-            f"{counted(len(self.requirements), 'formula')}, "
-            f"with {counted(self.recordings, 'recording')}"
-        ]
+        asked = counted(len(self.requirements), "formula")
+        lines = [f"{counted(len(self.findings), 'finding')} on {asked}, with "]
+        lines[0] += counted(self.recordings, "recording")
         for each in self.requirements:
             own = [finding for finding in self.findings if finding.requirement == each.id]
             lines += ["", f"{each.id}  {each.formula}"] if own else []

@@ -94,28 +94,18 @@ class FreeTraces:
         # A long clock has fewer traces, so that the memory is bounded.
         lanes = max(KEPT, min(lanes, 2**19 // self.length))
         shape = (self.length, lanes)
-        rates = np.array([0, 1, 2, 4, 8, self.length / 3]) / self.length
-        return {
-            name: self._steps(rng, own, shape, rates, self.widths[name])
-            for name, own in self.levels.items()
-        }
+        widths = self.widths
+        return {n: self._steps(rng, own, shape, widths[n]) for n, own in self.levels.items()}
 
     def _steps(
-        self,
-        rng: np.random.Generator,
-        levels: np.ndarray,
-        shape: tuple[int, int],
-        rates: np.ndarray,
-        width: int,
+        self, rng: np.random.Generator, levels: np.ndarray, shape: tuple[int, int], width: int
     ) -> Values:
         if width:
-            parts = [self._steps(rng, levels, shape, rates, 0) for _ in range(width)]
-            return np.stack(parts, axis=-1)
-        rate = rng.choice(rates, shape[1])
+            return np.stack([self._steps(rng, levels, shape, 0) for _ in range(width)], axis=-1)
+        rate = rng.choice(np.array([0, 1, 2, 4, 8, shape[0] / 3]) / shape[0], shape[1])
         changes = rng.random(shape) < rate
-        changes[list(self.instants)] |= (rng.random((len(self.instants), shape[1])) < 0.3) & (
-            rate > 0
-        )
+        chosen = rng.random((len(self.instants), shape[1])) < 0.3
+        changes[list(self.instants)] |= chosen & (rate > 0)
         changes[0] = True
         since = np.maximum.accumulate(np.where(changes, np.arange(shape[0])[:, None], 0), axis=0)
         return np.take_along_axis(rng.choice(levels, shape), since, axis=0)

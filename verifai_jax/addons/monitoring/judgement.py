@@ -2,7 +2,7 @@
 
 import functools
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Sequence, Sized
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -12,7 +12,7 @@ import numpy as np
 
 from verifai_jax.core.display.extensions import verb
 from verifai_jax.core.display.notebook import InNotebook, frame_html
-from verifai_jax.core.messages.text import counted, printable, shorten
+from verifai_jax.core.messages.text import counted, listed, printable, shorten
 from verifai_jax.core.store.atomic_files import replacing
 from verifai_jax.core.user_code.sources import Source
 from verifai_jax.mtl.requirements import Requirement
@@ -129,21 +129,17 @@ class Judgement(InNotebook):
         """
         import pandas as pd
 
-        table = {}
+        table: dict[str, dict[str, Any]] = {}
         for each in self.requirements:
             rows = self.of(each.id)
             values = np.array([row.robustness for row in rows])
+            none = sum(row.requirement == each.id for row in self.without_verdict)
             fails = sum(row.verdict == "fails" for row in rows)
-            entry: dict[str, Any] = {
-                "verdicts": len(rows),
-                "failing": fails,
-                "without verdict": sum(r.requirement == each.id for r in self.without_verdict),
-            }
+            table[each.id] = {"verdicts": len(rows), "failing": fails, "without verdict": none}
             for share in shares:
                 # No interpolation: the values of two recordings may be infinite.
                 found = np.quantile(values, share, method="inverted_cdf") if rows else math.nan
-                entry[f"{share:z.3g}"] = float(found)
-            table[each.id] = entry
+                table[each.id][f"{share:z.3g}"] = float(found)
         return pd.DataFrame.from_dict(table, orient="index").rename_axis("requirement")
 
     def outliers(self, distance: float = 3.5) -> "pd.DataFrame":
@@ -178,14 +174,10 @@ class Judgement(InNotebook):
     def summary(self) -> str:
         """Return the summary as text: failures, missing verdicts, and the margins of the others."""
         failing, missing = self.failing, self.without_verdict
-        asked = (
-            f"{counted(len(self.requirements), 'requirement')} on "
-            f"{counted(len(self.files), 'recording')}"
-        )
-        verdicts = len(self.rows) - len(missing)
-        lines = [f"{asked}: {len(failing)} of {verdicts} verdicts fail"]
-        if missing:
-            lines[0] += f", and {len(missing)} could not be given"
+        asked = counted(len(self.requirements), "requirement")
+        asked += f" on {counted(len(self.files), 'recording')}"
+        lines = [f"{asked}: {len(failing)} of {len(self.rows) - len(missing)} verdicts fail"]
+        lines[0] += f", and {len(missing)} could not be given" if missing else ""
         width = max(len(each.id) for each in self.requirements)
         lines += ["", f"  {'':{width}}  {'failing':<12}{'least':>10}{'median':>12}"]
         spread = self.quantiles((0.0, 0.5))
@@ -197,17 +189,12 @@ class Judgement(InNotebook):
             lines.append(f"  {each.id:{width}}  {share:<10}{numbers} {unit}".rstrip())
         lines += _listed("Failing, the worst first:", failing)
         lines += _listed("Without a verdict:", _together(missing))
-        lines += _noted(self.rows)
         if (tightest := self.tightest) is not None and not failing:
             lines += ["", f"Tightest: {tightest.requirement} on {tightest.file}"]
             lines += [f"  {tightest.explanation}"] if tightest.explanation else []
-        noted = {(row.requirement, row.note): row.file for row in reversed(self.rows) if row.note}
-        for (requirement, note), file in reversed(noted.items()):
-            lines += ["", f"Note on {requirement}, as on {file}:", f"  {note}"]
-        return "\n".join(lines)
+        return "\n".join([*lines, *_noted(self.rows)])
 
-    def __str__(self) -> str:
-        return self.summary()
+    __str__ = summary
 
     def _notebook_parts(self) -> Iterable[str]:
         yield frame_html(self.quantiles())
@@ -230,14 +217,10 @@ class Judgement(InNotebook):
         root = ElementTree.Element("testsuites", name="requirements")
         for each in self.requirements:
             rows = [row for row in self.rows if row.requirement == each.id]
-            suite = ElementTree.SubElement(
-                root,
-                "testsuite",
-                name=printable(each.id),
-                tests=str(len(rows)),
-                failures=str(sum(row.verdict == "fails" for row in rows)),
-                errors=str(sum(not row.verdict for row in rows)),
-            )
+            fails, errors = (sum(row.verdict == kind for row in rows) for kind in ("fails", ""))
+            numbers = {"tests": len(rows), "failures": fails, "errors": errors}
+            about = {"name": printable(each.id)} | {n: str(k) for n, k in numbers.items()}
+            suite = ElementTree.SubElement(root, "testsuite", about)
             for row in rows:
                 _case(suite, each, row)
         with replacing(path) as partial:
@@ -246,15 +229,12 @@ class Judgement(InNotebook):
 
 
 def _case(suite: ElementTree.Element, requirement: Requirement, row: Row) -> None:
-    case = ElementTree.SubElement(
-        suite, "testcase", name=printable(row.file), classname=printable(requirement.id)
-    )
+    names = {"name": printable(row.file), "classname": printable(requirement.id)}
+    case = ElementTree.SubElement(suite, "testcase", names)
     if row.verdict == "holds":
         return
-    said = row.error or f"robustness {row.robustness:z.6g}; {row.explanation}"
-    fault = ElementTree.SubElement(
-        case, "failure" if row.verdict else "error", message=printable(said)
-    )
+    said = printable(row.error or f"robustness {row.robustness:z.6g}; {row.explanation}")
+    fault = ElementTree.SubElement(case, "failure" if row.verdict else "error", message=said)
     about = (requirement.text, str(requirement.formula), requirement.source)
     fault.text = printable("\n".join(line for line in about if line))
 
@@ -264,24 +244,27 @@ def _listed(title: str, rows: Sequence[Row]) -> list[str]:
     for row in rows[:SHOWN]:
         lines.append(f"  {row.requirement} on {row.file}")
         lines.append(f"    {shorten(row.explanation or row.error, 160)}".rstrip())
-    if len(rows) > SHOWN:
-        lines.append(f"  and {len(rows) - SHOWN} more in the table")
-    return lines
+    return [*lines, *_more(rows)]
 
 
 def _noted(rows: Sequence[Row]) -> list[str]:
-    """Return each note once, with the recordings that it is about."""
-    found: dict[str, dict[str, None]] = {}
+    """Return each note once, with the requirements and the recordings that it is about."""
+    found: dict[str, list[Row]] = {}
     for row in rows:
         for note in filter(None, row.note.split("; ")):
-            found.setdefault(note, {})[row.file] = None
-    lines = ["", "Notes:"] if found else []
-    for note, files in list(found.items())[:SHOWN]:
-        where = next(iter(files)) if len(files) == 1 else counted(len(files), "recording")
-        lines.append(f"  {shorten(note, 160)} ({where})")
-    if len(found) > SHOWN:
-        lines.append(f"  and {len(found) - SHOWN} more in the table")
-    return lines
+            found.setdefault(note, []).append(row)
+    lines = []
+    for note, own in list(found.items())[:SHOWN]:
+        asked = listed(list(dict.fromkeys(row.requirement for row in own)))
+        files = list(dict.fromkeys(row.file for row in own))
+        where = files[0] if len(files) == 1 else counted(len(files), "recording")
+        lines += ["", f"Note on {asked}, as on {where}:", f"  {note}"]
+    return [*lines, *_more(found)]
+
+
+def _more(rows: Sized) -> list[str]:
+    left = len(rows) - SHOWN
+    return [f"  and {left} more in the table"] if left > 0 else []
 
 
 def _together(rows: Sequence[Row]) -> list[Row]:

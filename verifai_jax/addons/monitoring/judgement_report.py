@@ -28,12 +28,9 @@ def judgement_page(judgement: Judgement, about: About, problem: object = None) -
     failing, missing = judgement.failing, judgement.without_verdict
     verdicts = len(judgement.rows) - len(missing)
     fleet = counted(len(judgement.files), "recording")
-    headline = (
-        f"{len(failing):,} of {verdicts:,} verdicts fail: "
-        f"{counted(len(judgement.requirements), 'requirement')} on {fleet}."
-    )
-    if missing:
-        headline += f" {len(missing):,} verdicts could not be given."
+    asked = counted(len(judgement.requirements), "requirement")
+    headline = f"{len(failing):,} of {verdicts:,} verdicts fail: {asked} on {fleet}."
+    headline += f" {len(missing):,} verdicts could not be given." if missing else ""
     tone = "fails" if failing else "open" if missing or not verdicts else "holds"
     claims = []
     for index, each in enumerate(judgement.requirements, 1):
@@ -47,43 +44,26 @@ def judgement_page(judgement: Judgement, about: About, problem: object = None) -
         near = f"{tightest.requirement} on {tightest.file}: {tightest.explanation}"
     links = tuple(chained(judgement.inputs))
     chain = links[-1].chain if links else ""
+    answers = [
+        ("What was found?", headline, "found"),
+        ("Which requirement is the tightest?", near, "found"),
+        ("How many verdicts are missing?", f"{len(missing):,}", "limits"),
+    ]
+    limits = [bullets([RECORDED, "A recording shows what happened, not what may happen."])]
+    limits += [_rows(judgement, missing)] if missing else []
+    inputs = (element("h3", "Inputs"), chain_table(links), chain_words(chain))
     sections = (
-        answers_section(
-            [
-                ("What was found?", headline, "found"),
-                ("Which requirement is the tightest?", near, "found"),
-                ("How many verdicts are missing?", f"{len(missing):,}", "limits"),
-            ]
-        ),
+        answers_section(answers),
         _asked(judgement),
         _found(judgement),
-        Section(
-            "limits",
-            "What was not shown",
-            (
-                bullets([RECORDED, "A recording shows what happened, not what may happen."]),
-                *([_rows(judgement, missing)] if missing else []),
-            ),
-        ),
+        Section("limits", "What was not shown", tuple(limits)),
         claims_section(claims),
         Section(
-            "reproduce",
-            "Versions and inputs",
-            (
-                table(["package", "version"], versions()),
-                element("h3", "Inputs"),
-                chain_table(links),
-                chain_words(chain),
-            ),
+            "reproduce", "Versions and inputs", (table(["package", "version"], versions()), *inputs)
         ),
     )
-    return Page(
-        title=f"Requirements on {fleet}",
-        headline=headline,
-        tone=tone,
-        sections=sections,
-        claims=claims_json("requirements", claims, chain),
-    )
+    title, data = f"Requirements on {fleet}", claims_json("requirements", claims, chain)
+    return Page(title=title, headline=headline, tone=tone, sections=sections, claims=data)
 
 
 def _asked(judgement: Judgement) -> Section:
@@ -105,15 +85,8 @@ def _found(judgement: Judgement) -> Section:
     content = [table(heads, numbers, "Robustness, by share of the recordings")]
     outliers = judgement.outliers()
     if len(outliers):
-        found = [
-            (
-                row["requirement"],
-                row["file"],
-                f"{row['robustness']:z.4g}",
-                f"{row['distance']:z.3g}",
-            )
-            for row in outliers.to_dict("records")
-        ]
+        columns = outliers[["requirement", "file", "robustness", "distance"]].to_numpy().tolist()
+        found = [(id_, file, f"{rho:z.4g}", f"{away:z.3g}") for id_, file, rho, away in columns]
         heads = ["requirement", "recording", "robustness", "distance"]
         content.append(table(heads, found[:MAX_ROWS], "Recordings unlike the others"))
     held = [row for row in judgement.rows if row.verdict == "holds"]

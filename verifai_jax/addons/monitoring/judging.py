@@ -17,19 +17,14 @@ from typing import NamedTuple
 
 import numpy as np
 
+from verifai_jax.addons.monitoring import resampling
 from verifai_jax.addons.monitoring.columns import LeftOut
 from verifai_jax.addons.monitoring.containers import Episode
 from verifai_jax.addons.monitoring.dense import DenseValues, NotDense
 from verifai_jax.addons.monitoring.judgement import Judgement, Row
 from verifai_jax.addons.monitoring.recorded import Recording, Recordings, named_recordings
 from verifai_jax.addons.monitoring.recording import read
-from verifai_jax.addons.monitoring.resampling import (
-    Method,
-    Missing,
-    check_holes,
-    resample,
-    without_gaps,
-)
+from verifai_jax.addons.monitoring.resampling import Method, Missing
 from verifai_jax.core.compute.executors import Executor, check_executor, gather
 from verifai_jax.core.display.progress import count_done, shows_progress
 from verifai_jax.core.messages.text import format_time, listed, one_line
@@ -142,17 +137,13 @@ def judge(
             inputs.extend(_hashed(name, source))
             yield name, source
 
-    named = seen()
     if executor is None:
-        for index, (name, source) in enumerate(named):
+        for index, (name, source) in enumerate(seen()):
             keep(index, judge_recording(requirements, name, source, reading))
     else:
         check_executor(executor)
-        calls = [
-            executor.submit(judge_recording, requirements, name, source, reading)
-            for name, source in named
-        ]
-        gather(calls, keep)
+        start = functools.partial(executor.submit, judge_recording, requirements)
+        gather([start(name, source, reading) for name, source in seen()], keep)
     if not rows:
         raise ValueError("there is no recording to judge")
     ordered = tuple(row for index in sorted(rows) for row in rows[index])
@@ -164,11 +155,8 @@ def _hashed(name: str, source: Recording) -> list[Source]:
     if isinstance(source, str | Path | Episode):
         path = source.path if isinstance(source, Episode) else source
         return hashed_files([Path(path)], "a recording")
-    columns: Mapping[str, object] = (
-        source.to_dict("list")
-        if not isinstance(source, Trace)
-        else {**source.signals, "time": source.clock()}
-    )
+    is_trace = isinstance(source, Trace)
+    columns = {**source.signals, "time": source.clock()} if is_trace else source.to_dict("list")
     whole = hashlib.sha256()
     for column, values in sorted(columns.items(), key=str):
         array = np.asarray(values)
@@ -194,8 +182,8 @@ def read_recording(source: Recording, reading: Reading) -> Trace:
             source, time=reading.time, time_unit=reading.time_unit, dt=reading.dt,
             missing=reading.missing, max_gap=reading.max_gap,
         )  # fmt: skip
-    trace = check_holes(source.trim(), reading.max_gap)
-    return trace if reading.missing is None else without_gaps(trace, reading.missing)
+    trace = resampling.check_holes(source.trim(), reading.max_gap)
+    return trace if reading.missing is None else resampling.without_gaps(trace, reading.missing)
 
 
 def _judged(
@@ -204,11 +192,7 @@ def _judged(
     trace, units = trace.trim(), units_of(trace.signals, trace.units)
     said = [note for note in trace.notes if not isinstance(note, LeftOut)]
     find = finder(trace, reading)
-    clock = np.asarray(trace.clock())
-    try:
-        dt = period(trace)
-    except SamplingError:
-        dt = 0.0
+    clock, dt = np.asarray(trace.clock()), _even_step(trace)
     signals = {name: np.asarray(value) for name, value in trace.signals.items()}
     rows = []
     for each in requirements:
@@ -227,6 +211,14 @@ def _judged(
     return rows
 
 
+def _even_step(trace: Trace) -> float:
+    """Return the period of a trace; 0 for one that is not evenly sampled."""
+    try:
+        return period(trace)
+    except SamplingError:
+        return 0.0
+
+
 def finder(trace: Trace, reading: Reading) -> Callable[[Formula], tuple[Found, str]]:
     """Return a function that decides formulas on one trace, and notes how if that is not exact."""
 
@@ -234,15 +226,10 @@ def finder(trace: Trace, reading: Reading) -> Callable[[Formula], tuple[Found, s
     def sampled() -> tuple[HostValues, Trace]:
         own = trace
         if reading.resample_to is not None and reading.method is not None:
-            own = resample(own, reading.resample_to, reading.method)
+            own = resampling.resample(own, reading.resample_to, reading.method)
         return HostValues.of(own, "truncate" if reading.end == "truncate" else "hold"), own
 
-    try:
-        period(trace)
-        even = reading.method is None
-    except SamplingError:
-        even = False
-    dense = None
+    even, dense = _even_step(trace) and reading.method is None, None
     if not even and reading.end != "truncate":
         dense = DenseValues(trace, reading.method or "hold")
 

@@ -143,24 +143,18 @@ class _Linter:
     ) -> np.ndarray:
         """Return the values of a part at the samples at which it is asked in a recording."""
         values = np.broadcast_to(of(part), each.values.length)
-        first, last = (t / each.values.dt * each.values.stride for t in self._span(part))
+        span = self.asked.get(part, (0.0, math.inf))
+        first, last = (t / each.values.dt * each.values.stride for t in span)
         last = min(max(last, 0.0), len(values) - 1.0)
         return values[int(min(max(first, 0.0), last)) : int(last) + 1]
 
-    def _span(self, part: Formula) -> tuple[float, float]:
-        return self.asked.get(part, (0.0, math.inf))
-
     def _ever(self, part: Formula, everywhere: bool = False) -> list[str]:
         """Return the recordings in which a part holds where it is asked, or anywhere."""
-        found = []
-        for each in self.recordings:
-            truth = (
-                each.values.truth(part)
-                if everywhere
-                else self._within(each, part, each.values.truth)
-            )
-            found += [each.name] if (truth > 0).any() else []
-        return found
+        return [each.name for each in self.recordings if self._comes(each, part, everywhere)]
+
+    def _comes(self, each: _Recording, part: Formula, everywhere: bool = False) -> bool:
+        truth = each.values.truth
+        return bool(((truth(part) if everywhere else self._within(each, part, truth)) > 0).any())
 
     @property
     def _all(self) -> str:
@@ -229,29 +223,24 @@ class _Linter:
             if constant.intersection(operands):
                 constant.add(part)
                 continue
-            for truth in (True, False):
-                if self._same(drawn, part, TRUE if truth else FALSE):
+            for truth in (TRUE, FALSE):
+                if self._same(drawn, part, truth):
                     constant.add(part)
                     covered.update(part.subformulas())
-                    yield self._found(
-                        f"always {str(truth).lower()}", part,
-                        f"{part} is {'true' if truth else 'false'} on every trace that was tried",
-                    )  # fmt: skip
+                    said = f"{part} is {str(truth).lower()} on every trace that was tried"
+                    yield self._found(f"always {truth}".lower(), part, said)
                     break
-        for part in dict.fromkeys(
-            each for word, parts in written.values() for each in _droppable(word, parts)
-        ):
+        droppable = (each for word, parts in written.values() for each in _droppable(word, parts))
+        for part in dict.fromkeys(droppable):
+            without = (replaced(self.formula, {part: truth}) for truth in (TRUE, FALSE))
             if part in constant | covered:
                 continue
-            for value in (TRUE, FALSE):
-                if self._same(drawn, self.formula, replaced(self.formula, {part: value})):
-                    yield self._found(
-                        "no effect",
-                        part,
-                        f"{part} affects the truth of the formula on no trace that was tried",
-                        "Leave it out, or check what was meant by it.",
-                    )  # fmt: skip
-                    break
+            if any(self._same(drawn, self.formula, each) for each in without):
+                yield self._found(
+                    "no effect", part,
+                    f"{part} affects the truth of the formula on no trace that was tried",
+                    "Leave it out, or check what was meant by it.",
+                )  # fmt: skip
 
     def _same(self, drawn: HostValues, one: Formula, other: Formula) -> bool:
         """Return whether no trace is found on which two formulas differ."""
@@ -268,11 +257,9 @@ class _Linter:
         for leaf in predicates_of(self.formula):
             if leaf in guards:
                 continue
-            margins = np.concatenate([self._within(e, leaf, e.values) for e in self.recordings])
-            truths = np.concatenate(
-                [self._within(e, leaf, e.values.truth) for e in self.recordings]
-            )
-            margins, truths = margins[np.isfinite(margins)], truths[np.isfinite(truths)]
+            seen = [[self._within(e, leaf, e.values) for e in self.recordings]]
+            seen += [[self._within(e, leaf, e.values.truth) for e in self.recordings]]
+            margins, truths = (each[np.isfinite(each)] for each in map(np.concatenate, seen))
             if not margins.size or (truths > 0).any() != (truths > 0).all():
                 continue
             never, compared = bool((truths < 0).all()), leaf.compared
@@ -302,7 +289,7 @@ class _Linter:
     def _far(self, leaf: Formula, never: bool, nearest: float) -> Finding:
         ranges = []
         for name in leaf.signals():
-            own = np.concatenate([np.ravel(e.values.signals[name]) for e in self.recordings])
+            own = self._all_of(name)
             unit = f" {self.units[name]}" if name in self.units else ""
             ranges.append(f"{name} is from {np.nanmin(own):z.4g} to {np.nanmax(own):z.4g}{unit}")
         where = self._all if never else self._all.replace("any", "all")
@@ -345,17 +332,13 @@ class _Linter:
                     f"never required in {self._all}",
                 )  # fmt: skip
 
-    def _comes(self, each: _Recording, part: Formula) -> bool:
-        return bool((self._within(each, part, each.values.truth) > 0).any())
-
     def _at_once(self, part: ast.Until) -> bool:
         """Return whether the right side holds wherever the until is asked."""
-        for each in self.recordings:
-            truth = np.broadcast_to(each.values.truth(part.right), each.values.length)
-            span = self._within(each, part, lambda _, truth=truth: truth)
-            if not (span > 0).all():
-                return False
-        return True
+        spans = (
+            self._within(each, part, lambda _, each=each: each.values.truth(part.right))
+            for each in self.recordings
+        )
+        return all((span > 0).all() for span in spans)
 
     def _dimensions(self) -> Check:
         """Find units that do not go together, and a robustness of several units."""
@@ -399,10 +382,12 @@ class _Linter:
         """Write a scale for each signal: the width of its range, or 1."""
         scales = {}
         for name in self.formula.signals():
-            own = [np.ravel(e.values.signals[name]) for e in self.recordings]
-            width = float(np.ptp(np.concatenate(own))) if own else 0.0
+            width = float(np.ptp(self._all_of(name))) if self.recordings else 0.0
             scales[name] = float(f"{width:z.2g}") or 1.0
         return str(scales)
+
+    def _all_of(self, name: str) -> np.ndarray:
+        return np.concatenate([np.ravel(each.values.signals[name]) for each in self.recordings])
 
 
 def _implied(formula: Formula) -> bool:

@@ -16,8 +16,6 @@ from verifai_jax.mtl.tree import missing_case, postorder
 
 FEW = 64
 """Powers by a whole number up to this one are products, as in JAX."""
-
-
 ALONE = "\0"
 
 

@@ -7,6 +7,7 @@ distinguish_by_search(one, other, problem)
 
 from collections.abc import Mapping
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -61,7 +62,7 @@ def mine_by_search(
         left = budget - spent
         # Half of what is left, so that the values that a search moves are searched again.
         count = left if unbroken or left <= 2 * SIMULATED else left // 2
-        run = _searched(problem, {"asked": mined.formula}, count, seed + spent)
+        run = _searched(problem, {"asked": mined.formula}, count, seed=seed + spent)
         spent += run.simulations
         failing = _failing(run)
         traces += _traces(run, failing[:TAKEN])
@@ -87,22 +88,14 @@ def distinguish_by_search(
     if found or budget <= len(some):
         return found
     spec = {"forth": one >> other, "back": other >> one}
-    run = _searched(problem, spec, budget - len(some), seed, stop_after=1)
+    run = _searched(problem, spec, budget - len(some), seed=seed, stop_after=1)
     traces = _traces(run, _failing(run)[:TAKEN])
     return distinction(one, other, traces, source, end, len(some) + run.simulations)
 
 
-def _searched(
-    problem: Problem,
-    spec: Mapping[str, Formula],
-    budget: int,
-    seed: int,
-    stop_after: int | None = None,
-) -> Run:
+def _searched(problem: Problem, spec: Mapping[str, Formula], budget: int, **options: Any) -> Run:
     asking = replace(problem, spec=spec, priority=None)
-    return falsify(
-        asking, "auto", budget, seed=seed, confirm=False, progress=False, stop_after=stop_after
-    )
+    return falsify(asking, "auto", budget, confirm=False, progress=False, **options)
 
 
 def _failing(run: Run) -> list[int]:

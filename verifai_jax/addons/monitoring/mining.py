@@ -17,7 +17,6 @@ import math
 import struct
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import ClassVar
 
 import numpy as np
 
@@ -69,7 +68,7 @@ class Mined(Drawn, InNotebook):
     satisfied: int
     broken: Rate
     searched: int | None = None
-    _picture: ClassVar[tuple[str, str]] = ("verifai_jax.addons.monitoring.pictures", "plot_mined")
+    _picture = "verifai_jax.addons.monitoring.pictures", "plot_mined"
 
     def summary(self) -> str:
         """Write the parameters that were found, and the data that they rest on."""
@@ -82,10 +81,8 @@ class Mined(Drawn, InNotebook):
             lines.append(f"  front      {len(self.front)} corners; the most balanced is shown")
         lines.append(f"  formula    {self.formula}")
         if self.searched is not None:
-            lines.append(
-                f"  searched   {self.searched} simulations did not break it: found by search, "
-                "no proof"
-            )
+            said = "simulations did not break it: found by search, no proof"
+            lines.append(f"  searched   {self.searched} {said}")
         else:
             low, high = 1 - self.broken.high, 1 - self.broken.low
             lines.append(
@@ -137,9 +134,8 @@ def mine(
         )
     check_fraction("share", share, one=True)
     if isinstance(recordings, Simulated):
-        return lazy_import("verifai_jax.addons.monitoring.mined_bounds", "mine_by_search")(
-            template, recordings, budget, seed, confidence, progress
-        )
+        search = lazy_import("verifai_jax.addons.monitoring.mined_bounds", "mine_by_search")
+        return search(template, recordings, budget, seed, confidence, progress)
     return mine_template(template, tuple(named_traces(recordings).values()), share, end, confidence)
 
 
@@ -159,24 +155,15 @@ def mine_template(
     values = [HostValues.of(trace, end) for trace in traces]
     satisfied = _Satisfied(template, values, math.ceil(share * len(values) - 1e-9))
     axes = [_axis(template, name, satisfied) for name in template.names]
-    corners = (
-        _one(axes[0], satisfied) if len(axes) == 1 else _staircase(axes[0], axes[1], satisfied)
-    )
+    corners = (_one if len(axes) == 1 else _staircase)(*axes, satisfied)
     front = tuple(dict(zip(template.names, corner, strict=True)) for corner in corners)
     chosen = front[_balanced(corners, axes)]
-    formula = template.formula(chosen)
+    formula, count = template.formula(chosen), len(values)
     held = sum(each.holds(formula) for each in values)
-    return Mined(
-        template.text,
-        chosen,
-        front,
-        formula,
-        {axis.name: "greatest" if axis.sign < 0 else "least" for axis in axes},
-        tuple(axis.name for axis in axes if axis.sampled),
-        len(values),
-        held,
-        clopper_pearson(len(values) - held, len(values), confidence),
-    )
+    tightest = {axis.name: "greatest" if axis.sign < 0 else "least" for axis in axes}
+    sampled = tuple(axis.name for axis in axes if axis.sampled)
+    broken = clopper_pearson(count - held, count, confidence)
+    return Mined(template.text, chosen, front, formula, tightest, sampled, count, held, broken)
 
 
 @dataclass
@@ -205,18 +192,16 @@ class _Satisfied:
             return axis.tightest(lambda value: self({**given, axis.name: value}), first, axis.last)
         tight: int | None = axis.last
         for number in list(self._order):
+
+            def holds(value: float, number: int = number) -> bool:
+                return self._holds(number, self.template.formula({**given, axis.name: value}))
+
             # Few recordings are tighter than all before them, and they come first next time.
-            holds = self._of_one(number, axis, given)
             if tight is not None and not holds(axis.value(tight)):
                 tight = axis.tightest(holds, first, tight - 1)
                 self._order.remove(number)
                 self._order.insert(0, number)
         return tight
-
-    def _of_one(
-        self, number: int, axis: "_Axis", given: Mapping[str, float]
-    ) -> Callable[[float], bool]:
-        return lambda value: self._holds(number, self.template.formula({**given, axis.name: value}))
 
     def _holds(self, number: int, formula: Formula) -> bool:
         try:
@@ -296,12 +281,10 @@ def _tried(template: Parametric, name: str, satisfied: _Satisfied, values: Seque
             f"the form of the formula does not show whether it is monotone in ?{name}, and this "
             f"can be tried only for a single parameter: write a number for ?{others[0]}"
         )
-    rises = falls = False
-    for each in satisfied.values:
-        found = [each.holds(template.formula({name: value})) for value in values]
-        changes = np.diff(np.array(found, int))
-        rises |= bool((changes > 0).any())
-        falls |= bool((changes < 0).any())
+    formulas = [template.formula({name: value}) for value in values]
+    found = [[each.holds(formula) for formula in formulas] for each in satisfied.values]
+    changes = np.diff(np.array(found, int))
+    rises, falls = bool((changes > 0).any()), bool((changes < 0).any())
     if rises and falls:
         raise ValueError(
             f"{template.text!r} is not monotone in ?{name}: as it grows the formula becomes both "
@@ -316,11 +299,7 @@ def _tried(template: Parametric, name: str, satisfied: _Satisfied, values: Seque
 def _doubles(direction: int) -> Callable[[int], float]:
     """Return the doubles in order, from the loosest one on, which is that of number 0."""
     lowest = _ordinal(-LARGEST)
-
-    def value(k: int) -> float:
-        return direction * _double(lowest + k)
-
-    return value
+    return lambda k: direction * _double(lowest + k)
 
 
 def _ordinal(value: float) -> int:

@@ -85,27 +85,22 @@ class Mutants(Tabular):
     @property
     def surviving(self) -> tuple[Mutant, ...]:
         """The mutants that no recording kills, although some trace would."""
-        alive = (mutant for mutant in self.mutants if not mutant.killed_by)
-        return tuple(mutant for mutant in alive if mutant.example is not None)
+        return tuple(m for m in self.mutants if not m.killed_by and m.example is not None)
 
     @property
     def equivalent(self) -> tuple[Mutant, ...]:
         """The mutants for which no trace was found that distinguishes them from the formula."""
-        alive = (mutant for mutant in self.mutants if not mutant.killed_by)
-        return tuple(mutant for mutant in alive if mutant.example is None)
+        return tuple(m for m in self.mutants if not m.killed_by and m.example is None)
 
     @functools.cached_property
     def table(self) -> "pd.DataFrame":
         """A row for each mutant."""
         import pandas as pd
 
-        state = {id(m): "survives" for m in self.surviving} | {
-            id(m): "not told apart" for m in self.equivalent
-        }
-        rows = [
-            (m.kind, m.change, str(m.formula), m.killed_by, state.get(id(m), "killed"))
-            for m in self.mutants
-        ]
+        alive = ("survives", "not told apart")
+        states = ["killed" if m.killed_by else alive[m.example is None] for m in self.mutants]
+        pairs = zip(self.mutants, states, strict=True)
+        rows = [(m.kind, m.change, str(m.formula), m.killed_by, state) for m, state in pairs]
         return pd.DataFrame(rows, columns=["kind", "change", "formula", "killed_by", "state"])
 
     def summary(self) -> str:
@@ -151,8 +146,7 @@ def mutants(
         if changed in found or simplify(nnf(changed)) == original:
             continue
         try:
-            killers = (name for name, each in values.items() if each.holds(changed) != truth[name])
-            killer = next(killers, "")
+            killer = next((n for n, each in values.items() if each.holds(changed) != truth[n]), "")
         except IntervalError:
             continue  # A window that the clock of a recording does not have.
         example = None if killer else _example(formula, changed, list(traces.values()), end, seed)
@@ -189,11 +183,8 @@ def changes(formula: Formula, dt: float = 0.0) -> Iterator[Change]:
         other = OTHER_WORDS[word]
         yield "operator", f"{word} becomes {other} in {formula}", made(other, operands)
     if word == "implies":
-        yield (
-            "guard",
-            f"{operands[0]} becomes its negation",
-            made(word, (~operands[0], operands[1])),
-        )
+        negated = made(word, (~operands[0], operands[1]))
+        yield "guard", f"{operands[0]} becomes its negation", negated
         yield "clause", f"{operands[0]} is left out", operands[1]
     elif word in ("and", "or"):
         for index, part in enumerate(operands):

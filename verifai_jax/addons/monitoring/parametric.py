@@ -95,10 +95,8 @@ class Parametric:
             case ast.Atom(e):
                 if not _parameters(e):
                     return f
-                number = Number(0.0)
-                return ast.Predicate(
-                    ">=" if positive else ">", self._with_numbers(e, values), number
-                )
+                comparison = ">=" if positive else ">"
+                return ast.Predicate(comparison, self._with_numbers(e, values), Number(0.0))
             case ast.Leaf():
                 return f
         if isinstance(f, ast.Not) and positive is not None:
@@ -106,10 +104,8 @@ class Parametric:
         operands = [self._filled(part, values, positive) for part in f.operands()]
         if not f.operator.timed:
             return ast.build(f.operator.word, operands)
-        ends = [
-            values[self.slots[t]] if t in self.slots else t
-            for t in (f.interval.start, f.interval.end)
-        ]
+        ends = (f.interval.start, f.interval.end)
+        ends = (values[self.slots[t]] if t in self.slots else t for t in ends)
         return ast.build(f.operator.word, operands, Interval(*ends))
 
     def _with_numbers(self, e: Term, values: Mapping[str, float]) -> Term:
@@ -303,12 +299,9 @@ def templates(words: str = "", domain: str | None = None) -> tuple[Template, ...
     library = _library()
     if domain is not None:
         check_names("domain", [domain], dict.fromkeys(each.domain for each in library))
-    return tuple(
-        each
-        for each in library
-        if domain in (None, each.domain)
-        and all(word in f"{each} {each.unit}".lower() for word in words.lower().split())
-    )
+    own = (each for each in library if domain in (None, each.domain))
+    wanted = words.lower().split()
+    return tuple(t for t in own if all(word in f"{t} {t.unit}".lower() for word in wanted))
 
 
 @functools.cache

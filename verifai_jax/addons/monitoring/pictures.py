@@ -28,11 +28,8 @@ def plot_mined(mined: Mined, path: str | Path | None = None) -> Figure:
     axis = figure.add_subplot()
     corners = sorted((corner[one], corner[other]) for corner in mined.front)
     axis.plot(*zip(*corners, strict=True), "o", color="#1b2a41", ms=4, label="corners of the front")
-    axis.step(
-        *zip(*corners, strict=True),
-        where="post" if mined.tightest[one] == "least" else "pre",
-        color="#7b8794",
-    )
+    where = "post" if mined.tightest[one] == "least" else "pre"
+    axis.step(*zip(*corners, strict=True), where=where, color="#7b8794")
     axis.plot(mined.values[one], mined.values[other], "o", color="#cf3f21", ms=8, label="chosen")
     axis.set_xlabel(f"{one} (tight: the {mined.tightest[one]})")
     axis.set_ylabel(f"{other} (tight: the {mined.tightest[other]})")
@@ -70,9 +67,8 @@ def _plot_traces(
         raise ValueError("no trace was found, so that there is nothing to draw")
     names = list(dict.fromkeys(name for formula in formulas for name in formula.signals()))
     rows, columns = len(names) + len(formulas), len(traces)
-    figure = style.new_figure(
-        figsize=(3.2 * columns + 2.0, 1.4 * len(names) + 0.7 * len(formulas) + 1)
-    )
+    height = 1.4 * len(names) + 0.7 * len(formulas) + 1
+    figure = style.new_figure(figsize=(3.2 * columns + 2.0, height))
     heights = [1.0] * len(names) + [0.35] * len(formulas)
     grid = figure.subplots(
         rows, columns, sharex="col", sharey="row", squeeze=False, height_ratios=heights
@@ -93,9 +89,8 @@ def _plot_traces(
             axes.set_yticks([])
             axes.set_ylim(0, 1)
     for axes, name in zip(grid[:, 0], [*names, *map(str, formulas)], strict=True):
-        axes.set_ylabel(
-            style.wrap_name(name, 28, 4), rotation=0, ha="right", va="center", fontsize=9
-        )
+        label = style.wrap_name(name, 28, 4)
+        axes.set_ylabel(label, rotation=0, ha="right", va="center", fontsize=9)
     return style.show_or_save(figure, path)
 
 

@@ -4,6 +4,7 @@ joined([f, g], 1)                                   # the maximum, exact also wh
 window(f, 0.0, 0.3, -1)                             # the least of the next 0.3 s, at every time
 """
 
+import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
@@ -93,9 +94,8 @@ def aligned(*functions: Piecewise, crossings: bool = False) -> tuple[Piecewise, 
     snap = functions[0].snap
     times = merged([f.times for f in functions], snap)
     made = tuple(f.at(times) for f in functions)
-    found = [
-        _crossing(f, g) for k, f in enumerate(made) for g in made[:k] if crossings
-    ]  # fmt: skip
+    pairs = itertools.combinations(made, 2) if crossings else ()
+    found = [_crossing(f, g) for f, g in pairs]
     if any(len(each) for each in found):
         times = merged([times, *found], snap)
         made = tuple(f.at(times) for f in made)
@@ -163,13 +163,10 @@ def window(
 
 
 class _Highest:
-    """The greatest of the values from one index to another, both included; -inf for no values.
-
-    A table of the extremes of 1, 2, 4, 8 ... neighbours.
-    """
+    """The greatest of the values from one index to another, both included; -inf for no values."""
 
     def __init__(self, values: Values) -> None:
-        self.rows = [values]
+        self.rows = [values]  # The greatest of 1, 2, 4, 8 ... neighbours.
         while 2 ** len(self.rows) <= len(values):
             row, half = self.rows[-1], 2 ** (len(self.rows) - 1)
             self.rows.append(np.maximum(row[:-half], row[half:]))

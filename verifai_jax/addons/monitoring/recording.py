@@ -6,25 +6,17 @@ read("drive.mcap", resample_to=0.1, method="hold")        # topics that arrive w
 read(["imu.csv", "gps.csv"], missing={"speed": "hold"}, resample_to=0.1, method="linear")
 """
 
+import re
 from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from verifai_jax.addons.monitoring import containers
+from verifai_jax.addons.monitoring import containers, resampling
 from verifai_jax.addons.monitoring.columns import LeftOut, numbers_of
 from verifai_jax.addons.monitoring.containers import UNIT, Episode, Table
 from verifai_jax.addons.monitoring.csv_tables import read_csv
-from verifai_jax.addons.monitoring.resampling import (
-    Method,
-    Missing,
-    check_holes,
-    check_increasing,
-    joined,
-    resample,
-    without_gaps,
-)
 from verifai_jax.addons.monitoring.stamps import apart, find_clock, seconds_of
 from verifai_jax.core.messages.errors import missing_name
 from verifai_jax.core.values.trace import Trace
@@ -57,8 +49,8 @@ def read(
     dt: float | None = None,
     columns: Sequence[str] | None = None,
     resample_to: float | None = None,
-    method: Method | None = None,
-    missing: Missing | Mapping[str, Missing] | None = None,
+    method: resampling.Method | None = None,
+    missing: resampling.Missing | Mapping[str, resampling.Missing] | None = None,
     max_gap: float | None = None,
     episode: int | None = None,
 ) -> Trace:
@@ -110,37 +102,35 @@ def read(
     wanted = [time] * len(tables) if isinstance(time, str) else list(time)
     if isinstance(time, Mapping):
         tables = [_of_clock(name, tables, clock, own) for clock, own in time.items()]
-    units = {name: unit for _, said in tables for name, unit in said.items()}
+    units = _units(tables)
     parts, stamps = [], []
     for (table, said), each in zip(tables, wanted, strict=True):
         clock = find_clock(table, each)
         if clock is None and dt is None:
             raise TimeColumnError(f"{name} has no column {each!r} of sample times", list(table))
         column = None if clock is None else table.pop(clock)
-        if column is not None and dt is None:
-            unit = said.get(clock or "", "")
-            seconds, origin, note = seconds_of(name, clock or "", column, unit, time_unit)
+        if clock is not None and dt is None:
+            unit = said.get(clock, "")
+            seconds, origin, note = seconds_of(name, clock, column, unit, time_unit)
             notes |= {note: 1} if note else {}
             stamps.append((apart(seconds, notes), origin))
         parts.append(_values(name, table, columns, notes))
     if columns is None and not any(parts):
         raise ValueError(f"{name} has no column of numbers")
-    if dt is not None:
-        if len(parts) > 1:
-            raise ValueError(f"{name} has {len(parts)} clocks, so one period dt is not enough")
-        times, values = None, parts[0]
-    else:
-        for seconds, _ in stamps:
-            check_increasing(seconds)
-        times, values = (stamps[0][0], parts[0]) if len(parts) == 1 else joined(stamps, parts)
+    if dt is not None and len(parts) > 1:
+        raise ValueError(f"{name} has {len(parts)} clocks, so one period dt is not enough")
+    for seconds, _ in stamps:
+        resampling.check_increasing(seconds)
+    times = stamps[0][0] if stamps else None
+    times, values = resampling.joined(stamps, parts) if len(parts) > 1 else (times, parts[0])
     signals = _signals(name, values, columns)
     units = {each: unit for each in signals if (unit := units.get(each) or units.get(f"{each}[0]"))}
     trace = Trace(signals, dt=dt, times=times, notes=notes, units=units)
-    trace = check_holes(trace, max_gap)
+    trace = resampling.check_holes(trace, max_gap)
     if missing is not None:
-        trace = without_gaps(trace, missing)
+        trace = resampling.without_gaps(trace, missing)
     if resample_to is not None and method is not None:
-        return resample(trace, resample_to, method)
+        return resampling.resample(trace, resample_to, method)
     return trace
 
 
@@ -177,14 +167,12 @@ def _tables(
 
 def _file_of_episode(folder: Path, files: Sequence[Path], episode: int | None) -> Path:
     known = list(containers.episodes_of(files))
-    if episode is None and len(known) == 1:
-        return known[0].path
-    named = [each.path for each in known if each.number == episode]
-    if not named:
-        last = known[-1].number if known else -1
-        wanted = "name one of its episodes" if episode is None else f"it has no episode {episode}"
-        raise ValueError(f"{folder} is a LeRobot data set: {wanted}, episode=0 to {last}")
-    return named[0]
+    for each in known:
+        if each.number == episode or (episode is None and len(known) == 1):
+            return each.path
+    last = known[-1].number if known else -1
+    wanted = "name one of its episodes" if episode is None else f"it has no episode {episode}"
+    raise ValueError(f"{folder} is a LeRobot data set: {wanted}, episode=0 to {last}")
 
 
 def _columns(path: Path, table: Table) -> tuple[Columns, dict[str, str]]:
@@ -206,8 +194,11 @@ def _of_clock(
         if name not in columns:
             raise missing_name(source, "column", name, columns)
     given = columns[clock].is_valid()
-    units = {name: unit for _, said in tables for name, unit in said.items()}
-    return {name: columns[name].filter(given) for name in (clock, *names)}, units
+    return {name: columns[name].filter(given) for name in (clock, *names)}, _units(tables)
+
+
+def _units(tables: list[tuple[Columns, dict[str, str]]]) -> dict[str, str]:
+    return {name: unit for _, said in tables for name, unit in said.items()}
 
 
 def _frame_columns(frame: "pd.DataFrame") -> dict[str, Any]:
@@ -226,8 +217,7 @@ def _frame_columns(frame: "pd.DataFrame") -> dict[str, Any]:
     names = [str(name) for name in frame.columns]
     _refuse_repeated("the data frame", names)
     table = {}
-    for position, name in enumerate(names):
-        column = frame.iloc[:, position]
+    for name, (_, column) in zip(names, frame.items(), strict=True):
         if column.dtype == object:
             column = list(column)  # Cells may be lists, or numbers with None among them.
         try:
@@ -258,10 +248,8 @@ def _file_tables(path: Path, time: str, episode: int | None, notes: dict[str, in
         ".parquet": lambda: containers.read_parquet(path, time, episode),
         ".npz": lambda: [_read_arrays(path)],
         ".mcap": lambda: containers.read_mcap([path], time, notes),
-        ".nc": lambda: containers.read_dataset(path, time),
-        ".zarr": lambda: containers.read_dataset(path, time),
-        ".h5": lambda: containers.read_hdf5(path, time),
-        ".hdf5": lambda: containers.read_hdf5(path, time),
+        **dict.fromkeys((".nc", ".zarr"), lambda: containers.read_dataset(path, time)),
+        **dict.fromkeys((".h5", ".hdf5"), lambda: containers.read_hdf5(path, time)),
     }
     ending = path.suffix.lower()
     if bag := containers.bag_files(path):
@@ -294,10 +282,8 @@ def _read_arrays(path: Path) -> Any:
         for name in arrays.files:
             array = arrays[name]
             if array.ndim not in (1, 2):
-                raise ValueError(
-                    f"array {name!r} of {path} must have shape [time] or [time, k]; "
-                    f"got {list(array.shape)}"
-                )
+                shape = f"must have shape [time] or [time, k]; got {list(array.shape)}"
+                raise ValueError(f"array {name!r} of {path} {shape}")
             columns[name] = containers.matrix_column(array)
     return pyarrow.table(columns)
 
@@ -341,9 +327,8 @@ def vector_columns(names: Collection[str]) -> dict[str, list[str]]:
     """Return the vector signals among columns, `{"p": ["p[0]", "p[1]"]}`, in order."""
     vectors: dict[str, dict[int, str]] = {}
     for name in names:
-        stem, bracket, index = name.partition("[")
-        if bracket and index.endswith("]") and index[:-1].isdecimal():
-            vectors.setdefault(stem, {})[int(index[:-1])] = name
+        if found := re.fullmatch(r"([^\[]*)\[(\d+)\]", name, re.DOTALL):
+            vectors.setdefault(found[1], {})[int(found[2])] = name
     return {
         stem: [parts[i] for i in range(len(parts))]
         for stem, parts in vectors.items()

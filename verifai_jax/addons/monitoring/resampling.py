@@ -15,12 +15,12 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Float, Int
 
-from verifai_jax.addons.monitoring.stamps import merged, resolution_of
+from verifai_jax.addons.monitoring.stamps import merged
 from verifai_jax.core.messages.errors import check_names
 from verifai_jax.core.messages.text import format_seconds, format_time
 from verifai_jax.core.values.gaps import has_truths
 from verifai_jax.core.values.trace import Trace, check_period
-from verifai_jax.mtl.setting import since_first
+from verifai_jax.mtl.setting import resolution_of, since_first
 
 Method = Literal["hold", "linear"]
 Missing = Literal["hold", "drop", "interpolate"]
@@ -60,8 +60,7 @@ def resample(trace: Trace, dt: float, method: Method) -> Trace:
     if not steps < MAX_SAMPLES:
         raise ValueError(
             f"resampling {format_seconds(elapsed[-1])} every {format_seconds(dt)} makes "
-            f"{steps + 1:z.3g} samples, "
-            f"more than {MAX_SAMPLES}: take a longer period"
+            f"{steps + 1:z.3g} samples, more than {MAX_SAMPLES}: take a longer period"
         )
     clock = dt * np.arange(int(steps) + 1)
     index = np.searchsorted(elapsed, clock + tolerance, side="right") - 1
@@ -78,8 +77,7 @@ def resample(trace: Trace, dt: float, method: Method) -> Trace:
     for name, recorded in trace.signals.items():
         values = np.asarray(recorded)
         if trace.is_truth(name) or method == "hold":
-            missing = gaps(values)
-            if missing.any():
+            if (missing := gaps(values)).any():
                 notes[hold_note(name, missing)] = int(missing.sum())
             values = held(values)
             signals[name], inner[name] = values[index], values[passed]
@@ -112,8 +110,7 @@ def recorded_samples(trace: Trace) -> Trace:
 def _positions(cells: Int[np.ndarray, " passed"], count: int) -> Int[np.ndarray, " positions"]:
     """Return which sample stands at each position, with as many positions in each period.
 
-    - `cells`: the period in which each of the samples lies that the clock passes over.
-    - `count`: samples of the clock; they have the first numbers, those passed over the next.
+    Those of the clock (`count`) have the first numbers, those passed over (in `cells`) the next.
     """
     rank = np.arange(len(cells)) - np.searchsorted(cells, cells)
     # A power of two, less one, so that recordings share compiled monitors.
@@ -148,18 +145,13 @@ def held(values: np.ndarray) -> np.ndarray:
     if not gaps(values).any():
         return values
     columns = values.reshape(len(values), -1)
-    last = np.maximum.accumulate(
-        np.where(np.isnan(columns), 0, np.arange(len(values))[:, None]), axis=0
-    )
+    known = np.where(np.isnan(columns), 0, np.arange(len(values))[:, None])
+    last = np.maximum.accumulate(known, axis=0)
     return np.take_along_axis(columns, last, axis=0).reshape(values.shape)
 
 
 def _interpolated(
-    values: np.ndarray,
-    elapsed: Float[np.ndarray, " time"],
-    clock: Float[np.ndarray, " samples"],
-    index: Int[np.ndarray, " samples"],
-    tolerance: float,
+    values: np.ndarray, elapsed: np.ndarray, clock: np.ndarray, index: np.ndarray, tolerance: float
 ) -> np.ndarray:
     following = np.minimum(index + 1, len(elapsed) - 1)
     gap, ahead = elapsed[following] - elapsed[index], clock - elapsed[index]
@@ -220,16 +212,14 @@ def without_gaps(trace: Trace, missing: Missing | Mapping[str, Missing]) -> Trac
         gap = gaps(signals[name])
         if not gap.any():
             continue
-        # A truth value has no values between.
-        way = "hold" if way == "interpolate" and trace.is_truth(name) else way
-        done = {"hold": "its last one is held", "interpolate": "it is interpolated"}
-        said = done.get(way, "these are left out")
-        notes[f"signal {name!r} has no value in {gap.sum()} of {len(gap)} rows: {said} there"] = 1
         if way == "drop":
-            kept &= ~gap
+            said, kept = "these are left out", kept & ~gap
+        elif way == "hold" or trace.is_truth(name):  # A truth value has no values between.
+            said, signals[name] = "its last one is held", held(signals[name])
         else:
-            clock = np.asarray(trace.clock())
-            signals[name] = held(signals[name]) if way == "hold" else filled(signals[name], clock)
+            filled_in = filled(signals[name], np.asarray(trace.clock()))
+            said, signals[name] = "it is interpolated", filled_in
+        notes[f"signal {name!r} has no value in {gap.sum()} of {len(gap)} rows: {said} there"] = 1
     if not kept.any():
         raise ValueError(
             "no instant is left: at each instant some signal whose gaps are dropped has a gap"
@@ -260,8 +250,9 @@ def check_holes(trace: Trace, max_gap: float | None) -> Trace:
             continue
         seen.add(known.tobytes())
         k, usual = int(np.argmax(steps)), float(np.median(steps))
-        what = f"signal {name!r} has no value from {format_time(own[k])} s to "
-        what += f"{format_time(own[k + 1])} s, {format_seconds(float(steps[k]))}"
+        first, last = (format_time(t) for t in own[k : k + 2])
+        lasts = format_seconds(float(steps[k]))
+        what = f"signal {name!r} has no value from {first} s to {last} s, {lasts}"
         if max_gap is not None and steps[k] > max_gap:
             raise ValueError(f"{what}: more than max_gap, which is {format_seconds(max_gap)}")
         if steps[k] > HOLE * usual:

@@ -14,6 +14,7 @@ import numpy as np
 
 from verifai_jax.addons.monitoring.columns import numbers_of
 from verifai_jax.core.messages.text import format_seconds
+from verifai_jax.mtl.setting import resolution_of
 from verifai_jax.mtl.units import NONE
 
 WORDS = {
@@ -104,19 +105,17 @@ def seconds_of(
     """
     from pyarrow import types
 
+    if types.is_date(column.type):
+        column = column.cast("timestamp[ms]")
     kind = column.type
-    if types.is_string(kind) or types.is_large_string(kind):
-        moments = _moments(column.to_pylist())
-        if moments is not None:
-            return *moments, ""
-    if types.is_date(kind):
-        column, kind = column.cast("timestamp[ms]"), None
-    if kind is None or types.is_timestamp(kind) or types.is_duration(kind) or types.is_time(kind):
-        wide = "int32" if getattr(column.type, "bit_width", 64) == 32 else "int64"
-        scale = WORDS[column.type.unit]
-        counts = column.cast(wide)
-        known = np.asarray(counts.is_valid())
-        whole = np.asarray(counts.fill_null(0))
+    is_text = types.is_string(kind) or types.is_large_string(kind)
+    if is_text and (moments := _moments(column.to_pylist())) is not None:
+        return *moments, ""
+    if types.is_timestamp(kind) or types.is_duration(kind) or types.is_time(kind):
+        wide = "int32" if getattr(kind, "bit_width", 64) == 32 else "int64"
+        scale = WORDS[kind.unit]
+        known = np.asarray(column.is_valid())
+        whole = np.asarray(column.cast(wide).fill_null(0))
         first = int(whole[known][0]) if known.any() else 0
         seconds = np.where(known, (whole - first) / int(1 / scale), np.nan)
         return seconds, first * scale, ""
@@ -155,14 +154,11 @@ def scale_of_times(
         raise ValueError(f"{said[scales.index(None)]!r} is no unit of the sample times in {ask}")
     if len({scale.seconds for scale in scales if scale}) > 1:
         raise ValueError(f"{' and '.join(map(repr, said))} are both given as the unit of {ask}")
-    large = epoch_unit(values)
-    if scales:
-        scale = scales[0]
-        assert scale is not None
+    if scales and (scale := scales[0]):
         if chosen is None and epoch_unit(values * float(scale.seconds)) != "s":
             raise ValueError(f"the sample times cannot be in {said[0]}, as it says, in {ask}")
         return scale, ""
-    if large != "s":
+    if (large := epoch_unit(values)) != "s":
         note = f"column {name!r} is read as {large} since 1970, in seconds from the first"
         return Scale(WORDS[large]), note
     known = values[np.isfinite(values)]
@@ -216,28 +212,13 @@ def _since_1970(moment: datetime.datetime) -> Fraction:
 
 def _moments(texts: list[str | None]) -> tuple[np.ndarray, Fraction] | None:
     """Return the seconds from the first ISO 8601 text to each; None if a text is no moment."""
-    moments: list[datetime.datetime | None] = []
-    for text in texts:
-        try:
-            moments.append(moment_of(text.strip()) if text else None)
-        except ValueError:
-            return None
-    first = next((moment for moment in moments if moment is not None), None)
-    if first is None:
-        return None
     try:
+        moments = [moment_of(text.strip()) if text else None for text in texts]
+        first = next(moment for moment in moments if moment is not None)
         seconds = [np.nan if m is None else (m - first).total_seconds() for m in moments]
-    except TypeError:  # Some have a time zone and others have none.
+    except (ValueError, StopIteration, TypeError):  # Some may have a time zone and others none.
         return None
     return np.array(seconds), _since_1970(first)
-
-
-def resolution_of(stamps: np.ndarray) -> float:
-    """Return by how much sample times are rounded, in seconds; 0 for whole numbers."""
-    known = stamps[np.isfinite(stamps)]
-    if stamps.dtype.kind != "f" or not len(known):
-        return 0.0
-    return float(np.spacing(np.abs(known).max()))
 
 
 def apart(times: np.ndarray, notes: dict[str, int]) -> np.ndarray:

@@ -62,10 +62,8 @@ class CompiledMachine:
     """
 
     def __init__(self, plan: Plan, front: Margins) -> None:
-        counts = {"@columns": max(1, len(front.columns)), "@outputs": len(plan.outputs)}
-        library = LIBRARY
-        for word, count in counts.items():
-            library = library.replace(word, str(count))
+        library = LIBRARY.replace("@columns", str(max(1, len(front.columns))))
+        library = library.replace("@outputs", str(len(plan.outputs)))
         source = "".join([HEAD, HELPERS, monitor_code(plan, front, "monitor"), library])
         tool = compiler()
         about = tool.stat()
@@ -94,10 +92,8 @@ class CompiledMachine:
         """Process samples `[time, columns]`, and return the results `[time, formulas]`."""
         rows = np.ascontiguousarray(rows, float)
         out = np.empty((len(rows), len(self.out)))
-        count, x, to = ctypes.c_long(len(rows)), rows.ctypes, out.ctypes
-        self._library.steps(
-            self._state, count, x.data_as(ctypes.c_void_p), to.data_as(ctypes.c_void_p)
-        )
+        x, to = (ctypes.c_void_p(array.ctypes.data) for array in (rows, out))
+        self._library.steps(self._state, ctypes.c_long(len(rows)), x, to)
         return out
 
     def ahead(self, steps: int, leaf: float | None) -> np.ndarray:

@@ -38,19 +38,17 @@ def with_gaps(name: str, signal: Any) -> Any:
 
 def has_truths(signal: Any) -> bool:
     """Return whether the samples of a signal that are not missing are truth values."""
-    if isinstance(signal, list | tuple):
-        entries = np.ravel(np.array(signal, object)).tolist() if len(signal) else []
-    elif getattr(getattr(signal, "dtype", None), "kind", "") != "O":
-        return getattr(getattr(signal, "dtype", None), "kind", "") == "b"
-    else:
-        entries = np.ravel(np.asarray(signal)).tolist()
+    kind = getattr(getattr(signal, "dtype", None), "kind", "")
+    if kind != "O" and not isinstance(signal, list | tuple):
+        return kind == "b"
+    entries = np.ravel(np.array(signal, object)).tolist()
     known = [entry for entry in entries if not _is_missing(entry)]
     return bool(known) and all(isinstance(entry, bool | np.bool_) for entry in known)
 
 
 def _listed(name: str, rows: list[Any] | tuple[Any, ...]) -> Any:
     """Return a list of samples as an array; one of values that JAX traces as it is."""
-    if any(_is_masked(row) for row in rows):
+    if any(np.ma.getmaskarray(row).any() for row in rows if isinstance(row, np.ma.MaskedArray)):
         return np.ma.array(rows)
     if any(isinstance(row, Tracer) for row in jax.tree.leaves(rows)):
         return rows
@@ -63,10 +61,7 @@ def _listed(name: str, rows: list[Any] | tuple[Any, ...]) -> Any:
 
 
 def _real(name: str, signal: Any) -> Any:
-    """Return a signal of real numbers or truth values.
-
-    **Raises:** `TypeError` for any other.
-    """
+    """Return a signal of real numbers or truth values. **Raises:** `TypeError` for any other."""
     dtype = signal.dtype
     kind = getattr(dtype, "kind", "f")
     # Types of half precision that NumPy does not know, such as bfloat16, are without a kind.
@@ -77,22 +72,17 @@ def _real(name: str, signal: Any) -> Any:
     return signal.astype(np.float64) if dtype == np.longdouble else signal
 
 
-def _is_masked(value: object) -> bool:
-    return isinstance(value, np.ma.MaskedArray) and bool(np.ma.getmaskarray(value).any())
-
-
 def _numbers_of_objects(name: str, values: np.ndarray) -> np.ndarray:
     """Return objects as numbers, a missing one as NaN."""
     numbers = np.full(values.shape, np.nan)
     for index, value in np.ndenumerate(values):
         if _is_missing(value):
             continue
-        if isinstance(value, bool | np.bool_ | int | float | np.number):
-            numbers[index] = value
-        else:
+        if not isinstance(value, bool | np.bool_ | int | float | np.number):
             raise TypeError(
                 f"signal {name!r} must hold real numbers; sample {index[0]} is {value!r}"
             )
+        numbers[index] = value
     return numbers
 
 
@@ -120,9 +110,8 @@ def known_times(times: Any) -> Any:
     if known.dtype == object:
         known = known.astype(float) if all(map(is_number, np.ravel(known))) else known
     if known.dtype.kind not in "iuf":
-        hint = ""
-        if known.dtype.kind == "M":
-            hint = ": give seconds since the first, (times - times[0]) / np.timedelta64(1, 's')"
+        hint = ": give seconds since the first, (times - times[0]) / np.timedelta64(1, 's')"
+        hint = hint if known.dtype.kind == "M" else ""
         raise TypeError(f"sample times must be numbers of seconds; got {known.dtype}{hint}")
     return known.astype(float) if known.dtype.itemsize < 4 and known.dtype.kind != "f" else known
 

@@ -121,9 +121,8 @@ class Trace(InNotebook):
         for name, signal in signals.items():
             shape = _shape(name, signal)
             if len(shape) not in (1, 2):
-                raise ValueError(
-                    f"signal {name!r} must have shape [time] or [time, k]; got {list(shape)}"
-                )
+                wanted = "shape [time] or [time, k]"
+                raise ValueError(f"signal {name!r} must have {wanted}; got {list(shape)}")
             lengths[name] = shape[0]
         if len(set(lengths.values())) > 1:
             listing = ", ".join(f"{name}: {n}" for name, n in lengths.items())
@@ -142,11 +141,9 @@ class Trace(InNotebook):
             object.__setattr__(self, "dt", check_period(self.dt))
         if self.times is not None:
             object.__setattr__(self, "times", known_times(self.times))
-        if self.times is not None and np.shape(self.times) != (length,):
-            raise ValueError(
-                f"times must have shape [{length}], like the signals; "
-                f"got {list(np.shape(self.times))}"
-            )
+            if (shape := np.shape(self.times)) != (length,):
+                wanted = f"shape [{length}], like the signals"
+                raise ValueError(f"times must have {wanted}; got {list(shape)}")
         if self.between is not None and (
             self.between.signals.keys() != signals.keys() or self.between.length % length
         ):
@@ -294,30 +291,20 @@ class Trace(InNotebook):
     def _span(self) -> str:
         """Return the number of samples, the clock, and how it ended."""
         count = f"{self.length} sample{'s' * (self.length != 1)}"
-        if self.dt is not None:
-            text = f"{count} every {format_seconds(self.dt)}"
-        else:
-            known = not isinstance(self.times, Tracer | jax.ShapeDtypeStruct)
-            text = count
-            if known:
-                first, last = (format_seconds(float(self.clock()[i])) for i in (0, -1))
-                text += f" from {first} to {last}"
-        for name in ("valid", "status"):
-            code = getattr(self, name)
-            if code is None or np.shape(code) or not _is_known(code):
-                continue
-            if name == "valid" and int(code) < self.length:
-                text += f", of which {int(code)} count"
-            if name == "status" and int(code) != Status.OK:
-                text += f", status {Status(int(code)).name.lower()}"
-        return text
+        text = count if self.dt is None else f"{count} every {format_seconds(self.dt)}"
+        if self.dt is None and not isinstance(self.times, Tracer | jax.ShapeDtypeStruct):
+            first, last = (format_seconds(float(self.clock()[i])) for i in (0, -1))
+            text += f" from {first} to {last}"
+        valid, status = (
+            None if code is None or np.shape(code) or not _is_known(code) else int(code)
+            for code in (self.valid, self.status)
+        )
+        text += "" if valid is None or valid >= self.length else f", of which {valid} count"
+        return text if not status else f"{text}, status {Status(status).name.lower()}"
 
 
 def _check_notes(notes: object) -> None:
-    """Refuse notes that are not counts by text.
-
-    **Raises:** `TypeError`, and `ValueError` for a count below zero.
-    """
+    """Refuse notes that are not counts by text, or that count below zero."""
     wanted = 'notes must be counts by text, such as {"the solver fell back to Euler": 3}'
     if not isinstance(notes, Mapping):
         raise TypeError(f"{wanted}; got {type(notes).__name__}")
@@ -444,9 +431,8 @@ def _unflatten(static: Any, children: Any) -> Trace:
     trace = object.__new__(Trace)
     names, dt, held, finite, truths = static
     values = tuple(children)
-    fields = {"signals": dict(zip(names, values, strict=False))}
-    fields |= {"dt": dt, "held": held, "finite": finite, "notes": {}, "units": {}}
-    fields["truths"] = truths
+    fields = {"signals": dict(zip(names, values, strict=False)), "dt": dt, "held": held}
+    fields |= {"finite": finite, "notes": {}, "units": {}, "truths": truths}
     fields |= dict(zip(_CHILDREN, values[len(names) :], strict=True))
     for name, value in fields.items():
         object.__setattr__(trace, name, value)

@@ -1,18 +1,17 @@
 """`verifai-jax formula lint "always speed < 30" logs/`: checks for mistakes in a formula."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import click
 
+import verifai_jax as vj
 from verifai_jax.addons.monitoring.commands.monitor_fleet import load_requirements
 from verifai_jax.cli import arguments
 from verifai_jax.cli.arguments import PATH, option
 from verifai_jax.cli.gates import Gate, check_gate, fail_on
 from verifai_jax.cli.json_output import command, give_result, show_result
 
-if TYPE_CHECKING:
-    from verifai_jax import Formula
 End = Literal["hold", "truncate"]
 FILES = click.argument("recordings", metavar="[RECORDING]...", nargs=-1, type=PATH)
 """Recordings: files, or folders of them."""
@@ -41,23 +40,15 @@ def formula() -> None:
 @ASKED
 @fail_on(finding="if anything is suspicious")
 def lint(
-    formula: str,
-    recordings: tuple[Path, ...],
-    units: tuple[str, ...],
-    problem: str | None,
-    end: End,
-    constants: tuple[str, ...],
-    definitions: tuple[str, ...],
-    fail_on: Gate | None,
-) -> None:
+    formula: str, recordings: tuple[Path, ...], units: tuple[str, ...], problem: str | None,
+    end: End, constants: tuple[str, ...], definitions: tuple[str, ...], fail_on: Gate | None,
+) -> None:  # fmt: skip
     """Find what is suspicious about FORMULA, or a file of requirements: parts that never hold, are
     never near, or have no effect, units that do not go together, windows beyond the recordings.
     """
-    from verifai_jax import mtl
-
     requirements = load_requirements(formula, *arguments.read_names(constants, definitions))
     named = dict(arguments.split_pairs("--unit", units))
-    found = mtl.lint(requirements, _signals(recordings, problem), units=named, end=end)
+    found = vj.mtl.lint(requirements, _signals(recordings, problem), units=named, end=end)
     show_result(found, None, "recordings", "unread")
     give_result(findings=[finding._asdict() for finding in found])
     check_gate(fail_on, {"finding": bool(found)})
@@ -70,20 +61,12 @@ def lint(
 @arguments.SEED
 @fail_on(survivor="if a mutant survives")
 def mutants(
-    formula: str,
-    recordings: tuple[Path, ...],
-    problem: str | None,
-    end: End,
-    constants: tuple[str, ...],
-    definitions: tuple[str, ...],
-    seed: int,
-    fail_on: Gate | None,
-) -> None:
+    formula: str, recordings: tuple[Path, ...], problem: str | None, end: End,
+    constants: tuple[str, ...], definitions: tuple[str, ...], seed: int, fail_on: Gate | None,
+) -> None:  # fmt: skip
     """Change FORMULA in one point at a time, and see which changes no recording notices."""
-    from verifai_jax import mtl
-
     parsed = _parsed(formula, constants, definitions)
-    found = mtl.mutants(parsed, _signals(recordings, problem), end=end, seed=seed)
+    found = vj.mtl.mutants(parsed, _signals(recordings, problem), end=end, seed=seed)
     show_result(found, None, "recordings", "table")
     check_gate(fail_on, {"survivor": bool(found.surviving)})
 
@@ -98,21 +81,13 @@ def mutants(
 @arguments.PLOT
 @fail_on(apart="if a trace tells the formulas apart")
 def distinguish(
-    one: str,
-    other: str,
-    recordings: tuple[Path, ...],
-    problem: str | None,
-    constants: tuple[str, ...],
-    definitions: tuple[str, ...],
-    plot: Path | None,
-    fail_on: Gate | None,
-    **options: Any,
-) -> None:
+    one: str, other: str, recordings: tuple[Path, ...], problem: str | None,
+    constants: tuple[str, ...], definitions: tuple[str, ...], plot: Path | None,
+    fail_on: Gate | None, **options: Any,
+) -> None:  # fmt: skip
     """Find a trace on which one of the formulas ONE and OTHER holds, and the other does not."""
-    from verifai_jax import mtl
-
     first, second = (_parsed(text, constants, definitions) for text in (one, other))
-    found = mtl.distinguish(first, second, _signals(recordings, problem), **options)
+    found = vj.mtl.distinguish(first, second, _signals(recordings, problem), **options)
     show_result(found, plot if found else None, "source", "holds", "robustness", "tried")
     check_gate(fail_on, {"apart": bool(found)})
 
@@ -126,22 +101,15 @@ def distinguish(
 @arguments.SEED
 @arguments.PLOT
 def examples(
-    formula: str,
-    recordings: tuple[Path, ...],
-    problem: str | None,
-    constants: tuple[str, ...],
-    definitions: tuple[str, ...],
-    plot: Path | None,
-    **options: Any,
-) -> None:
+    formula: str, recordings: tuple[Path, ...], problem: str | None, constants: tuple[str, ...],
+    definitions: tuple[str, ...], plot: Path | None, **options: Any,
+) -> None:  # fmt: skip
     """Find a trace that satisfies FORMULA, one that barely does, and one that breaks it.
 
     Their signals move in the range of the recordings, if any are given.
     """
-    from verifai_jax import mtl
-
     parsed = _parsed(formula, constants, definitions)
-    found = mtl.examples(parsed, _signals(recordings, problem), **options)
+    found = vj.mtl.examples(parsed, _signals(recordings, problem), **options)
     show_result(found, plot, "robustness")
 
 
@@ -150,9 +118,7 @@ def examples(
 @option("--domain", help="Domain, such as driving, flight, medical or power.")
 def templates(words: tuple[str, ...], domain: str | None) -> None:
     """Print the requirements of the library that have all WORDS, with their sources and units."""
-    from verifai_jax import mtl
-
-    found = mtl.templates(" ".join(words), domain)
+    found = vj.mtl.templates(" ".join(words), domain)
     click.echo("\n\n".join(map(str, found)) or "no template has all of these words")
     give_result(templates=found)
 
@@ -161,10 +127,8 @@ for _command in (lint, mutants, distinguish, examples, templates):
     formula.add_command(_command)
 
 
-def _parsed(text: str, constants: tuple[str, ...], definitions: tuple[str, ...]) -> "Formula":
-    from verifai_jax import mtl
-
-    return mtl.parse(text, *arguments.read_names(constants, definitions))
+def _parsed(text: str, constants: tuple[str, ...], definitions: tuple[str, ...]) -> "vj.Formula":
+    return vj.mtl.parse(text, *arguments.read_names(constants, definitions))
 
 
 def _signals(recordings: tuple[Path, ...], problem: str | None) -> Any:

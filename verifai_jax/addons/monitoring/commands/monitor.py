@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import click
 
+import verifai_jax as vj
 from verifai_jax.addons.monitoring.commands.monitor_fleet import (
     fleet_options,
     is_fleet,
@@ -32,10 +33,7 @@ from verifai_jax.core.messages.text import format_time, printable
 from verifai_jax.core.store.atomic_files import replacing
 
 if TYPE_CHECKING:
-    from verifai_jax import Formula
     from verifai_jax.addons.monitoring.judging import Reading
-    from verifai_jax.addons.monitoring.resampling import Missing
-    from verifai_jax.core.values.trace import Trace
 
 
 @command()
@@ -45,54 +43,32 @@ if TYPE_CHECKING:
 @option("--time", default="time", help="Column of sample times.")
 @option("--time-unit", help="Unit of the sample times (ns, us, ms, s, min, h, d), if none is said.")
 @option("--max-gap", type=float, help="Longest time in seconds without a value of a signal.")
-@option("--resample", "period", type=float, help="Period in seconds to resample to.")
+@option("--resample", "resample_to", type=float, help="Period in seconds to resample to.")
 @option("--method", type=click.Choice(["hold", "linear"]), help="Interpolation to resample.")
 @option(
-    "--missing",
-    type=click.Choice(["hold", "drop", "interpolate"]),
+    "--missing", type=click.Choice(["hold", "drop", "interpolate"]),
     help="Treatment of gaps  [default: no verdict where they matter]",
-)
+)  # fmt: skip
 @option(
-    "--end",
-    type=click.Choice(["hold", "truncate", "strict"]),
-    default="hold",
+    "--end", type=click.Choice(["hold", "truncate", "strict"]), default="hold",
     help="How a trace continues after the last sample.",
-)
+)  # fmt: skip
 @option("--compat", type=click.Choice(["pymtl"]), help="Right-open windows, as in py-mtl.")
 @NAMES
 @option(
-    "--export-c",
-    "header",
-    type=PATH,
-    metavar="FILE.h",
+    "--export-c", "header", type=PATH, metavar="FILE.h",
     help="Write FORMULA as a monitor in C (or FILE.fmu) instead, for samples --dt seconds apart.",
-)
+)  # fmt: skip
 @option("--explain", is_flag=True, help="Say which predicate decides, and when.")
 @PLOT
 @fleet_options
 @fail_on(violation="if a formula fails", incomplete="if one fails or has no verdict on a recording")
 def monitor(
-    formula: str,
-    recording: tuple[Path, ...],
-    dt: float | None,
-    time: str,
-    time_unit: str | None,
-    max_gap: float | None,
-    period: float | None,
-    method: Literal["hold", "linear"] | None,
-    missing: "Missing | None",
-    end: Literal["hold", "truncate", "strict"],
-    compat: Literal["pymtl"] | None,
-    constants: tuple[str, ...],
-    definitions: tuple[str, ...],
-    header: Path | None,
-    explain: bool,
-    plot: Path | None,
-    report: Path | None,
-    junit: Path | None,
-    jobs: int,
-    fail_on: Gate | None,
-) -> None:
+    formula: str, recording: tuple[Path, ...], compat: Literal["pymtl"] | None,
+    constants: tuple[str, ...], definitions: tuple[str, ...], header: Path | None, explain: bool,
+    plot: Path | None, report: Path | None, junit: Path | None, jobs: int, fail_on: Gate | None,
+    **given: Any,
+) -> None:  # fmt: skip
     """Compute the robustness of FORMULA on a recorded trace, RECORDING.csv or .parquet.
 
     FORMULA may also be a file of requirements (.toml, .yaml, .csv or .reqif), and RECORDING a
@@ -105,24 +81,25 @@ def monitor(
     """
     import jax
 
-    from verifai_jax import mtl
     from verifai_jax.addons.monitoring.columns import LeftOut
     from verifai_jax.addons.monitoring.judging import Reading, finder
     from verifai_jax.mtl.setting import check_signals
 
     if (explain or plot is not None) and compat is not None:
         raise click.UsageError("--explain and --plot do not go with --compat")
+    reading = Reading(**given, explain=explain)
+    dt, end = reading.dt, reading.end
     numbers, named = read_names(constants, definitions)
     if header is not None:
         if recording or dt is None:
             raise click.UsageError("--export-c goes with --dt SECONDS, and with no RECORDING")
-        name = re.sub(r"\W", "_", header.stem)
-        parsed = mtl.parse(formula, numbers, named)
+        parsed = vj.parse(formula, numbers, named)
         if header.suffix == ".fmu":
-            mtl.export_fmu(parsed, dt, header)
+            vj.mtl.export_fmu(parsed, dt, header)
         else:
+            text = vj.mtl.export_c(parsed, dt, re.sub(r"\W", "_", header.stem))
             with replacing(header) as partial:
-                partial.write_text(mtl.export_c(parsed, dt, name), encoding="utf-8")
+                partial.write_text(text, encoding="utf-8")
         click.echo(f"monitor {header}")
         give_result(formula=formula, header=str(header))
         return
@@ -131,47 +108,45 @@ def monitor(
     if is_fleet(formula, recording, report, junit):
         if plot is not None or compat is not None:
             raise click.UsageError("--plot and --compat go with one formula on one recording")
-        options = {"time": time, "dt": dt, "resample_to": period, "method": method, "end": end}
-        options |= {"missing": missing, "time_unit": time_unit, "max_gap": max_gap}
-        found = monitor_fleet(formula, recording, numbers, named, report, junit, jobs, options)
+        found = monitor_fleet(formula, recording, numbers, named, report, junit, jobs, given)
         failing, unjudged = bool(found.failing), bool(found.without_verdict)
         check_gate(fail_on, {"violation": failing, "incomplete": failing or unjudged})
         return
     (file,) = recording
-    parsed = mtl.parse(formula, numbers, named)
+    parsed = vj.parse(formula, numbers, named)
     if str(file) == "-":
-        whole = (plot, compat, period, max_gap)
+        whole = (plot, compat, reading.resample_to, reading.max_gap)
         if explain or end != "hold" or any(option is not None for option in whole):
             raise click.UsageError(
                 "a stream goes with --dt, --time, --time-unit, --missing hold, --const, --define "
                 "and --fail-on; other options need the whole recording"
             )
-        if missing in ("drop", "interpolate"):
-            why = {
-                "drop": "leaves instants out, and samples of a stream are evenly spaced",
-                "interpolate": "needs the value after a gap, which a stream has not had yet",
-            }[missing]
-            raise click.UsageError(f"--missing {missing} {why}: use --missing hold")
-        held = missing == "hold"
-        holds = monitor_stream(parsed, sys.stdin, time, dt, hold=held, time_unit=time_unit)
+        why = {
+            "drop": "leaves instants out, and samples of a stream are evenly spaced",
+            "interpolate": "needs the value after a gap, which a stream has not had yet",
+        }.get(str(reading.missing))
+        if why:
+            raise click.UsageError(f"--missing {reading.missing} {why}: use --missing hold")
+        held, unit = reading.missing == "hold", reading.time_unit
+        holds = monitor_stream(parsed, sys.stdin, reading.time, dt, hold=held, time_unit=unit)
         give_result(formula=str(parsed), holds=holds)
         check_gate(fail_on, {"violation": not holds, "incomplete": not holds})
         return
-    reading = Reading(time, dt, time_unit, period, method, missing, max_gap, end, explain)
     trace = _read(file, reading)
     check_signals(parsed, trace, str(file))
-    even = mtl.resample(trace, period, method) if period and method else trace
+    period, method = reading.resample_to, reading.method
+    even = vj.mtl.resample(trace, period, method) if period and method else trace
     with jax.enable_x64(True):
         try:
             if compat is None:
                 (rho, holds, *_, because), off = finder(trace, reading)(parsed)
             else:
-                rho, off = float(mtl.robustness(parsed, even, end=end, compat=compat)), ""
-                holds, because = bool(mtl.satisfied(parsed, even, end, compat)), ""
-        except mtl.HorizonError as error:
+                rho, off = float(vj.mtl.robustness(parsed, even, end=end, compat=compat)), ""
+                holds, because = bool(vj.mtl.satisfied(parsed, even, end, compat)), ""
+        except vj.mtl.HorizonError as error:
             advice = "Use --end hold or --end truncate, or a longer recording"
             raise ValueError(f"{error.fact}. {advice}") from None
-        except mtl.SamplingError as error:
+        except vj.mtl.SamplingError as error:
             advice = f"Resample it: --resample {error.dt:zg} --method hold (or linear)"
             raise ValueError(f"{error.fact}. {advice}") from None
         except ValueError as error:
@@ -183,8 +158,8 @@ def monitor(
             if not isinstance(note, LeftOut) or note.column in parsed.signals():
                 click.echo(f"note: {printable(note)}")
         try:
-            why = mtl.explain(parsed, even, end=end) if explain or plot is not None else None
-        except mtl.SamplingError as error:
+            why = vj.mtl.explain(parsed, even, end=end) if explain or plot is not None else None
+        except vj.mtl.SamplingError as error:
             if plot is not None:
                 raise ValueError(f"{error.fact}. A picture needs --resample and --method") from None
             why = None
@@ -192,22 +167,21 @@ def monitor(
             # Recorded times decide where there is a method, and a picture is of an even clock.
             click.echo(str(why) if why is not None and method is None else because)
         if plot is not None and why is not None:
-            mtl.draw(why, plot)
+            vj.mtl.draw(why, plot)
             click.echo(f"picture {plot}")
     give_result(formula=str(parsed), holds=holds, robustness=rho)
     check_gate(fail_on, {"violation": not holds, "incomplete": not holds})
 
 
-def _read(recording: Path, reading: "Reading") -> "Trace":
+def _read(recording: Path, reading: "Reading") -> "vj.Trace":
     """Read the recording; errors name the missing option of this command."""
-    from verifai_jax import mtl
     from verifai_jax.addons.monitoring.judging import read_recording
 
     if reading.resample_to is not None and reading.method is None:
         raise click.UsageError("--resample PERIOD goes with --method hold or --method linear")
     try:
         return read_recording(recording, reading)
-    except mtl.TimeColumnError as error:
+    except vj.mtl.TimeColumnError as error:
         near = nearest_names(reading.time, error.columns)
         raise ValueError(
             f"{error.fact}{near or '.'} Give the sampling period, --dt SECONDS, or the name of "
@@ -229,8 +203,8 @@ class Sample(NamedTuple):
 
 
 def monitor_stream(
-    formula: "Formula", lines: Iterable[str], time: str, dt: float | None, show: Any = click.echo,
-    hold: bool = False, time_unit: str | None = None,
+    formula: "vj.Formula", lines: Iterable[str], time: str, dt: float | None,
+    show: Any = click.echo, hold: bool = False, time_unit: str | None = None,
 ) -> bool:  # fmt: skip
     """Monitor samples until the verdict is certain, or until they end.
 
@@ -244,16 +218,14 @@ def monitor_stream(
     **Returns:** whether the formula holds; if the samples have ended, with the last one held.
     **Raises:** `ValueError` for lines that are not evenly spaced samples; `CommandError` for a NaN.
     """
-    from verifai_jax import mtl
-
     vectors: dict[str, int] = {}
     samples = _samples(lines, formula, None if dt is not None else time, vectors, time_unit)
     samples, period = _period(samples, dt)
     first = next(samples, None)  # After it the sizes of vectors are known.
     samples = samples if first is None else itertools.chain([first], samples)
     robustness, truth = (
-        mtl.watch(formula, period, semantics=semantics, sizes=vectors)
-        for semantics in (mtl.hard, mtl.boolean)
+        vj.mtl.watch(formula, period, semantics=semantics, sizes=vectors)
+        for semantics in (vj.mtl.hard, vj.mtl.boolean)
     )
     count, begin, last = 0, None, dict[str, Any]()
     for count, sample in enumerate(samples, 1):
@@ -314,7 +286,7 @@ def _period(samples: Iterator[Sample], dt: float | None) -> tuple[Iterator[Sampl
 
 
 def _samples(
-    lines: Iterable[str], formula: "Formula", time: str | None, vectors: dict[str, int],
+    lines: Iterable[str], formula: "vj.Formula", time: str | None, vectors: dict[str, int],
     time_unit: str | None,
 ) -> Iterator[Sample]:  # fmt: skip
     """Read samples one by one, no line before it is needed, and note the sizes of `vectors`."""
@@ -380,7 +352,7 @@ def _seconds_since(first: list[datetime.datetime], cell: str) -> float | None:
         return None
 
 
-def _columns(names: list[str], formula: "Formula") -> dict[str, str | list[str]]:
+def _columns(names: list[str], formula: "vj.Formula") -> dict[str, str | list[str]]:
     """Return the column of each signal of the formula, or the columns of a vector."""
     from verifai_jax.addons.monitoring.recording import vector_columns
 

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 
+import verifai_jax as vj
 from verifai_jax.cli.arguments import option
 from verifai_jax.cli.exit_codes import BROKEN, CommandError
 from verifai_jax.cli.json_output import give_result
@@ -40,15 +41,10 @@ def is_fleet(
 
 
 def monitor_fleet(
-    formula: str,
-    recordings: Sequence[Path],
-    constants: Mapping[str, float],
-    definitions: Mapping[str, str],
-    report: Path | None,
-    junit: Path | None,
-    jobs: int,
+    formula: str, recordings: Sequence[Path], constants: Mapping[str, float],
+    definitions: Mapping[str, str], report: Path | None, junit: Path | None, jobs: int,
     options: Mapping[str, Any],
-) -> "Judgement":
+) -> "Judgement":  # fmt: skip
     """Judge one formula or a file of requirements on recordings; print the findings.
 
     **Arguments:**
@@ -56,8 +52,6 @@ def monitor_fleet(
     - `options`: the options of `judge` for reading recordings.
     **Raises:** `CommandError` if nothing has a verdict.
     """
-    from verifai_jax import mtl
-
     requirements = load_requirements(formula, constants, definitions)
     with contextlib.ExitStack() as stack:
         executor = None
@@ -65,16 +59,13 @@ def monitor_fleet(
             spawned = multiprocessing.get_context("spawn")
             pool = concurrent.futures.ProcessPoolExecutor(jobs, mp_context=spawned)
             executor = stack.enter_context(pool)
-        found = mtl.judge(requirements, recordings, executor=executor, **options)
+        found = vj.mtl.judge(requirements, recordings, executor=executor, **options)
     click.echo(printable(str(found)))
     for name, path, write in (("report", report, found.report), ("junit", junit, found.junit)):
         if path is not None:
             click.echo(f"{name} {write(path)}")
-    give_result(
-        failing=len(found.failing),
-        without_verdict=len(found.without_verdict),
-        verdicts=[row._asdict() for row in found.rows],
-    )
+    give_result(failing=len(found.failing), without_verdict=len(found.without_verdict))
+    give_result(verdicts=[row._asdict() for row in found.rows])
     if len(found.without_verdict) == len(found.rows):
         raise CommandError("no requirement had a verdict on any recording", BROKEN)
     return found
@@ -84,11 +75,9 @@ def load_requirements(
     formula: str, constants: Mapping[str, float], definitions: Mapping[str, str]
 ) -> "Sequence[Requirement]":
     """Return the requirements of a file, or one formula as a requirement."""
-    from verifai_jax import mtl
-
     if _is_file(formula):
-        return mtl.read_requirements(formula, constants, definitions)
-    return [mtl.Requirement("formula", mtl.parse(formula, constants, definitions))]
+        return vj.mtl.read_requirements(formula, constants, definitions)
+    return [vj.mtl.Requirement("formula", vj.mtl.parse(formula, constants, definitions))]
 
 
 def _is_file(formula: str) -> bool:
