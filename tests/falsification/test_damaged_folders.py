@@ -17,8 +17,8 @@ from verifai_jax.core.store.log import Log
 from verifai_jax.falsification import segments
 from verifai_jax.falsification.loop import Rounds
 from verifai_jax.falsification.run_folder import RECORD, STATE
+from verifai_jax.falsification.segments import TAIL
 from verifai_jax.falsification.table import FINISHED, ErrorTable
-from verifai_jax.falsification.tail import TAIL
 
 SPACE = {"a": vj.Box(0, 1), "b": vj.Box(-1, 1)}
 OPTIONS = {"search": "cross_entropy", "batch": 16, "confirm": False}

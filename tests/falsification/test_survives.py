@@ -27,7 +27,7 @@ from verifai_jax.falsification.run_folder import (
     STATE,
     write_checkpoint,
 )
-from verifai_jax.falsification.tail import TAIL
+from verifai_jax.falsification.segments import TAIL
 
 SPACE = {"a": vj.Box(0, 1), "b": vj.Box(-1, 1)}
 

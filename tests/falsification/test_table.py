@@ -10,8 +10,8 @@ from checked_types import unchecked
 import verifai_jax as vj
 from verifai_jax.core.store.log import Log
 from verifai_jax.falsification import segments
+from verifai_jax.falsification.segments import TAIL
 from verifai_jax.falsification.table import FINISHED, ErrorTable, TableError
-from verifai_jax.falsification.tail import TAIL
 
 
 def batch(rho, status=None, **features):

@@ -52,6 +52,13 @@ CHECK_TEXTS = {
     "nudged": "one rounding of the features away",
 }
 """Each check as people read it, engines apart."""
+PASSED_TEXTS = {
+    "float64": "in double precision",
+    "again": "when simulated again",
+    "quarter_step": "at a third and a quarter of the step",
+    "nudged": CHECK_TEXTS["nudged"],
+}
+"""Checks that a row has passed as people read them; the last step implies the others."""
 ENGINE = "engine."
 """Beginning of the names of checks by other engines, before the name of the engine."""
 EXACT_STEP = "exact_step"
@@ -100,17 +107,8 @@ def describe_checks(checks: Collection[str], *, of_step: bool = True) -> str:
     **Returns:** the end of a sentence, such as `in double precision and at a third and a quarter of
     the step`; empty if there was no check.
     """
-    parts = []
-    if "float64" in checks:
-        parts.append("in double precision")
-    elif "again" in checks:
-        parts.append("when simulated again")
-    if "quarter_step" in checks:
-        parts.append("at a third and a quarter of the step")
-    if "nudged" in checks:
-        parts.append("one rounding of the features away")
-    parts += map(describe_check, engines_of(checks))
-    text = listed(parts)
+    parts = [text for name, text in PASSED_TEXTS.items() if name in checks]
+    text = listed([*parts, *map(describe_check, engines_of(checks))])
     if text and of_step and "quarter_step" not in checks:
         exact = EXACT_STEP in checks
         text += "; the step belongs to the system" if exact else "; no finer step could be tried"
@@ -203,10 +201,9 @@ class Confirmations(InNotebook):
       one rounding of float32), and `engine.NAME` of another engine.
     - `band`: `[n]`, the change of the robustness. Between a third and a quarter of the step three
       times the change is the remaining error of a method of order 1 at the quarter (Richardson
-      extrapolation). By rounding
-      it moves between two precisions, two neighbouring features, or the run and its replay if
-      `run_rho` is known. A row is confirmed if it fails by more than the former and by four times
-      the latter.
+      extrapolation). By rounding it moves between two precisions, two neighbouring features, or the
+      run and its replay if `run_rho` is known. A row is confirmed if it fails by more than the
+      former and by four times the latter.
     - `why`: `[n]`, a sentence with the reason; empty if confirmed.
     - `notes`: checks that could not be made, with the reasons.
     - `checks`: names of the checks that were made, for `describe_checks`.
@@ -241,8 +238,7 @@ class Confirmations(InNotebook):
         """Return rows with one verdict, none of them replayed yet; see `put`."""
         missing = np.full(len(numbers), np.nan)
         known = missing if run_rho is None else np.asarray(run_rho, np.float64)
-        texts = np.full(len(numbers), "", object)
-        verdicts = np.full(len(numbers), verdict, object)
+        verdicts, texts = (np.full(len(numbers), text, object) for text in (verdict, ""))
         return cls(name, np.asarray(numbers), known, verdicts, {}, missing.copy(), texts)
 
     def put(self, rows: Int[np.ndarray, " some"], part: "Confirmations") -> None:
@@ -268,16 +264,10 @@ class Confirmations(InNotebook):
         """One line for each row number: `verdict`, `rho` in the run, `rho.CHECK`, `band`, `why`."""
         import pandas as pd
 
-        return pd.DataFrame(
-            {
-                "verdict": self.verdict,
-                "rho": self.run_rho,
-                **{f"rho.{name}": values for name, values in self.rho.items()},
-                "band": self.band,
-                "why": self.why,
-            },
-            index=pd.Index(self.numbers, name="row"),
-        )
+        columns = {"verdict": self.verdict, "rho": self.run_rho}
+        columns |= {f"rho.{name}": values for name, values in self.rho.items()}
+        columns |= {"band": self.band, "why": self.why}
+        return pd.DataFrame(columns, index=pd.Index(self.numbers, name="row"))
 
     @property
     def checked(self) -> str:
@@ -366,13 +356,9 @@ class Repetitions:
         lost = (verdict == "fragile") & ~(again < 0)
         moved = lost | (known & came_otherwise(rho, again))
         differs = known & (again != rho)
-        return cls(
-            int(np.sum(known | lost)),
-            int(np.sum(moved)),
-            int(np.sum(differs & ~moved)),
-            int(np.sum(lost)),
-            float(np.max(np.abs(rho - again)[differs], initial=0.0)),
-        )
+        rows = (known | lost, moved, differs & ~moved, lost)
+        most = float(np.max(np.abs(rho - again)[differs], initial=0.0))
+        return cls(*(int(np.sum(each)) for each in rows), most)
 
     def joined(self, other: "Repetitions") -> "Repetitions":
         """Return the sums of both counts."""
@@ -395,9 +381,8 @@ class Repetitions:
                 f"robustness{by}, and {self.lost} did not fail"
             )
         if self.rounded:
-            return (
-                f"{of}, {self.rounded} have other last digits, by up to {self.max_difference:z.2g}"
-            )
+            by = f"by up to {self.max_difference:z.2g}"
+            return f"{of}, {self.rounded} have other last digits, {by}"
         return ""
 
 

@@ -9,11 +9,10 @@ A search simulates in single precision at the model's step; both can cause false
 counterexample is claimed only if it was replayed, and fails in double precision, at a third and at
 a quarter of the step (there also in single precision), and with features changed by one rounding.
 It also has to fail by more than the finer step changed its robustness, and by far more than
-rounding did. A host system
-without a finer step is simulated once more with the same features and key: a row that fails again
-is confirmed. Otherwise it is fragile, since the system remembers earlier simulations or draws
-numbers that do not come from its key. `confirmation_rules.py` decides from the replays,
-`confirmations.py` has the results.
+rounding did. A host system without a finer step is simulated once more with the same features and
+key: a row that fails again is confirmed. Otherwise it is fragile, since the system remembers
+earlier simulations or draws numbers that do not come from its key. The results are of
+`confirmations.py`.
 """
 
 from collections.abc import Mapping, Sequence
@@ -27,12 +26,13 @@ from jaxtyping import Float, Int
 
 from verifai_jax.core.compute.keys import run_keys
 from verifai_jax.core.compute.precision import in_precision
+from verifai_jax.core.messages.text import listed
 from verifai_jax.evaluation.backends import Engines, engines_for
-from verifai_jax.evaluation.confirmation_rules import decide, hold_to_run, lowest_failing
 from verifai_jax.evaluation.confirmations import (
     EXACT_STEP,
     FINER,
     RAISED,
+    REFUSED,
     SINGLE,
     Confirmations,
     came_otherwise,
@@ -53,6 +53,12 @@ comes again: 4 % of the budget."""
 MORE = 3
 """Further repetitions of rows that fail again, once another row of the run did not: a system that
 fails at every seventh call fails in the first repetition of every seventh row, too."""
+AMPLIFIED = 4.0
+"""Times by which a row must fail beyond what rounding has moved it: a chaotic system turns
+roundings into any of its outcomes, and two or three programs may agree by chance."""
+REMAINING = 3.0
+"""Error left at a quarter of the step by a method of order 1, as a multiple of the change since a
+third of it."""
 CHECKPOINT = "confirmer"
 """Entry of a checkpoint: rows examined, the worst row, whether one came again otherwise, and
 whether one did not fail again."""
@@ -237,13 +243,6 @@ class Confirmer:
         """Whether all that is done is to simulate a host system once more."""
         return self.problem.black_box and set(self._checks) == {"again"}
 
-    @property
-    def _is_finer(self) -> bool:
-        """Whether a check simulates more finely than the run, so that it may refute a row."""
-        checks = self._checks
-        more_precise = "float64" in checks and self.precision != "float64"
-        return more_precise or "quarter_step" in checks or bool(engines_of(checks))
-
     def _room(
         self, rest: Int[np.ndarray, " rest"], run: Float[np.ndarray, " n"] | None, limit: int | None
     ) -> int:
@@ -260,17 +259,10 @@ class Confirmer:
         """Replay rows by all checks, and decide."""
         run = rows.get("rho")
         replayed = self._replay(rows, numbers, run)
-        found = decide(
-            Confirmations.blank(self.problem.name, numbers, run, "raised"),
-            replayed,
-            run,
-            untraceable=self._untraceable,
-            may_refute=self._is_finer,
-            by_far=not self._only_repeats or self.flips,
-            came_again=self._only_repeats and self._came_again,
-        )
+        found = Confirmations.blank(self.problem.name, numbers, run, "raised")
+        self._decide(found, replayed, run)
         if self.problem.black_box and "verdict" in rows:
-            hold_to_run(found, replayed, rows, self._only_repeats)
+            _hold_to_run(found, replayed, rows, self._only_repeats)
         self.examined += len(numbers)
         if run is not None:
             self.worst = min(self.worst, float(np.min(run)))
@@ -338,5 +330,118 @@ class Confirmer:
             own = jax.tree.map(lambda leaf, left=left: leaf[left], features)
             [more] = replays.anew(own, numbers[left])
             notice(left, more)
-            again = lowest_failing(again, more, left)
+            with np.errstate(invalid="ignore"):
+                less = np.flatnonzero(~more.violated | ~(more.lowest <= again.lowest[left]))
+            taken = np.arange(len(numbers))
+            taken[left[less]] = len(numbers) + less
+            again = Verdicts.concatenate([again, more]).rows(taken)
         return again
+
+    def _decide(
+        self,
+        found: Confirmations,
+        replayed: Mapping[str, Verdicts],
+        run: Float[np.ndarray, " n"] | None,
+    ) -> None:
+        """Decide on rows from their replays, in place; all of them have the verdict `raised`."""
+        rho = {name: verdicts.lowest for name, verdicts in replayed.items()}
+        found.rho.update(rho)
+        base = next((name for name in ("float64", "again") if name in replayed), "")
+        engines = engines_of(replayed)
+        finest = next((n for n in ("quarter_step", base, *engines) if n in replayed), "")
+        step = rounding = np.zeros(len(found))
+        if "quarter_step" in replayed:
+            step = REMAINING * _moved(rho["third_step"], rho["quarter_step"])
+        for name in (SINGLE, "nudged"):
+            if name in replayed:
+                rounding = np.maximum(rounding, _moved(rho[name], rho[finest]))
+        if run is not None and base:
+            rounding = np.maximum(rounding, _moved(run, rho[base]))
+        found.band[:] = np.maximum(step, rounding)
+        if not replayed:
+            found.why[:] = self._untraceable
+            return
+        deciding = [name for name in (*FINER, SINGLE) if name in replayed] or [base]
+        deciding = [name for name in (*deciding, *engines) if name in replayed]
+        failing = {name: verdicts.violated for name, verdicts in replayed.items()}
+        holding = {name: v.proper & ~v.violated for name, v in replayed.items()}
+        raised = {name: np.isin(v.status, RAISED) for name, v in replayed.items()}
+        clear = np.abs(rho[finest]) >= np.maximum(step, AMPLIFIED * rounding)
+        if self._only_repeats and not self.flips:
+            # Of a host system that is simulated once more, and fails each time, that says all.
+            clear = np.ones(len(found), bool)
+        # Only a check that simulates more finely than the run may refute a row.
+        finer = "quarter_step" in replayed or bool(engines)
+        finer |= "float64" in replayed and self.precision != "float64"
+        fails = np.all(list(failing.values()), axis=0)
+        refuted = np.all([holding[name] for name in deciding], axis=0) & finer
+        refuted &= deciding[0] != "again"
+        lost = np.any(list(raised.values()), axis=0) | bool(self._untraceable)
+        lost &= np.all([failing[name] | raised[name] for name in replayed], axis=0)
+        if self._only_repeats and self._came_again:
+            # Other rows could be simulated again: an error means that this failure did not recur.
+            lost[:] = False
+        found.verdict[:] = np.select(
+            [lost, fails & clear, refuted], ["raised", "confirmed", "refuted"], "fragile"
+        )
+        for i in np.flatnonzero(found.verdict != "confirmed").tolist():
+            if found.verdict[i] == "raised" and self._untraceable:
+                found.why[i] = self._untraceable
+            else:
+                moved = f"its robustness {rho[finest][i]:z.3g} moves by {found.band[i]:z.2g}"
+                then = "" if run is None else f", and {run[i]:z.4g} in the run"
+                found.why[i] = _disagreement(i, replayed, then) or f"{moved} between replays"
+
+
+def _hold_to_run(
+    found: Confirmations,
+    replayed: Mapping[str, Verdicts],
+    rows: Mapping[str, np.ndarray],
+    only_repeats: bool,
+) -> None:
+    """Keep the run's verdict on rows of a host system that the present replays do not contradict.
+
+    A failure that the run could not reproduce stays unconfirmed, whatever happens now; one that
+    fails every time stays confirmed, however far its robustness moved.
+    """
+    fails = np.all([verdicts.violated for verdicts in replayed.values()], axis=0)
+    still = (rows["verdict"] == "confirmed") & fails & only_repeats
+    found.verdict[still], found.why[still] = "confirmed", ""
+    refused = np.isin(rows["verdict"], REFUSED) & np.isin(found.verdict, ("confirmed", "raised"))
+    for i in np.flatnonzero(refused).tolist():
+        found.verdict[i] = "fragile"
+        again = float(rows["rho_again"][i]) if "rho_again" in rows else float("nan")
+        then = "" if np.isnan(again) else f", with robustness {again:z.4g}"
+        found.why[i] = f"it did not come again when the run simulated it again{then}"
+
+
+def _disagreement(i: int, found: Mapping[str, Verdicts], in_run: str) -> str:
+    """Explain which replays of row `i` do not confirm it; empty if it fails in all of them."""
+    lost = [name for name in found if not found[name].proper[i]]
+    raised = [name for name in lost if found[name].status[i] in RAISED]
+    if raised:
+        messages = [m[i] for name in raised if (m := found[name].messages)]
+        message = next(filter(None, messages), "out of time")
+        return f"the replay {_and(raised)} raised: {message}"
+    if lost:
+        return f"the replay {_and(lost)} is not finite"
+    holds = [name for name, replayed in found.items() if not replayed.violated[i]]
+    fails = [name for name in found if name not in holds]
+    if holds == ["again"]:
+        rho = found["again"].lowest[i]
+        return f"it holds when simulated again: robustness {rho:z.4g}{in_run}"
+    if holds and not fails:
+        return "it holds in every replay"
+    if len(holds) > len(fails):
+        return f"it fails only {_and(fails)}"
+    return f"it holds {_and(holds)}" if holds else ""
+
+
+def _and(names: Sequence[str]) -> str:
+    return listed(list(map(describe_check, names)))
+
+
+def _moved(a: Float[np.ndarray, " n"], b: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
+    """Return by how much a robustness moved: infinitely where one of the two is missing."""
+    with np.errstate(invalid="ignore"):
+        return np.nan_to_num(np.where(a == b, 0.0, np.abs(a - b)), nan=np.inf)

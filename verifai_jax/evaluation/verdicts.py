@@ -89,15 +89,17 @@ class Verdicts(NamedTuple):
     def split(self, parts: int) -> "list[Verdicts]":
         """Split the rows into this many parts of equal length; the inverse of `concatenate`."""
         count = len(self.status) // parts
-        blocks = [slice(i * count, (i + 1) * count) for i in range(parts)]
-        rows = self._replace(messages=None, traces=None)
-        return [
-            jax.tree.map(lambda leaf, block=block: leaf[block], rows)._replace(
-                messages=None if self.messages is None else self.messages[block],
-                traces=None if self.traces is None else self.traces[block],
-            )
-            for block in blocks
-        ]
+        return [self.rows(slice(i * count, (i + 1) * count)) for i in range(parts)]
+
+    def rows(self, chosen: slice | Int[np.ndarray, " k"]) -> "Verdicts":
+        """Return some of the rows, by their indices."""
+        arrays = self._replace(messages=None, traces=None)
+        some: Verdicts = jax.tree.map(lambda leaf: leaf[chosen], arrays)
+        numbers = np.arange(len(self.status))[chosen].tolist()
+        return some._replace(
+            messages=None if self.messages is None else [self.messages[i] for i in numbers],
+            traces=None if self.traces is None else [self.traces[i] for i in numbers],
+        )
 
 
 class RowVerdict(NamedTuple):

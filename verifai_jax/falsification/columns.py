@@ -118,9 +118,8 @@ def to_arrow(columns: Columns) -> "pa.RecordBatch":
     """Return rows as a record batch of Arrow."""
     import pyarrow as pa
 
-    return pa.RecordBatch.from_pydict(
-        {name: column_to_arrow(each) for name, each in columns.items()}
-    )
+    arrays = {name: column_to_arrow(each) for name, each in columns.items()}
+    return pa.RecordBatch.from_pydict(arrays)
 
 
 def column_to_arrow(values: Shaped[np.ndarray, " n"]) -> "pa.Array":
@@ -177,13 +176,10 @@ def rows_of(
     if verdicts.gradient is not None:
         columns["gradient_finite"] = np.all(np.isfinite(verdicts.gradient), axis=1)
     if differentiates:
-        clause_gradients = verdicts.clause_gradients
-        columns["differentiated"] = np.full(count, clause_gradients is not None)
-        columns["gradient_finite"] = (
-            np.ones(count, bool)
-            if clause_gradients is None
-            else np.all(np.isfinite(clause_gradients), axis=(1, 2))
-        )
+        columns["differentiated"] = np.full(count, verdicts.clause_gradients is not None)
+        columns["gradient_finite"] = np.ones(count, bool)
+    if differentiates and verdicts.clause_gradients is not None:
+        columns["gradient_finite"] = np.all(np.isfinite(verdicts.clause_gradients), axis=(1, 2))
     if verdicts.messages is not None:
         columns["message"] = np.array(verdicts.messages, dtype=object)
     return columns

@@ -123,9 +123,9 @@ def count(parts: Iterable[tuple[Int[np.ndarray, " n"], Columns]]) -> Counts:
             if "rho_again" in columns:
                 own = (columns[name][violating] for name in ("rho", "rho_again", "verdict"))
                 counts.repetitions = counts.repetitions.joined(Repetitions.count(*own))
-        minimum = np.fmin.reduce(np.asarray(columns["rho"], np.float64))
-        counts.lowest = float(np.fmin(counts.lowest, minimum))
-        rho = np.nan_to_num(np.asarray(columns["rho"], np.float64), nan=np.inf)
+        rho = np.asarray(columns["rho"], np.float64)
+        counts.lowest = float(np.fmin(counts.lowest, np.fmin.reduce(rho)))
+        rho = np.nan_to_num(rho, nan=np.inf)
         for name, among in (("worst", claimed), ("nearest", proper)):
             indices = np.flatnonzero(among)
             if len(indices):
@@ -138,15 +138,12 @@ def count(parts: Iterable[tuple[Int[np.ndarray, " n"], Columns]]) -> Counts:
             if (first := next(said, None)) is not None:
                 counts.first_message = int(numbers[first]), str(columns["message"][first])
         if "gradient_finite" in columns:
-            finite = columns["gradient_finite"].astype(bool)
-            counts.not_differentiated += int(np.sum(~finite))
-        each = [name for name in columns if name.startswith("rho.")]
-        if each:
+            counts.not_differentiated += int(np.sum(~columns["gradient_finite"].astype(bool)))
+        if each := [name for name in columns if name.startswith("rho.")]:
             of_each = np.stack([columns[name][violating] for name in each], axis=1)
-            failing = _failing_alone(of_each.astype(np.float64))
-            counts.failing_alone.update(
-                {name.removeprefix("rho."): int(n) for name, n in zip(each, failing, strict=True)}
-            )
+            failing = _failing_alone(of_each.astype(np.float64)).tolist()
+            names = [name.removeprefix("rho.") for name in each]
+            counts.failing_alone.update(dict(zip(names, failing, strict=True)))
     counts.failed, counts.verdicts = dict(statuses.most_common()), dict(verdicts.most_common())
     return counts
 

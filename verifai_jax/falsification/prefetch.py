@@ -15,7 +15,6 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import AbstractContextManager, nullcontext
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-import jax
 import numpy as np
 from jaxtyping import Float
 
@@ -90,7 +89,7 @@ class Prefetch:
         self._rounds.popleft()
         self.checkpoint = each.checkpoint
         part = slice(each.begin, each.begin + len(each.points))
-        return each.points, _rows(whole, part)
+        return each.points, whole.rows(part)
 
     def close(self) -> None:
         """Cancel queued rounds, and reset the proposals to the end of the last round taken."""
@@ -150,11 +149,3 @@ class Prefetch:
                 begin += len(points)
             self._next += count
             waiting += count
-
-
-def _rows(verdicts: Verdicts, part: slice) -> Verdicts:
-    if part.start == 0 and part.stop == len(verdicts.status):
-        return verdicts
-    messages = None if verdicts.messages is None else verdicts.messages[part]
-    rows: Verdicts = jax.tree.map(lambda leaf: leaf[part], verdicts._replace(messages=None))
-    return rows._replace(messages=messages)

@@ -29,9 +29,8 @@ from verifai_jax.core.store.log import Log, write_log
 from verifai_jax.core.user_code.sources import Sources
 from verifai_jax.falsification.derived import as_simulated
 from verifai_jax.falsification.run import Run
-from verifai_jax.falsification.segments import FAILURES, SEGMENTS, list_segments
+from verifai_jax.falsification.segments import FAILURES, SEGMENTS, TAIL, list_segments
 from verifai_jax.falsification.table import FINISHED, ErrorTable
-from verifai_jax.falsification.tail import TAIL
 from verifai_jax.problem.problem import Problem
 
 RECORD = "run.json"

@@ -189,7 +189,7 @@ class Running:
         """Compile, and note the decisions; `prepare` may choose another search."""
         rounds, search = self.rounds, self.rounds.search
         slow = rounds.problem.system.why_slow_to_compile(search.wants.derivatives)
-        if slow and bar.bar.show:
+        if slow and bar.show:
             bar.note(slow)
         elif slow and progress is not False:
             write_line(f"note: {slow}")

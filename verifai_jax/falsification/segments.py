@@ -7,6 +7,9 @@ A file is written completely and then renamed; its name has its first row, the r
 one, and its checksum. A second file has those rows of the segment that stand out: violations, rows
 without a verdict or with a gradient that is not finite, and the row of least robustness. Counts and
 views of failures read only this file. `pandas.read_parquet` opens either folder as one table.
+
+The rows after the last segment are the tail, `rows.tail`: batches in Arrow's format, each an entry
+of a log under the number of its first row.
 """
 
 import re
@@ -20,7 +23,8 @@ from jaxtyping import Int
 
 from verifai_jax.core.messages.text import format_error, printable
 from verifai_jax.core.store.files import DamagedError, checksum, write_complete
-from verifai_jax.falsification.columns import ROW, Columns, column_to_arrow
+from verifai_jax.core.store.log import Arrays, Log
+from verifai_jax.falsification.columns import ROW, Columns, column_to_arrow, to_arrow
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -31,6 +35,9 @@ SEGMENTS = "table"
 """Name of the folder of the segments."""
 FAILURES = "failures"
 """Name of the folder of the rows that stand out."""
+TAIL = "rows.tail"
+"""Name of the file of the rows after the last segment."""
+_STREAM = "arrow"
 _NAME = re.compile(r"rows-(\d{12})-(\d{12})-([0-9a-f]{8})\.parquet")
 MAX_ROWS = 10**12 - 1
 """The greatest number that a row can have: names of segments have twelve digits."""
@@ -190,3 +197,34 @@ def remove_segments(run: Path, begin: int) -> None:
                 partial.unlink(missing_ok=True)
             if not any(folder.iterdir()):
                 folder.rmdir()
+
+
+def tail_entry(first: int, rows: Columns) -> dict[str, Arrays]:
+    """Return rows from number `first` on as an entry of the tail."""
+    import pyarrow as pa
+
+    batch, sink = to_arrow(rows), pa.BufferOutputStream()
+    with pa.ipc.new_stream(sink, batch.schema) as writer:
+        writer.write_batch(batch)
+    return {str(first): {_STREAM: np.frombuffer(sink.getvalue(), np.uint8)}}
+
+
+def read_tail(folder: Path) -> "list[tuple[int, pa.RecordBatch]]":
+    """Return the undamaged batches of a tail, each with the number of its first row.
+
+    **Raises:** `DamagedError` if the path is not a file.
+    """
+    import pyarrow as pa
+
+    found = []
+    for name, arrays in Log(folder / TAIL).entries():
+        if not name.isdecimal() or len(name) > len(str(MAX_ROWS)) or _STREAM not in arrays:
+            continue  # Of another program.
+        try:
+            for batch in pa.ipc.open_stream(pa.py_buffer(arrays[_STREAM])):
+                # A checksum is no proof of who wrote it: offsets may point anywhere.
+                batch.validate(full=True)
+                found.append((int(name), batch))
+        except pa.ArrowException:
+            continue
+    return found

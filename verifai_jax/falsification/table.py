@@ -3,13 +3,13 @@
     table.append(columns)   a batch of them
     table.all               all of them, and more of the kind in `table_view.py`
 
-On disk the batches of a growing table are appended to its tail (`tail.py`), a log; a process that
-dies loses at most the batch in flight. Every 1 048 576 rows become a segment (`segments.py`), and
-leave memory. A finished table that has no segment is one Parquet file, `table.parquet`; a longer
-one is the folder `table/` of its segments.
+On disk (`segments.py`) the batches of a growing table are appended to its tail, a log; a process
+that dies loses at most the batch in flight. Every 1 048 576 rows become a segment, and leave
+memory. A finished table that has no segment is one Parquet file, `table.parquet`; a longer one is
+the folder `table/` of its segments.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -19,27 +19,27 @@ from verifai_jax.core.store.files import write_complete
 from verifai_jax.core.store.log import Log, write_log
 from verifai_jax.falsification import segments
 from verifai_jax.falsification.columns import (
-    Batch,
     Columns,
     cut,
     from_frame,
     length,
     merge,
-    to_arrow,
     wrong_column,
 )
 from verifai_jax.falsification.segments import (
     SEGMENTS,
+    TAIL,
     Segment,
     TableError,
     damaged,
     list_segments,
     parquet,
+    read_tail,
     remove_segments,
+    tail_entry,
     write_segment,
 )
 from verifai_jax.falsification.table_view import TableView
-from verifai_jax.falsification.tail import TAIL, read_tail, tail_entry
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -112,7 +112,7 @@ class ErrorTable(TableView):
         if self._tail is None:
             return
         if self._next - self._begin < segments.SEGMENT_ROWS:
-            self._tail.put(tail_entry(first, to_arrow(batch)))
+            self._tail.put(tail_entry(first, batch))
             return
         while self._next - self._begin >= segments.SEGMENT_ROWS:
             self._close_segment(segments.SEGMENT_ROWS)
@@ -123,7 +123,7 @@ class ErrorTable(TableView):
         ]
         self._tail.clear()
         for begin, rest in self._batches:
-            self._tail.put(tail_entry(begin, to_arrow(rest)))
+            self._tail.put(tail_entry(begin, rest))
 
     def close(self) -> None:
         """Convert the rows of the tail to Parquet.
@@ -135,7 +135,9 @@ class ErrorTable(TableView):
         self._tail = None
         assert self._folder is not None
         if not self._segments:
-            self._write_finished(self._folder)
+            batches = list(self._parts(0, self._next))
+            columns = merge(batches) if batches else from_frame(self._empty)
+            write_complete(self._folder / FINISHED, parquet(columns, np.arange(self._next)))
         elif self._next > self._begin:
             self._close_segment(self._next - self._begin)
         (self._folder / TAIL).unlink(missing_ok=True)
@@ -175,11 +177,8 @@ class ErrorTable(TableView):
     @staticmethod
     def exists(folder: Path) -> bool:
         """Return whether there is a table in `folder`, finished or growing."""
-        return (
-            (folder / FINISHED).exists()
-            or (folder / TAIL).exists()
-            or bool(list_segments(folder / SEGMENTS))
-        )
+        files = ((folder / name).exists() for name in (FINISHED, TAIL))
+        return any(files) or bool(list_segments(folder / SEGMENTS))
 
     def resumed(self, rows: int, folder: Path | None = None) -> "ErrorTable":
         """Return a table with the first `rows` rows of this one, to which more can be appended.
@@ -192,20 +191,27 @@ class ErrorTable(TableView):
             raise TableError(f"rows cannot be added to a table that misses some: {self.damage}")
         table = ErrorTable(self.features, folder)
         if folder is None or table._folder != self._folder:
-            table._replace_by(self._parts(0, rows))
+            if folder is not None:
+                (folder / TAIL).unlink(missing_ok=True)
+                remove_segments(folder, 0)
+                (folder / FINISHED).unlink(missing_ok=True)
+            for _, part in self._parts(0, rows):
+                table.append(part)
             return table
         assert table._folder is not None
         begin = rows - rows % segments.SEGMENT_ROWS
         begin = max((each.stop for each in self._segments if each.stop <= begin), default=0)
-        # This table keeps the rows whose files go.
-        self._recall(begin)
+        if begin < self._begin:
+            # This table keeps the rows whose files go.
+            self._batches, self._small = list(self._parts(begin, self._next)), 0
+            self._segments = [each for each in self._segments if each.stop <= begin]
         table._segments = list(self._segments)
         table._next = begin
         for first, part in self._parts(begin, rows):
             table._hold(first, part)
         table._join()
         # Whenever the process dies, what is left has these rows: the tail first, then the others.
-        rest = tail_entry(begin, to_arrow(merge(table._batches))) if table._batches else {}
+        rest = tail_entry(begin, merge(table._batches)) if table._batches else {}
         write_log(folder / TAIL, rest)
         remove_segments(folder, begin)
         (folder / FINISHED).unlink(missing_ok=True)
@@ -237,30 +243,9 @@ class ErrorTable(TableView):
         begin = self._begin
         columns = merge(list(self._parts(begin, begin + rows)))
         segment = write_segment(self._folder, begin, columns)
-        rest = list(self._parts(segment.stop, self._next))
+        self._batches, self._small = list(self._parts(segment.stop, self._next)), 0
         self._segments.append(segment)
-        self._batches, self._small, self._frame = rest, 0, None
-
-    def _write_finished(self, folder: Path) -> None:
-        batches = list(self._parts(0, self._next))
-        columns = merge(batches) if batches else from_frame(self._empty)
-        write_complete(folder / FINISHED, parquet(columns, np.arange(self._next)))
-
-    def _replace_by(self, parts: Iterator[Batch]) -> None:
-        """Take these rows, and replace the content of the folder by them."""
-        if self._folder is not None:
-            (self._folder / TAIL).unlink(missing_ok=True)
-            remove_segments(self._folder, 0)
-            (self._folder / FINISHED).unlink(missing_ok=True)
-        for _, part in parts:
-            self.append(part)
-
-    def _recall(self, begin: int) -> None:
-        """Load the rows from `begin` on into memory, before their segments are removed."""
-        if begin < self._begin:
-            rows = list(self._parts(begin, self._next))
-            self._segments = [each for each in self._segments if each.stop <= begin]
-            self._batches, self._small = rows, 0
+        self._frame = None
 
     def _attach_segments(self, found: list[Segment]) -> None:
         """Attach the undamaged segments, and record the missing rows of the others."""
@@ -295,20 +280,16 @@ class ErrorTable(TableView):
         parts += [tuple(batch) for _, batch in self._batches]
         if not parts or not len(self):
             return
+        damaged_table = f"the table in {self._folder} is damaged:"
         for name in (*self.features, "rho", "violated", "status"):
             if name not in parts[0]:
-                raise TableError(
-                    f"the table in {self._folder} is damaged: it has no column {name!r}"
-                )
-        other = next((part for part in parts if set(part) != set(parts[0])), None)
-        if other is not None:
-            name = sorted(set(other) ^ set(parts[0]))[0]
-            raise TableError(
-                f"the table in {self._folder} is damaged: only some of its rows have {name!r}"
-            )
+                raise TableError(f"{damaged_table} it has no column {name!r}")
+        for part in parts:
+            if others := set(part) ^ set(parts[0]):
+                raise TableError(f"{damaged_table} only some of its rows have {min(others)!r}")
         for _, batch in self._batches:
             if wrong := wrong_column(batch, numbers):
-                raise TableError(f"the table in {self._folder} is damaged: {wrong}")
+                raise TableError(f"{damaged_table} {wrong}")
 
 
 def _read_finished(path: Path) -> "pd.DataFrame":

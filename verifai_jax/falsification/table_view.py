@@ -102,14 +102,8 @@ class TableView(InNotebook):
             raise IndexError(where)
         if self._frame is not None:
             return self._frame.loc[number]
-        for segment in self._segments:
-            if segment.first <= number < segment.stop:
-                return segment.read().loc[number]
-        for first, batch in self._batches:
-            if first <= number < first + length(batch):
-                _, own = cut((first, batch), number, number + 1)
-                return to_frame(np.array([number]), own).loc[number]
-        raise AssertionError(number)
+        [(_, own)] = self._parts(number, number + 1)
+        return to_frame(np.array([number]), own).loc[number]
 
     def entry(
         self, row: "int | np.integer | pd.Series | Mapping[str, object]"

@@ -92,13 +92,13 @@ def halton_points(
     digits = np.array([_digits(int(base)) for base in bases], int)
     maps = None if key is None else _digit_maps(key, bases, int(np.max(digits, initial=0)))
     if len(index) * dim <= MAX_IN_LOOP:
-        return _radical_inverse_in_loop(index, bases, digits, maps)
+        return _radical_inverse(index, bases, digits, maps, unroll=False)
     blocks = [jnp.zeros((len(index), 0), jnp.float32)]
     # Bases whose indices have equally many digits go together: one loop for many large ones.
     for count in sorted(set(digits.tolist()), reverse=True):
         group = digits == count
         chosen = None if maps is None else (maps[0][:count, group], maps[1][:count, group])
-        blocks.append(_radical_inverse(index, bases[group], count, chosen))
+        blocks.append(_radical_inverse(index, bases[group], digits[group], chosen, unroll=True))
     return jnp.concatenate(blocks, axis=1)
 
 
@@ -125,35 +125,12 @@ def _digits(base: int) -> int:
 def _radical_inverse(
     index: UInt32[Array, " n"],
     bases: UInt32[np.ndarray, " d"],
-    digits: int,
-    maps: tuple[UInt32[Array, "digits d"], UInt32[Array, "digits d"]] | None,
-) -> Float[Array, "n d"]:
-    rest = jnp.broadcast_to(index[:, None], (len(index), len(bases)))
-    figures = []
-    for k in range(digits):
-        quotient = rest // bases
-        figure = rest - quotient * bases
-        if maps is not None:
-            figure = (maps[0][k] * figure + maps[1][k]) % bases
-        figures.append(figure)
-        rest = quotient
-    # From the lowest digit on (Horner): every rounding error is divided by the base at once.
-    inverse = jnp.zeros(rest.shape, jnp.float32)
-    for figure in reversed(figures):
-        inverse = (inverse + figure.astype(jnp.float32)) / bases.astype(np.float32)
-    return jnp.minimum(inverse, np.float32(1 - 2**-24))
-
-
-def _radical_inverse_in_loop(
-    index: UInt32[Array, " n"],
-    bases: UInt32[np.ndarray, " d"],
     digits: Int[np.ndarray, " d"],
     maps: tuple[UInt32[Array, "digits d"], UInt32[Array, "digits d"]] | None,
+    *,
+    unroll: bool,
 ) -> Float[Array, "n d"]:
-    """Compute what `_radical_inverse` does in a program a tenth as long.
-
-    On some processors to the last bit; on others the compiler joins other products and sums.
-    """
+    """Mirror the digits of the indices at the point, in a loop or written out (`unroll`)."""
     width = int(np.max(digits, initial=0))
     shape = (len(index), len(bases))
 
@@ -165,7 +142,7 @@ def _radical_inverse_in_loop(
         return quotient, figure
 
     rest = jnp.broadcast_to(index[:, None], shape)
-    _, figures = jax.lax.scan(divide, rest, maps, length=width)
+    _, figures = jax.lax.scan(divide, rest, maps, length=width, unroll=unroll)
     # As XLA writes a division by a constant, in which LLVM joins product and sum.
     share = np.float32(1) / bases.astype(np.float32)
 
@@ -173,9 +150,10 @@ def _radical_inverse_in_loop(
         figure, there = step
         return jnp.where(there, total * share + figure.astype(jnp.float32), total), None
 
+    # From the lowest digit on (Horner): every rounding error is divided by the base at once.
     there = jnp.asarray(np.arange(width)[:, None] < digits)
     zero = jnp.zeros(shape, jnp.float32)
-    total, _ = jax.lax.scan(add, zero, (figures, there), reverse=True)
+    total, _ = jax.lax.scan(add, zero, (figures, there), reverse=True, unroll=unroll)
     return jnp.minimum(total * share, np.float32(1 - 2**-24))
 
 

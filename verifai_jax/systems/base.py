@@ -8,6 +8,7 @@
 Only the call is required; every other member has a default that a system may override.
 """
 
+import functools
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from types import MappingProxyType
 from typing import Any, NamedTuple, TypeAlias, TypeVar
@@ -283,6 +284,20 @@ _VALUES = (
 )
 
 
+def _delegated(name: str, *, makes_system: bool = False) -> Any:
+    """Return a method that the function's object answers; `System` where that has none."""
+    default = getattr(System, name)
+
+    @functools.wraps(default)
+    def method(self: "FunctionSystem", *arguments: Any, **options: Any) -> Any:
+        if not self._offers(name):
+            return default(self, *arguments, **options)
+        found = getattr(self.function, name)(*arguments, **options)
+        return as_system(found) if makes_system else found
+
+    return method
+
+
 class FunctionSystem(System):
     """A function `(features, key) -> Trace` as a system; made by `as_system`.
 
@@ -312,86 +327,27 @@ class FunctionSystem(System):
     def __call__(self, features: Features, key: Seed = None) -> Any:
         return self.function(features, key)
 
-    def check(self, features: Features) -> None:
-        if self._offers("check"):
-            self._method("check")(features)
-
-    def with_domains(self, domains: Mapping[str, Domain]) -> System:
-        if self._offers("with_domains"):
-            return as_system(self._method("with_domains")(domains))
-        return self
-
-    def abstract(self, features: Features) -> Trace | None:
-        if self._offers("abstract"):
-            return self._method("abstract")(features)
-        return super().abstract(features)
-
-    @property
-    def can_fold(self) -> bool:
-        return self._offers("fold")
-
-    def fold(
-        self,
-        features: Features,
-        key: Seed,
-        carry: Carry,
-        update: Callable[[Carry, dict[str, Array]], Carry],
-    ) -> tuple[Carry, Int[Array, ""]]:
-        return self._method("fold")(features, key, carry, update)
-
-    @property
-    def can_refine(self) -> bool:
-        return self._offers("refined") and not self.exact_step
-
-    def refined(self, factor: int | Int[Array, ""]) -> System:
-        return as_system(self._method("refined")(factor))
-
-    def filmed(self, replay: Any) -> Any:
-        return self._method("filmed")(replay)
-
-    def renewed(self) -> System:
-        return as_system(self._method("renewed")()) if self._offers("renewed") else self
-
-    def with_backend(self, name: str) -> System:
-        return as_system(self._method("with_backend")(name))
-
-    def why_not(self, backend: str) -> str | None:
-        if self._offers("why_not"):
-            return self._method("why_not")(backend)
-        return super().why_not(backend)
-
-    def passing(self, features: Features) -> Passing:
-        return self._method("passing")(features)
-
-    def with_links(self, links: tuple[Link, ...]) -> System:
-        return as_system(self._method("with_links")(links))
-
-    def may_draw(self, features: Features) -> bool:
-        return self._method("may_draw")(features)
-
-    @property
-    def can_simulate_batch(self) -> bool:
-        return self._offers("simulate_batch")
-
-    def simulate_batch(self, features: Features, keys: Key[Array, " n"]) -> Trace:
-        return self._method("simulate_batch")(features, keys)
-
-    @property
-    def can_simulate_each(self) -> bool:
-        return self._offers("simulate_each")
-
-    def simulate_each(
-        self, features: Sequence[Features], seeds: Sequence[int]
-    ) -> Iterator[tuple[int, Outcome]]:
-        return self._method("simulate_each")(features, seeds)
+    check = _delegated("check")
+    with_domains = _delegated("with_domains", makes_system=True)
+    abstract = _delegated("abstract")
+    fold = _delegated("fold")
+    refined = _delegated("refined", makes_system=True)
+    filmed = _delegated("filmed")
+    renewed = _delegated("renewed", makes_system=True)
+    with_backend = _delegated("with_backend", makes_system=True)
+    why_not = _delegated("why_not")
+    passing = _delegated("passing")
+    with_links = _delegated("with_links", makes_system=True)
+    may_draw = _delegated("may_draw")
+    simulate_batch = _delegated("simulate_batch")
+    simulate_each = _delegated("simulate_each")
+    can_fold = property(lambda self: self._offers("fold"))
+    can_refine = property(lambda self: self._offers("refined") and not self.exact_step)
+    can_simulate_batch = property(lambda self: self._offers("simulate_batch"))
+    can_simulate_each = property(lambda self: self._offers("simulate_each"))
 
     def _offers(self, name: str) -> bool:
         return callable(getattr(self.function, name, None))
-
-    def _method(self, name: str) -> Callable[..., Any]:
-        """Return a method of the function's object, or of `System`, which says what is missing."""
-        offered = getattr(self.function, name, None)
-        return offered if callable(offered) else getattr(super(), name)
 
 
 def as_system(thing: object) -> System:

@@ -26,8 +26,8 @@ from verifai_jax.evaluation.confirmations import describe_checks
 from verifai_jax.falsification.no_rate import why_no_rate
 from verifai_jax.falsification.run import Run
 from verifai_jax.falsification.run_folder import RECORD, STATE, replay_command
+from verifai_jax.falsification.segments import TAIL
 from verifai_jax.falsification.table import FINISHED
-from verifai_jax.falsification.tail import TAIL
 from verifai_jax.mtl import parse
 from verifai_jax.mtl.english import formula_words
 

@@ -27,7 +27,7 @@ from typing import IO, TYPE_CHECKING, Any, ParamSpec, TypeVar, cast
 from verifai_jax.core.messages.text import printable
 
 if TYPE_CHECKING:
-    from rich.progress import Progress, Task, TaskID
+    from rich.progress import Progress, Task
     from rich.text import Text
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -72,7 +72,7 @@ class _Stage:
     first: float = 0.0
     counted: float = 0.0
     figures: str = ""
-    task: "TaskID | None" = None
+    task: Any = None
 
     @property
     def amount(self) -> str:
@@ -99,19 +99,15 @@ class ProgressBar:
         self.show = show
         self._display: Progress | None = None
         self._stages: list[_Stage] = []
-        # Stages begin on the bar of the verb that this is a part of, where there is one.
-        self._shared: ProgressBar | None = None
         self._own = 0
+        self._shared = False
         self._over = threading.Event()
 
     def __enter__(self) -> "ProgressBar":
         outer = _ongoing.get()
-        if (
-            outer is not None
-            and self.show is not False
-            and (outer.show is not False or not self.show)
-        ):
-            self._shared = outer
+        if outer and self.show is not False and (outer.show is not False or not self.show):
+            # Stages begin on the bar of the verb that this is a part of.
+            self._display, self._stages, self._shared = outer._display, outer._stages, True
         elif self.show is not False:
             if self.show or has_viewer():
                 self._draw()
@@ -123,7 +119,7 @@ class ProgressBar:
         while self._own:
             self.end()
         self._over.set()
-        if self._display is not None:
+        if self._display is not None and not self._shared:
             self._display.stop()
 
     def _draw(self) -> None:
@@ -160,46 +156,42 @@ class ProgressBar:
     def _write_lines(self) -> None:
         stream = _Stream()
         while not self._over.wait(EVERY):
-            stages = self._stages[-1:]
-            if stages:
-                stream.write(printable(stages[0].line(_compiling())) + "\n")
-                stream.flush()
+            for stage in self._stages[-1:]:
+                write_line(stage.line(_compiling()), stream)
 
     def begin(self, name: str, total: float | None, unit: str) -> None:
         """Begin a stage of `total` units of work, None if unknown; stages may be nested."""
         self._own += 1
-        bar = self._shared or self
         stage = _Stage(name, total, unit, time.perf_counter())
-        if bar._display is not None:
-            if bar._stages and bar._stages[-1].task is not None:
-                bar._display.update(bar._stages[-1].task, visible=False)
-            stage.task = bar._display.add_task(
+        if self._display is not None:
+            self._show_last(False)
+            stage.task = self._display.add_task(
                 name, total=total, amount=stage.amount, figures="", shown=""
             )
-        bar._stages.append(stage)
+        self._stages.append(stage)
 
     def end(self) -> None:
         """End the present stage; the enclosing one continues."""
-        if not self._own:
-            return
-        self._own -= 1
-        bar = self._shared or self
-        stage = bar._stages.pop()
-        if bar._display is not None and stage.task is not None:
-            bar._display.remove_task(stage.task)
-            if bar._stages and bar._stages[-1].task is not None:
-                bar._display.update(bar._stages[-1].task, visible=True)
+        if self._own:
+            self._own -= 1
+            stage = self._stages.pop()
+            if self._display is not None:
+                self._display.remove_task(stage.task)
+                self._show_last(True)
+
+    def _show_last(self, visible: bool) -> None:
+        if self._display is not None and self._stages:
+            self._display.update(self._stages[-1].task, visible=visible)
 
     def advance(self, amount: float, figures: str = "") -> None:
         """Count `amount` more units as done, and show `figures` next to the bar."""
         if self._own:
-            stage = (self._shared or self)._stages[-1]
-            self.update(stage.done + amount, figures=figures)
+            self.set_done(self._stages[-1].done + amount, figures=figures)
 
-    def update(self, done: float, total: float | None = None, figures: str = "") -> None:
+    def set_done(self, done: float, total: float | None = None, figures: str = "") -> None:
         """Set the number of finished units, and their total if it has changed."""
         if self._own:
-            self._set((self._shared or self)._stages[-1], done, total, figures)
+            self._set(self._stages[-1], done, total, figures)
 
     def count(self, amount: float) -> None:
         """Count finished units of the outermost stage, even inside another stage."""
@@ -213,27 +205,24 @@ class ProgressBar:
         if not stage.counted:
             stage.first, stage.counted = done, time.perf_counter()
         stage.total = stage.total if total is None else total
-        display = (self._shared or self)._display
-        if display is not None and stage.task is not None:
-            display.update(
+        if self._display is not None:
+            self._display.update(
                 stage.task, completed=done, total=stage.total, amount=stage.amount, figures=figures
             )
 
     def note(self, text: str) -> None:
         """Write a line above the bar, which remains visible."""
-        display = (self._shared or self)._display
-        if display is not None:
-            display.console.print(f"note: {printable(text)}", markup=False, highlight=False)
+        if self._display is not None:
+            self._display.console.print(f"note: {printable(text)}", markup=False, highlight=False)
 
     @property
     def speed(self) -> float:
         """Units per second in the present stage."""
-        bar = self._shared or self
         if not self._own:
             return 0.0
-        stage = bar._stages[-1]
-        if bar._display is not None:
-            return next((t.speed or 0.0 for t in bar._display.tasks if t.id == stage.task), 0.0)
+        stage = self._stages[-1]
+        if self._display is not None:
+            return next((t.speed or 0.0 for t in self._display.tasks if t.id == stage.task), 0.0)
         return (stage.done - stage.first) / max(time.perf_counter() - stage.counted, 1e-9)
 
 
@@ -298,43 +287,33 @@ def count_done(amount: float) -> None:
 def say_done(done: float, total: float | None = None, figures: str = "") -> None:
     """Set the finished units and the total of the call that shows progress, with figures."""
     if (bar := _ongoing.get()) is not None:
-        bar.update(done, total, figures)
+        bar.set_done(done, total, figures)
 
 
-class SimulationProgress:
+class SimulationProgress(ProgressBar):
     """The bar of a run: simulations per second, least robustness, counterexamples, time left.
 
-    **Arguments:**
-    - `name`: text in front of the bar.
-    - `budget`: simulations in all.
-    - `show`: whether to draw it; None draws if the error stream is a terminal or notebook.
+    **Arguments:** those of `ProgressBar.begin` and `ProgressBar`; `budget` simulations in all.
     """
 
     def __init__(self, name: str, budget: int, show: bool | None = None) -> None:
+        super().__init__(show)
         self.name, self.budget = name, budget
-        self.bar = ProgressBar(show)
 
     def __enter__(self) -> "SimulationProgress":
-        self.bar.__enter__()
-        self.bar.begin(self.name, self.budget, "simulations")
+        super().__enter__()
+        self.begin(self.name, self.budget, "simulations")
         return self
-
-    def __exit__(self, *reason: object) -> None:
-        self.bar.__exit__(*reason)
-
-    def note(self, text: str) -> None:
-        """Write a line above the bar, which remains visible."""
-        self.bar.note(text)
 
     def update(self, simulations: int, counterexamples: int, best: float) -> None:
         """Show the number of simulations and counterexamples, and the least robustness."""
-        figures = f"{self.bar.speed:z,.0f}/s  best {best:z.3g}  {counterexamples} counterexamples"
-        self.bar.update(simulations, figures=figures)
+        figures = f"{self.speed:z,.0f}/s  best {best:z.3g}  {counterexamples} counterexamples"
+        self.set_done(simulations, figures=figures)
 
 
-def write_line(text: str) -> None:
+def write_line(text: str, stream: _Stream | None = None) -> None:
     """Write a line about slow work to the error stream, above the bar if there is one."""
-    stream = _Stream()
+    stream = stream or _Stream()
     stream.write(f"{printable(text)}\n")
     stream.flush()
 

@@ -72,7 +72,7 @@ class Clock:
 
     def show(self, done: float, total: float, figures: str) -> None:
         """Set the number of finished units and their total, which may have changed."""
-        self._bar.update(done, total, figures)
+        self._bar.set_done(done, total, figures)
 
     def count_compilation(self, seconds: float) -> None:
         """Count seconds of the present stage as compilation."""
