@@ -251,8 +251,8 @@ def _noted(rows: Sequence[Row]) -> list[str]:
     """Return each note once, with the requirements and the recordings that it is about."""
     found: dict[str, list[Row]] = {}
     for row in rows:
-        for note in filter(None, row.note.split("; ")):
-            found.setdefault(note, []).append(row)
+        if row.note:
+            found.setdefault(row.note, []).append(row)
     lines = []
     for note, own in list(found.items())[:SHOWN]:
         asked = listed(list(dict.fromkeys(row.requirement for row in own)))

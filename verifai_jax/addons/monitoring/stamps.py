@@ -19,7 +19,7 @@ from verifai_jax.mtl.units import NONE
 
 WORDS = {
     word: seconds
-    for seconds, words in (
+    for seconds, spellings in (
         (Fraction(1, 10**9), "ns nsec nano nanosec nanosecond"),
         (Fraction(1, 10**6), "us µs μs usec micro microsec microsecond"),
         (Fraction(1, 1000), "ms msec milli millisec millisecond"),
@@ -28,7 +28,7 @@ WORDS = {
         (Fraction(3600), "h hr hour"),
         (Fraction(86400), "d day"),
     )
-    for word in words.split()
+    for word in spellings.split()
 }
 """Words for units of time, without the ending of several, and their seconds."""
 CALENDARS = {"utc", "gmt", "unix", "epoch", "posix", "local", "boot", "start", "time", "since"}
