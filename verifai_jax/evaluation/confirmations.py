@@ -356,9 +356,11 @@ class Repetitions:
         lost = (verdict == "fragile") & ~(again < 0)
         moved = lost | (known & came_otherwise(rho, again))
         differs = known & (again != rho)
-        rows = (known | lost, moved, differs & ~moved, lost)
+        seen, others, small, gone = (
+            int(np.sum(each)) for each in (known | lost, moved, differs & ~moved, lost)
+        )
         most = float(np.max(np.abs(rho - again)[differs], initial=0.0))
-        return cls(*(int(np.sum(each)) for each in rows), most)
+        return cls(seen, others, small, gone, most)
 
     def joined(self, other: "Repetitions") -> "Repetitions":
         """Return the sums of both counts."""

@@ -158,7 +158,7 @@ def write_requirements(requirements: Iterable[Requirement], path: str | Path) ->
             partial.write_bytes(reqif_document(entries, FIELDS, path.stem))
         else:
             with open(partial, "w", encoding="utf-8", newline="") as file:
-                writer = csv.DictWriter(file, FIELDS)
+                writer = csv.DictWriter(file, [*map(str, FIELDS)])
                 writer.writeheader()
                 writer.writerows(entries)
     return path

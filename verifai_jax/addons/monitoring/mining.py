@@ -155,7 +155,9 @@ def mine_template(
     values = [HostValues.of(trace, end) for trace in traces]
     satisfied = _Satisfied(template, values, math.ceil(share * len(values) - 1e-9))
     axes = [_axis(template, name, satisfied) for name in template.names]
-    corners = (_one if len(axes) == 1 else _staircase)(*axes, satisfied)
+    corners = (
+        _one(axes[0], satisfied) if len(axes) == 1 else _staircase(axes[0], axes[1], satisfied)
+    )
     front = tuple(dict(zip(template.names, corner, strict=True)) for corner in corners)
     chosen = front[_balanced(corners, axes)]
     formula, count = template.formula(chosen), len(values)

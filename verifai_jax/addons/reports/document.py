@@ -53,7 +53,7 @@ class DesignDomain(Protocol):
         """The files that it was read from, with their hashes."""
         ...
 
-    def coverage(self, run: Any) -> AddedSection:
+    def coverage(self, source: Any) -> AddedSection:
         """Return the part of the domain that a run covers."""
         ...
 

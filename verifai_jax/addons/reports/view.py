@@ -117,7 +117,11 @@ def _column(name: str, values: "pd.Series") -> dict[str, Any] | None:
     if not levels or len(levels) > MAX_CHOICES:
         return None
     codes = {text: i for i, text in enumerate(levels)}
-    return {"name": name, "levels": levels, "values": [codes.get(text) for text in texts]}
+    return {
+        "name": name,
+        "levels": levels,
+        "values": [None if text is None else codes[text] for text in texts],
+    }
 
 
 def numbers_of(values: Any) -> list[float | int | None]:

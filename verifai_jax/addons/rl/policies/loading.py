@@ -132,8 +132,9 @@ def policy(
     if normalise is not None:
         loaded = replace(loaded, normaliser=_normaliser(normalise))
     if stated:
-        ends = (() if v is None else bounds(v, n) for v, n in ((low, "low"), (high, "high")))
-        loaded = replace(loaded, actions=Actions(action or "clip", *ends))
+        lowest = () if low is None else bounds(low, "low")
+        highest = () if high is None else bounds(high, "high")
+        loaded = replace(loaded, actions=Actions(action or "clip", lowest, highest))
     if stack > 1:
         if observation is None:
             raise PolicyError("stack= needs observation=, an example of a single observation")
