@@ -180,7 +180,7 @@ class Rows:
     def _below(
         self, names: Sequence[str], index: Index, lowest: Points, budget: int
     ) -> tuple[Points, bool]:
-        """Search below the lowest severity; return what fails, and whether the last rounds had none."""
+        """Search below the lowest severity; return what fails, and if the last rounds had none."""
         misses = 0
         own = np.concatenate([self.groups[name] for name in names])
         good = lowest[:FOLLOWED]
