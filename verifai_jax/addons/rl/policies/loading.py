@@ -153,8 +153,8 @@ def _of_file(
     if kind not in FORMATS:
         raise PolicyError(f"{path} has to be one of {', '.join(FORMATS)}, or a folder of Brax")
     if (size := path.stat().st_size) > MAX_BYTES:
-        most = f"a policy may have at most {MAX_BYTES / 1e6:z.0f} MB"
-        raise PolicyError(f"{path} has {size / 1e6:z.0f} MB, and {most}")
+        limit = f"a policy may have at most {MAX_BYTES / 1e6:z.0f} MB"
+        raise PolicyError(f"{path} has {size / 1e6:z.0f} MB, and {limit}")
     data = path.read_bytes()
     stored = _stored_graph(data, path)
     weights_alone = kind in (".safetensors", ".pt", ".pth") and stored is None

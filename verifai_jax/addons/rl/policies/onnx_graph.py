@@ -97,8 +97,8 @@ class Graph:
             given = cast(given, TYPES[self.types.get(name, 1)])
             added = len(shape) - given.ndim
             if added < 0:
-                most = f"the network takes observations of rank {len(shape)} at most"
-                raise PolicyError(f"{most}; got shape {list(given.shape)}")
+                limit = f"the network takes observations of rank {len(shape)} at most"
+                raise PolicyError(f"{limit}; got shape {list(given.shape)}")
             values[name] = given.reshape((1,) * added + given.shape)
         values.update(zip(dict(self.memory), memory or (), strict=True))
         run(self.nodes, values)
