@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from typing import Any
 
-from verifai_jax.addons.analysis import OddCoverage
+from verifai_jax.addons.assurance.odd_coverage import OddCoverage
 from verifai_jax.addons.reports.markup import paragraph, table
 from verifai_jax.addons.reports.page import Page, Section, before_limits
 from verifai_jax.addons.reports.run_question import NO_REASON

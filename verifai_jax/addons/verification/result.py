@@ -153,11 +153,10 @@ class Verification(Drawn, Reported, InNotebook):
             whole = weights[inside].sum()
             shares.append(float(weights[rows & inside].sum() / whole) if whole > 0 else 0.0)
         if not self.cut.any():
-            return Part(shares[0], shares[1], shares[0], shares[0])
+            return Part(*shares, shares[0], shares[0])
         half = 1 - (1 - self.confidence) / 2
         (low, high), (lower, upper) = (self._accepted(each, half) for each in (rows, ~rows))
-        least, greatest = low / max(low + upper, TINY), high / max(high + lower, TINY)
-        return Part(shares[0], shares[1], least, greatest)
+        return Part(*shares, low / max(low + upper, TINY), high / max(high + lower, TINY))
 
     @property
     def proved(self) -> Part:

@@ -9,6 +9,7 @@ import hashlib
 import inspect
 import re
 import sys
+import textwrap
 import time
 from collections.abc import Sequence
 from datetime import UTC, datetime
@@ -55,10 +56,10 @@ def qualify(only: Sequence[str] | None = None) -> Qualification:
 def not_exercised(oracles: Sequence[FunctionType]) -> list[str]:
     """Return the public functions that are not named in the text of oracles, as users call them."""
     root = sys.modules["verifai_jax"]
-    names = (*root.__all__, *(f"mtl.{name}" for name in mtl.__all__))
+    names = (*root.__all__, *(f"mtl.{name}" for name in dir(mtl)))
     called: set[str] = set()
     for oracle in oracles:
-        parts = [*ast.walk(ast.parse(inspect.getsource(oracle)))]
+        parts = [*ast.walk(ast.parse(textwrap.dedent(inspect.getsource(oracle))))]
         called |= {part.id for part in parts if isinstance(part, ast.Name)}
         called |= {part.attr for part in parts if isinstance(part, ast.Attribute)}
         # A process that an oracle starts has its program as a text.
