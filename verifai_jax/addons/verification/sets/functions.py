@@ -351,8 +351,8 @@ def angle(y: Form, x: Form) -> Form:
         ends = np.full(ratio.centre.shape, by)
         return add(Form.between(ends, ends, y.dtype), FUNCTIONS["atan"](ratio))
 
-    beside = negative(quotient(x, y))
-    cases = turned(0.0, quotient(y, x)), turned(np.pi / 2, beside), turned(-np.pi / 2, beside)
+    ratio = negative(quotient(x, y))
+    cases = turned(0.0, quotient(y, x)), turned(np.pi / 2, ratio), turned(-np.pi / 2, ratio)
     return _widened(chosen([*masks, rest], [*cases, circle]), UNITS)
 
 
