@@ -129,8 +129,8 @@ def bad_pairs(installed: Mapping[str, str | None]) -> list[str]:
 def _tested(installed: Mapping[str, str | None]) -> list[str]:
     """Say which versions have been tested, and whether those of this process are among them."""
     python = ".".join(platform.python_version_tuple()[:2])
-    versions = (installed[package] or "missing" for package in ("jax", "numpy"))
-    here = Tested(python, *versions, f"{platform.system()} {platform.machine()}")
+    jax, numpy = (installed[package] or "missing" for package in ("jax", "numpy"))
+    here = Tested(python, jax, numpy, f"{platform.system()} {platform.machine()}")
     lines = [f"tested      {each}" for each in TESTED]
     if here not in TESTED:
         lines.append(

@@ -96,7 +96,8 @@ def falsify(
         problem = arguments.load_problem(target, only)
         kept = ("max_seconds", "stop_after", "progress", "keep_going")
         with given_or_next(resume, "runs", "", goes_on), arguments.on_cluster(cluster) as executor:
-            asked = {name: given[name] for name in kept} | {"even_if_changed": even_if_changed}
+            asked: dict[str, Any] = {name: given[name] for name in kept}
+            asked |= {"even_if_changed": even_if_changed}
             asked |= {"budget": budget, "stop_when": stop_when, "executor": executor}
             run = falsification.resume(resume, problem, **asked)
     else:

@@ -104,7 +104,7 @@ def draw(found: Any, path: Path) -> None:
     click.echo(f"  picture      {path}")
 
 
-def as_plain(value: Any) -> Any:
+def as_plain(value: object) -> Any:
     """Convert a value to JSON types: tables to lists of rows, dataclasses to objects.
 
     Fields of a dataclass that are not part of its `repr` and values without a plain form are left
@@ -123,11 +123,12 @@ def as_plain(value: Any) -> Any:
     if is_dataclass(value) and not isinstance(value, type):
         shown = {field.name: getattr(value, field.name) for field in fields(value) if field.repr}
         return {name: as_plain(entry) for name, entry in shown.items() if _has_form(entry)}
-    if hasattr(value, "to_dict"):
+    other: Any = value
+    if hasattr(other, "to_dict"):
         # A table has its rows, and a row its entries.
-        is_table = hasattr(value, "columns")
-        return as_plain(value.reset_index().to_dict("records") if is_table else value.to_dict())
-    return as_plain(value.tolist()) if hasattr(value, "tolist") else str(value)
+        is_table = hasattr(other, "columns")
+        return as_plain(other.reset_index().to_dict("records") if is_table else other.to_dict())
+    return as_plain(other.tolist()) if hasattr(other, "tolist") else str(other)
 
 
 def _has_form(value: object) -> bool:
