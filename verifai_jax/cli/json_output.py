@@ -104,7 +104,7 @@ def draw(found: Any, path: Path) -> None:
     click.echo(f"  picture      {path}")
 
 
-def as_plain(value: Any) -> Any:
+def as_plain(value: object) -> Any:
     """Convert a value to JSON types: tables to lists of rows, dataclasses to objects.
 
     Fields of a dataclass that are not part of its `repr` and values without a plain form are left

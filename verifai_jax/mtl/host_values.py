@@ -192,8 +192,8 @@ class HostValues:
                 sign = -1 if weak else 1
                 return _window(below[0], self.stride, self.stride, sign, top, hold, True)
             case ast.Witness():
-                first, last = self._span(f.interval)
-                return _witness(below[0], below[1], first, last, top, hold, f.side == "back")
+                left, right = below
+                return _witness(left, right, *self._span(f.interval), top, hold, f.side == "back")
             case ast.Derived():
                 return below[0]
         raise missing_case("the value", f)

@@ -155,9 +155,8 @@ def mine_template(
     values = [HostValues.of(trace, end) for trace in traces]
     satisfied = _Satisfied(template, values, math.ceil(share * len(values) - 1e-9))
     axes = [_axis(template, name, satisfied) for name in template.names]
-    corners = (
-        _one(axes[0], satisfied) if len(axes) == 1 else _staircase(axes[0], axes[1], satisfied)
-    )
+    one, *others = axes
+    corners = _staircase(one, others[0], satisfied) if others else _one(one, satisfied)
     front = tuple(dict(zip(template.names, corner, strict=True)) for corner in corners)
     chosen = front[_balanced(corners, axes)]
     formula, count = template.formula(chosen), len(values)

@@ -156,12 +156,8 @@ class Verification(Drawn, Reported, InNotebook):
             return Part(shares[0], shares[1], shares[0], shares[0])
         half = 1 - (1 - self.confidence) / 2
         (low, high), (lower, upper) = (self._accepted(each, half) for each in (rows, ~rows))
-<<<<<<< HEAD
         lowest, highest = low / max(low + upper, TINY), high / max(high + lower, TINY)
         return Part(shares[0], shares[1], lowest, highest)
-=======
-        return Part(*shares, low / max(low + upper, TINY), high / max(high + lower, TINY))
->>>>>>> s2
 
     @property
     def proved(self) -> Part:
