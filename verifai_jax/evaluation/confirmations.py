@@ -357,8 +357,8 @@ class Repetitions:
         moved = lost | (known & came_otherwise(rho, again))
         differs = known & (again != rho)
         rows = (known | lost, moved, differs & ~moved, lost)
-        most = float(np.max(np.abs(rho - again)[differs], initial=0.0))
-        return cls(*(int(np.sum(each)) for each in rows), most)
+        max_difference = float(np.max(np.abs(rho - again)[differs], initial=0.0))
+        return cls(*(int(np.sum(each)) for each in rows), max_difference)
 
     def joined(self, other: "Repetitions") -> "Repetitions":
         """Return the sums of both counts."""
