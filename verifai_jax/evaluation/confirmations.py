@@ -359,8 +359,8 @@ class Repetitions:
         seen, others, small, gone = (
             int(np.sum(each)) for each in (known | lost, moved, differs & ~moved, lost)
         )
-        most = float(np.max(np.abs(rho - again)[differs], initial=0.0))
-        return cls(seen, others, small, gone, most)
+        max_difference = float(np.max(np.abs(rho - again)[differs], initial=0.0))
+        return cls(seen, others, small, gone, max_difference)
 
     def joined(self, other: "Repetitions") -> "Repetitions":
         """Return the sums of both counts."""

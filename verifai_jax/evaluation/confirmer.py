@@ -279,11 +279,10 @@ class Confirmer:
     ) -> dict[str, Verdicts]:
         """Simulate rows again by each check."""
         space = self.problem.space
-        features: dict[str, Any] = {}
+        precisions = dict.fromkeys(replays.precision for replays, _ in self._checks.values())
+        features = {name: space.features_of(rows, name) for name in precisions}
         together: dict[tuple[int, int], list[str]] = {}
         for name, (replays, factor) in self._checks.items():
-            if replays.precision not in features:
-                features[replays.precision] = space.features_of(rows, replays.precision)
             # What one program replays at one step fills its lanes.
             together.setdefault((id(replays), factor), []).append(name)
         for names in together.values():

@@ -120,17 +120,19 @@ class Replays:
             lambda form, *leaves: np.concatenate(leaves).astype(form.dtype), self._form, *each
         )
         numbers = np.tile(numbers, len(each))
-        count = len(numbers)
         engine, parts = self._engine(factor, together), []
         compiled = engine.compile_seconds
-        for start in range(0, count, together):
+        for start in range(0, len(numbers), together):
             block = slice(start, start + together)
             rows = jax.tree.map(lambda leaf, block=block: leaf[block], features)
             try:
                 keys = self._keys(numbers[block], together)
                 parts.append(engine.evaluate(rows, keys, shared=np.int32(factor)))
             except Exception as error:
-                parts.append(_raised(len(numbers[block]), len(self.problem.formulas), error))
+                size = len(numbers[block])
+                rho = np.full((size, len(self.problem.formulas)), np.nan)
+                status, no = np.full(size, Status.ERROR, np.int32), np.zeros(size, bool)
+                parts.append(Verdicts(rho, status, no, messages=[format_error(error)] * size))
             count_done(len(numbers[block]))
         self.compile_seconds += engine.compile_seconds - compiled
         verdicts = Verdicts.concatenate([part._replace(features=None) for part in parts])
@@ -283,16 +285,15 @@ class HostReplays:
         executor, system = self._executor, self.problem.system
         assert executor is not None
         backend = system.backend if system.backends else None
+        how = (backend, self.precision, factor, anew)
         words = np.asarray(jax.random.key_data(self.key))
         step = TOGETHER if system.can_simulate_batch else 1
         futures = []
         for start in range(0, len(numbers), step):
             block = slice(start, start + step)
             leaves = [np.asarray(leaf)[block] for leaf in jax.tree.leaves(features)]
-            how = (backend, self.precision, factor, anew)
-            futures.append(
-                executor.submit(replay_block, self._shipment, how, words, leaves, numbers[block])
-            )
+            given = (self._shipment, how, words, leaves, numbers[block])
+            futures.append(executor.submit(replay_block, *given))
         found: dict[int, Verdicts] = {}
 
         def ended(index: int, result: dict[str, Any]) -> None:
@@ -372,20 +373,10 @@ def replay_block(
     replays = HostReplays(problem, precision, as_key(words))
     with computing:
         [found] = replays.anew(features, numbers) if anew else replays(factor, [features], numbers)
-    parts = ("rho", "status", "violated", "messages")
-    return {name: getattr(found, name) for name in parts}
+    return {name: getattr(found, name) for name in ("rho", "status", "violated", "messages")}
 
 
 @jax.jit
 def _seeds(key: Key[Array, ""], numbers: Int[Array, " n"]) -> Array:
     """Return the seeds of a host system's simulations, as its engine makes them of their keys."""
     return jax.vmap(lambda number: jax.random.bits(simulation_key(key, number)))(numbers)
-
-
-def _raised(count: int, formulas: int, error: Exception) -> Verdicts:
-    return Verdicts(
-        np.full((count, formulas), np.nan),
-        np.full(count, Status.ERROR, np.int32),
-        np.zeros(count, bool),
-        messages=[format_error(error)] * count,
-    )
