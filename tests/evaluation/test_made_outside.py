@@ -103,7 +103,7 @@ def test_blocks_made_outside_serve_both_precisions(system, precision):
     problem.check()
     confirmer = Confirmer(problem, precision)
     confirmer.prepare()
-    assert set(confirmer._checks) >= {"float64", "half_step"}
+    assert set(confirmer._checks) >= {"float64", "third_step"}
     trace = replay(problem, {"v": 0.25, "lag": 0.2}, run_keys(0)[1], 0, precision).trace
     assert trace["x"].dtype == precision
     assert np.all(np.isfinite(trace["x"]))

@@ -108,7 +108,7 @@ def test_a_deterministic_system_is_confirmed_and_costs_little():
     assert steady.count <= 1050
     assert run.verdict_counts["confirmed"] == steady.count - 1000 >= REPEATED
     assert set(run.verdict_counts) == {"confirmed", "unexamined"}
-    assert "unexamined: unchecked, as not replayed" in str(run)
+    assert "unexamined: not claimed, as not replayed" in str(run)
     # The worst of all has been simulated again.
     assert run.best["verdict"] == "confirmed"
 

@@ -254,10 +254,10 @@ def _look_into(things: object, others: dict[str, Source]) -> Iterator[_Module]:
         elif isinstance(value, list | tuple | set | frozenset):
             waiting += [*list(value)[:MAX_ENTRIES], type(value)]
         elif isinstance(value, type):
-            if value.__module__.partition(".")[0] not in (*_OPAQUE, "verifai_jax"):
+            if str(value.__module__).partition(".")[0] not in (*_OPAQUE, "verifai_jax"):
                 waiting += [each for each in vars(value).values() if callable(each)]
                 waiting += value.__bases__
-        elif type(value).__module__.partition(".")[0] in _OPAQUE:
+        elif str(type(value).__module__).partition(".")[0] in _OPAQUE:
             # A compiled function of JAX has the one that it was made of.
             waiting.append(getattr(value, "__wrapped__", None))
         else:

@@ -30,7 +30,7 @@ from verifai_jax.core.messages.checks import check_positive, is_number
 from verifai_jax.core.messages.errors import missing_name, suggests_options
 from verifai_jax.core.values.trace import Trace
 from verifai_jax.core.values.waveform import is_waveform
-from verifai_jax.features import Categorical, Domain
+from verifai_jax.features import Domain
 from verifai_jax.systems.base import Features, System
 from verifai_jax.systems.blackbox._blackbox import blackbox
 from verifai_jax.systems.clock import count_periods
@@ -97,7 +97,7 @@ class FMUSimulation:
         if more or np.shape(leaf)[moving:] != ():
             raise ValueError(f"{what}, which is one number; the feature has {shape or 'several'}")
         domain = self.domains.get(name)
-        real = jnp.issubdtype(leaf.dtype, jnp.floating) and not isinstance(domain, Categorical)
+        real = jnp.issubdtype(leaf.dtype, jnp.floating) and not hasattr(domain, "choices")
         if real and not variable.real:
             raise ValueError(
                 f"{what}, which is of type {variable.type}, by real values: give whole ones, by "
@@ -193,9 +193,10 @@ class FMUSimulation:
     def _value(self, feature: str, course: Callable[[float], Any], time: float) -> Any:
         """Return a feature at a time; of a choice that is no number the choice itself."""
         value, domain = course(time), self.domains.get(feature)
-        if isinstance(value, str) or not isinstance(domain, Categorical) or domain.numeric:
+        choices = getattr(domain, "choices", None)
+        if isinstance(value, str) or choices is None or (domain and domain.numeric):
             return value
-        return domain.choices[int(value)]
+        return choices[int(value)]
 
     def _variable(self, feature: str) -> str | None:
         """Return the variable that a feature sets; None for one that only the controller sees."""
@@ -228,8 +229,8 @@ class FMUSimulation:
 
 def _extremes(domain: Domain | None, listed: bool = False) -> tuple[Any, ...]:
     """Return the choices of a domain, or its ends; with `listed` all whole numbers between them."""
-    if isinstance(domain, Categorical):
-        return domain.choices
+    if (choices := getattr(domain, "choices", None)) is not None:
+        return choices
     low, high = getattr(domain, "low", None), getattr(domain, "high", None)
     if not (is_number(low) and is_number(high)):
         return ()
