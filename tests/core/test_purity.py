@@ -147,6 +147,7 @@ def test_every_door_is_watched():
         problem(still, guide=lambda trace, features: pid(features["a"])).check()
 
 
+@pytest.mark.addons
 def test_a_control_that_is_none_is_said():
     with pytest.raises(ProblemError, match="controller must return the control; it returned None"):
         problem(lambda t, s, f: None).check()
