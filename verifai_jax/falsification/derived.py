@@ -26,7 +26,7 @@ def as_simulated(problem: Problem, record: Mapping[str, Any]) -> Problem:
     if derived is None or problem.system.derived is not None:
         return problem
     try:
-        return extension("verifai_jax.runs", derived["verb"]).derive(problem, derived)
+        return extension("verifai_jax.runs", derived["verb"]).as_recorded(problem, derived)
     except (TypeError, ValueError, AttributeError, KeyError):
         return problem  # What differs is said where the two are compared.
 

@@ -13,7 +13,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 
 from verifai_jax.addons.fuzzing.implicit import with_implicit
-from verifai_jax.addons.fuzzing.run import FuzzRun, as_fuzz_run
+from verifai_jax.addons.fuzzing.run import FuzzRun, as_made
 from verifai_jax.core.display.progress import shows_progress
 from verifai_jax.core.messages.errors import suggests_options
 from verifai_jax.core.values.trace import Trace
@@ -77,4 +77,4 @@ def fuzz(
         precision=precision, backend=backend, confirm=confirm, progress=progress, target=target,
         keep_going=keep_going,
     )  # fmt: skip
-    return as_fuzz_run(run)
+    return as_made(run)

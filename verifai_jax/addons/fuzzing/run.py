@@ -1,18 +1,16 @@
 """The result of fuzzing: a run, what it covered, and the simulations that extended coverage."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from verifai_jax.addons.fuzzing.coverage import FuzzCoverage
-from verifai_jax.addons.fuzzing.implicit import as_recorded
+from verifai_jax.addons.fuzzing.implicit import as_recorded as as_recorded
 from verifai_jax.core.messages.text import printable
 from verifai_jax.falsification.coverage_counts import SEEN
 from verifai_jax.falsification.run import Run
-from verifai_jax.problem.problem import Problem
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -65,25 +63,8 @@ class FuzzRun(Run):
         return self.summary()
 
 
-def as_fuzz_run(run: Run) -> FuzzRun:
+def as_made(run: Run) -> FuzzRun:
     """Return a run of `fuzz` as a `FuzzRun`, with its coverage and its corpus."""
     if isinstance(run, FuzzRun):
         return run
     return FuzzRun(**{field.name: getattr(run, field.name) for field in fields(run)})
-
-
-class Fuzzing:
-    """The functions by which `vj.load` and `vj.resume` make a run of `fuzz`."""
-
-    @staticmethod
-    def derive(problem: Problem, derived: Mapping[str, Any]) -> Problem:
-        """Return the problem with the implicit properties that the record names."""
-        return as_recorded(problem, derived)
-
-    @staticmethod
-    def as_made(run: Run) -> FuzzRun:
-        """Return the run with its coverage and its corpus."""
-        return as_fuzz_run(run)
-
-
-FUZZING = Fuzzing()

@@ -10,7 +10,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from verifai_jax.core.display.extensions import verb
+from verifai_jax.core.display.figure import Reported
 from verifai_jax.core.display.notebook import InNotebook, frame_html
 from verifai_jax.core.messages.text import counted, listed, printable, shorten
 from verifai_jax.core.store.atomic_files import replacing
@@ -50,7 +50,7 @@ class Row(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Judgement(InNotebook):
+class Judgement(Reported, InNotebook):
     """The verdicts of requirements on recordings; `str()` writes the summary.
 
     **Fields:** `requirements`; `rows`, one for each recording and requirement; `inputs`, the files
@@ -198,13 +198,6 @@ class Judgement(InNotebook):
 
     def _notebook_parts(self) -> Iterable[str]:
         yield frame_html(self.quantiles())
-
-    def report(self, path: str | Path) -> Path:
-        """Write the report as one HTML file, and its claims as JSON next to it.
-
-        **Returns:** the path of the HTML file.
-        """
-        return verb("report")(self, path)
 
     def junit(self, path: str | Path) -> Path:
         """Write the verdicts as JUnit XML: a suite for each requirement, a case for each recording.

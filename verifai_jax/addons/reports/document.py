@@ -15,6 +15,7 @@ from verifai_jax.addons.reports.page import Page, write_page
 from verifai_jax.addons.reports.run_question import About
 from verifai_jax.addons.reports.run_report import run_page
 from verifai_jax.addons.reports.sections import with_files
+from verifai_jax.core.display.figure import Reported
 from verifai_jax.core.display.lazy import lazy_import
 from verifai_jax.core.display.progress import shows_progress
 from verifai_jax.core.messages.checks import check_count
@@ -121,7 +122,7 @@ def write_report(
         apart = errors is not None or odd is not None
         words = None if apart else " --assessment" * assessment
         page = run_page(result, about, traces, studies, modes, words)
-    elif hasattr(type(result), "_report"):
+    elif isinstance(result, Reported):
         page = lazy_import(*result._report)(result, about, problem)
     else:
         raise TypeError(

@@ -22,37 +22,34 @@ if TYPE_CHECKING:
 
 @functools.cache
 def _entry_points() -> "dict[str, dict[str, EntryPoint]]":
-    """Return the entry points of all groups of this package, by group and name."""
+    """Return the entry points of this package's groups whose module exists, by group and name."""
     from importlib.metadata import entry_points
 
     found: dict[str, dict[str, EntryPoint]] = {}
     everything = entry_points()
     for group in everything.groups:
         if group.startswith("verifai_jax."):
-            found[group] = {each.name: each for each in everything.select(group=group)}
+            points = everything.select(group=group)
+            found[group] = {each.name: each for each in points if _exists(each.module)}
     return found
 
 
 def extensions(group: str) -> tuple[str, ...]:
     """Return the names of a group's entry points whose module exists; nothing is imported."""
-    found = _entry_points().get(group, {})
-    return tuple(sorted(name for name, each in found.items() if _exists(each.module)))
+    return tuple(sorted(_entry_points().get(group, ())))
 
 
-def extension(group: str, name: str, kind: str | None = None) -> Any:
+def extension(group: str, name: str) -> Any:
     """Import the object that an entry point names.
 
     **Arguments:**
     - `group`: the group of entry points, such as `"verifai_jax.commands"`.
     - `name`: the name of the entry point.
-    - `kind`: the word of the error for such an object; by default the last word of the group.
     **Raises:** `UnknownNameError` for a name that no installed package registers.
     """
     known = _entry_points().get(group, {})
-    if name not in known or not _exists(known[name].module):
-        error = unknown_name(
-            kind or group.split(".")[-1].removesuffix("s"), name, extensions(group)
-        )
+    if name not in known:
+        error = unknown_name(group.split(".")[-1].removesuffix("s"), name, extensions(group))
         error.add_note("It belongs to an add-on that is not installed, or whose files are missing.")
         raise error
     return known[name].load()
