@@ -115,7 +115,7 @@ def distinguishing_features(run: Run) -> list[str]:
     """
     table = run.table.all
     # Items that do not exist have no value, which differs from all other values.
-    varying = [name for name in run.table.features if len(table[[name]].drop_duplicates()) > 1]
+    varying = [name for name in run.table.features if table[name].nunique(dropna=False) > 1]
     numeric = [n for n in varying if np.issubdtype(table[n].to_numpy().dtype, np.number)]
     failing, safe = run.table.counterexamples, run.table.safe
     if len(failing) and len(safe):
@@ -143,7 +143,8 @@ def _visible_size(size: float, count: int) -> float:
 def _distance(a: np.ndarray, b: np.ndarray) -> float:
     if not len(a) or not len(b):
         return 0.0
-    points = np.concatenate([a, b])
+    # In order, so that each search begins near the last one's end, in the processor's cache.
+    points = np.sort(np.concatenate([a, b]))
     below_a = np.searchsorted(np.sort(a), points, side="right") / len(a)
     below_b = np.searchsorted(np.sort(b), points, side="right") / len(b)
     return float(np.max(np.abs(below_a - below_b)))

@@ -48,6 +48,24 @@ def test_a_box_is_found_and_measured_on_other_rows():
     assert "95 % interval" in str(found)
 
 
+def test_of_many_rows_a_sample_makes_the_rules_and_all_kept_aside_measure_them():
+    table = frame(150_000)
+    table["violated"] = (table.x > 0.6) & (table.y <= -0.2)
+    found = rules(table)
+    failing = int(table["violated"].sum())
+    assert found.made == 20_000 + min(20_000, failing - round(0.4 * failing))
+    assert found.measured == pytest.approx(60_000, abs=1)
+    assert f"(made from {found.made:,} of 90,000 rows, measured on 60,000 rows kept" in str(found)
+    by_feature = {c.feature: c for c in found.rules[0].conditions}
+    assert set(by_feature) == {"x", "y"}
+    assert by_feature["x"].above == pytest.approx(0.6, abs=0.002)
+    # Rare failures all take part, so few as they are, and weights keep them rare.
+    table["violated"] &= table.x > 0.997
+    rare = rules(table)
+    assert 20_000 < rare.made < 20_200
+    assert rare.precision is not None and rare.precision.estimate > 0.8
+
+
 def test_unordered_values_and_whole_numbers():
     table = frame()
     table["violated"] = (table.colour == "orange") & (table.lanes == 3)

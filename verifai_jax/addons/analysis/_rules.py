@@ -35,6 +35,8 @@ FEW = 100
 """Failing rows below which their number may be why there is no rule."""
 SUPPORT = 3
 """Failing rows in a rule at least, of those it is made from and of those it is measured on."""
+MAX_MADE = 20_000
+"""Failing rows, and safe rows, that rules are made from; all that are kept aside measure them."""
 WORTH = 1.02
 """By how much a condition must raise the score of a rule."""
 DENSER = 1.25
@@ -87,9 +89,9 @@ class Rules(Drawn, InNotebook):
     """Rules that together describe the failure region of a system, the best one first.
 
     **Fields:** `rules`; `coverage` and `precision` of all of them together, 0 and None without a
-    rule; `unsupported`: number of further boxes that the held-out rows do not support; `measured`:
-    number of held-out rows; `doubt`: why precision is not a failure rate, empty if it is;
-    `samples`: all rows with a verdict.
+    rule; `unsupported`: number of further boxes that the held-out rows do not support; `made`:
+    number of rows that rules are made from; `measured`: number of held-out rows; `doubt`: why
+    precision is not a failure rate, empty if it is; `samples`: all rows with a verdict.
     """
 
     _picture = "verifai_jax.addons.analysis.pictures.panels", "plot_rules"
@@ -98,6 +100,7 @@ class Rules(Drawn, InNotebook):
     coverage: float
     precision: Rate | None
     unsupported: int
+    made: int
     measured: int
     doubt: str
     samples: Samples
@@ -157,6 +160,8 @@ class Rules(Drawn, InNotebook):
     def basis(self) -> str:
         """A description of the rows on which the numbers were measured, and of their meaning."""
         measured = f"measured on {self.measured:,} rows kept aside"
+        if self.made < (others := len(self.samples) - self.measured):
+            measured = f"made from {self.made:,} of {others:,} rows, {measured}"
         if self.doubt:
             return f"({measured}; precision is no rate of failure: {self.doubt})"
         return f"({measured}; precision is the rate of failure inside)"
@@ -207,12 +212,19 @@ def rules(
     check_both(samples, "rules tell failing rows from safe ones")
     doubt = _doubt(source)
     if _too_few(failing):
-        return Rules((), 0.0, None, unsupported=0, measured=0, doubt=doubt, samples=samples)
+        return Rules((), 0.0, None, 0, made=0, measured=0, doubt=doubt, samples=samples)
     aside = rows_set_aside(failing, held_out, seed)
     values, codes = samples.values(), samples.codes()
-    made = ~aside
+    made, weights = _thinned(failing, ~aside, seed)
     regions = _select_regions(
-        values[made], codes[made], failing[made], samples.unordered, depth, cover, max_rules
+        values[made],
+        codes[made],
+        failing[made],
+        weights,
+        samples.unordered,
+        depth,
+        cover,
+        max_rules,
     )
     integer = [column.integer for column in samples.ordered]
     regions = [region.round(values[made], codes[made], integer) for region in regions]
@@ -236,6 +248,7 @@ def rules(
         coverage=coverage,
         precision=precision,
         unsupported=unsupported,
+        made=len(made),
         measured=int(aside.sum()),
         doubt=doubt,
         samples=samples,
@@ -299,35 +312,52 @@ def rows_set_aside(
     return aside
 
 
+def _thinned(
+    failing: Bool[np.ndarray, " n"], among: Bool[np.ndarray, " n"], seed: int
+) -> tuple[Int[np.ndarray, " k"], Float[np.ndarray, " k"]]:
+    """Draw at most `MAX_MADE` failing and safe rows each; return how many each stands for, too."""
+    rows, weights = [], []
+    for part in (np.flatnonzero(failing & among), np.flatnonzero(~failing & among)):
+        kept = part
+        if len(part) > MAX_MADE:
+            kept = np.random.default_rng(seed).choice(part, MAX_MADE, replace=False)
+        rows.append(kept)
+        weights.append(np.full(len(kept), len(part) / max(len(kept), 1)))
+    order = np.argsort(np.concatenate(rows), kind="stable")
+    return np.concatenate(rows)[order], np.concatenate(weights)[order]
+
+
 def _select_regions(
     values: Float[np.ndarray, "n k"],
     codes: Int[np.ndarray, "n m"],
     failing: Bool[np.ndarray, " n"],
+    weights: Float[np.ndarray, " n"],
     unordered: tuple[Column, ...],
     depth: int,
     cover: float,
     max_rules: int,
 ) -> list[Region]:
     """Select regions that together cover the failures, each from what those before left over."""
-    base = failing.mean()
+    bad = failing * weights
+    base = bad.sum() / weights.sum()
     # Denser in failures than everywhere, or half of what is missing to all.
     dense = min(DENSER * base, (1 + base) / 2)
     remaining = np.ones(len(failing), bool)
     found: list[Region] = []
-    while len(found) < max_rules and (failing & remaining).sum() > (1 - cover) * failing.sum():
+    while len(found) < max_rules and bad[remaining].sum() > (1 - cover) * bad.sum():
 
         def score(region: Region, left: Bool[np.ndarray, " n"] = remaining) -> float:
             inside = region.covers(values, codes) & left
-            new = (inside & failing).sum()
-            precision = new / max(inside.sum(), 1)
-            return float(new / (failing & left).sum() * precision**2 * (precision >= dense))
+            new = bad[inside].sum()
+            precision = new / max(weights[inside].sum(), 1)
+            return float(new / bad[left].sum() * precision**2 * (precision >= dense))
 
         # The region of a tree, cut further by trees of what is left inside.
         best, grown = everywhere(values.shape[1], codes.shape[1]), True
         while grown:
             rows = remaining & best.covers(values, codes)
             tried = propose_regions(
-                best, values[rows], codes[rows], failing[rows], unordered, depth
+                best, values[rows], codes[rows], failing[rows], weights[rows], unordered, depth
             )
             tried = [region for region in tried if region.size <= depth]
             finer = max(tried, key=score, default=best)

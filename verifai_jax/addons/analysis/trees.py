@@ -13,8 +13,6 @@ from verifai_jax.addons.analysis.conditions import Region
 from verifai_jax.addons.analysis.data.columns import Column
 
 MAX_ONE_HOT = 30
-MAX_ENTRIES = 500_000
-"""Rows times columns that a tree is made from."""
 
 
 def propose_regions(
@@ -22,12 +20,13 @@ def propose_regions(
     values: Float[np.ndarray, "n k"],
     codes: Int[np.ndarray, "n m"],
     failing: Bool[np.ndarray, " n"],
+    weights: Float[np.ndarray, " n"],
     unordered: tuple[Column, ...],
     depth: int,
 ) -> list[Region]:
     """Propose parts of `start`: all nodes of trees with failing rows weighted evenly or not.
 
-    The rows are those inside `start`.
+    The rows are those inside `start`, and each stands for as many as its weight says.
     """
     if failing.all() or not failing.any():
         return []
@@ -36,14 +35,12 @@ def propose_regions(
     matrix, meanings = _encoded(values, codes, failing, unordered)
     if not matrix.shape[1]:
         return []
-    rows = _limit_rows(failing, int(MAX_ENTRIES // matrix.shape[1]))
-    leaf = int(np.clip(failing[rows].sum() // 10, 1, 5))
+    leaf = int(np.clip(failing.sum() // 10, 1, 5))
     regions: list[Region] = []
-    for weight in (None, "balanced"):
-        tree = DecisionTreeClassifier(
-            max_depth=depth, min_samples_leaf=leaf, class_weight=weight, random_state=0
-        )
-        nodes = tree.fit(matrix[rows], failing[rows]).tree_
+    for even in (False, True):
+        each = np.where(failing, weights[~failing].sum() / weights[failing].sum(), 1.0)
+        tree = DecisionTreeClassifier(max_depth=depth, min_samples_leaf=leaf, random_state=0)
+        nodes = tree.fit(matrix, failing, weights * each if even else weights).tree_
         stack = [(0, start)]
         while stack:
             node, region = stack.pop()
@@ -55,16 +52,6 @@ def propose_regions(
             stack.append((nodes.children_right[node], _part(region, column, edge, upper=True)))
             stack.append((nodes.children_left[node], _part(region, column, edge, upper=False)))
     return regions
-
-
-def _limit_rows(failing: Bool[np.ndarray, " n"], maximum: int) -> Int[np.ndarray, " k"]:
-    """Return rows to make trees from, `maximum` at most; rare verdicts are kept."""
-    if len(failing) <= maximum:
-        return np.arange(len(failing))
-    parts = []
-    for part in (np.flatnonzero(failing), np.flatnonzero(~failing)):
-        parts.append(part[:: max(1, -(-2 * len(part) // maximum))])
-    return np.concatenate(parts)
 
 
 def _encoded(

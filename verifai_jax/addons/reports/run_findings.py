@@ -194,7 +194,7 @@ def explore(run: Run, view: dict, studies: Studies) -> Section:
 def not_claimed_rows(run: Run, maximum: int = 20) -> Iterable[Child]:
     """Write the rows that violate as simulated but that closer replays did not confirm."""
     rows = run.table.unconfirmed.sort_values("rho")
-    for row_number, row in list(rows.to_dict("index").items())[:maximum]:
+    for row_number, row in rows.head(maximum).to_dict("index").items():
         again = float(row.get("rho_again", math.nan))
         then = "" if math.isnan(again) else f", {again:z.4g} when simulated again"
         yield f"row {row_number}: {row.get('verdict', '')}, robustness {row['rho']:z.4g}{then}"

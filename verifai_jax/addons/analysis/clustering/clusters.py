@@ -252,9 +252,11 @@ def _best_count(
     rows = rng.permutation(len(placed[0]))[:_TRIED]
     part = placed[0][rows], placed[1][rows]
     best, reached = 1, MIN_SILHOUETTE
+    # The same rows for each count, so that chance does not decide between them.
+    measured = np.random.default_rng(0).permutation(len(rows))[:_SILHOUETTE_ROWS]
+    between = _between(part, measured)
     for count in range(2, min(max_clusters, len(rows) - 1) + 1):
-        # The same rows for each count, so that chance does not decide between them.
-        score = _silhouette(part, _partition(part, count, rng), np.random.default_rng(0))
+        score = _silhouette_of(between, _partition(part, count, rng)[measured])
         if score > reached:
             best, reached = count, score
     return best
@@ -296,16 +298,24 @@ def _silhouette(
     placed: tuple[np.ndarray, np.ndarray], labels: np.ndarray, rng: np.random.Generator
 ) -> float:
     """Return the silhouette of at most 2000 rows, noise left out; NaN where it is not defined."""
+    rows = rng.permutation(np.flatnonzero(labels >= 0))[:_SILHOUETTE_ROWS]
+    return _silhouette_of(_between(placed, rows), labels[rows]) if len(rows) else np.nan
+
+
+def _between(
+    placed: tuple[np.ndarray, np.ndarray], rows: Int[np.ndarray, " k"]
+) -> Float[np.ndarray, "k k"]:
+    """Return the distances of rows from each other."""
+    part = placed[0][rows], placed[1][rows]
+    return np.stack([distances(part, (one, code)) for one, code in zip(*part, strict=True)])
+
+
+def _silhouette_of(between: Float[np.ndarray, "k k"], labels: Int[np.ndarray, " k"]) -> float:
     from sklearn.metrics import silhouette_score
 
-    rows = np.flatnonzero(labels >= 0)
-    rows = rng.permutation(rows)[:_SILHOUETTE_ROWS]
-    kinds = len(np.unique(labels[rows]))
-    if not 2 <= kinds < len(rows):
+    if not 2 <= len(np.unique(labels)) < len(labels):
         return np.nan
-    part = placed[0][rows], placed[1][rows]
-    between = np.stack([distances(part, (one, code)) for one, code in zip(*part, strict=True)])
-    return float(silhouette_score(between, labels[rows], metric="precomputed"))
+    return float(silhouette_score(between, labels, metric="precomputed"))
 
 
 def _by_size(labels: Int[np.ndarray, " n"]) -> Int[np.ndarray, " n"]:
