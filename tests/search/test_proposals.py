@@ -9,7 +9,8 @@ import pytest
 from scipy import stats
 
 import verifai_jax as vj
-from verifai_jax.search import Grid, Search, named, names
+from verifai_jax.addons.searches.grid import Grid
+from verifai_jax.search import Search, named, names
 from verifai_jax.search.proposals import ConstraintError, Proposals
 from verifai_jax.testing import check_search
 

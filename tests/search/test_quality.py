@@ -12,13 +12,13 @@ import pytest
 from playing import FLAT, MIXED, SEEDS, WIDE, gain, play, played
 
 from benchmarks.landscapes import LANDSCAPES
+from verifai_jax.addons.searches.annealing import Annealing
+from verifai_jax.addons.searches.bandit import Bandit
+from verifai_jax.addons.searches.cmaes import CMAES
+from verifai_jax.addons.searches.epsilon_greedy import EpsilonGreedy
 from verifai_jax.search import (
-    CMAES,
-    Annealing,
-    Bandit,
     CrossEntropy,
     Descent,
-    EpsilonGreedy,
     Gradient,
     Mutation,
     Portfolio,

@@ -10,22 +10,22 @@ import pytest
 from checked_types import unchecked
 
 import verifai_jax as vj
+from verifai_jax.addons.searches.bayes import Bayes
+from verifai_jax.addons.searches.coverage import Coverage
+from verifai_jax.addons.searches.grid import Grid
+from verifai_jax.addons.searches.trace_surrogate import TraceSurrogate
+from verifai_jax.addons.searches.turbo import TuRBO
 from verifai_jax.core.values.cube import Cube
 from verifai_jax.search import (
-    Bayes,
-    Coverage,
     CrossEntropy,
     Diverse,
     Gradient,
-    Grid,
     Halton,
     Observations,
     PointList,
     Portfolio,
     Search,
     Split,
-    TraceSurrogate,
-    TuRBO,
     Uniform,
     Wants,
     Wrapper,

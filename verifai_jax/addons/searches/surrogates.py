@@ -1,12 +1,12 @@
 """A model of the traces of a run, monitored in place of the system: proposals of `TraceSurrogate`.
 
-    surrogate = Surrogate(problem, search.wants.traces, key)
+    surrogate = search.wants.traces.trace_model(problem, key)
     surrogate.learn(u, verdicts)                        # the rows of a round, with their traces
     points = surrogate.improve(points)                  # some of a round's points replaced
 
-Each proposal comes from a simulator drawn from the model's posterior (`search/trace_model.py`):
-many points are monitored on it, and gradient descents on the smooth robustness start from the best,
-all in one batch. If the model is certain of a failure, all proposals go there; otherwise they
+Each proposal comes from a simulator drawn from the model's posterior (`trace_model`): many points
+are monitored on it, and gradient descents on the smooth robustness start from the best, all in one
+batch. If the model is certain of a failure, all proposals go there; otherwise they
 differ according to its uncertainty (Thompson sampling). The real system decides the verdict of
 each.
 """
@@ -19,20 +19,20 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Key
 
+from verifai_jax.addons.searches import trace_model as models
+from verifai_jax.addons.searches.process_data import snap
+from verifai_jax.addons.searches.trace_form import TraceForm, signals_of
+from verifai_jax.addons.searches.trace_model import TraceOptions
 from verifai_jax.core.compute.compilation import Slot
 from verifai_jax.core.values.cube import Cube
 from verifai_jax.core.values.trace import Trace
 from verifai_jax.evaluation.verdicts import Verdicts
-from verifai_jax.falsification.trace_form import TraceForm, signals_of
 from verifai_jax.mtl import hard, smooth
 from verifai_jax.mtl.clauses import goals_of
 from verifai_jax.mtl.evaluate import End
 from verifai_jax.mtl.semantics import Semantics
 from verifai_jax.problem.problem import Problem
-from verifai_jax.search import trace_model as models
-from verifai_jax.search.base import TraceOptions
 from verifai_jax.search.draws import draw_uniform, standard_normal
-from verifai_jax.search.process_data import snap
 
 POOL = 512
 """Points that are monitored on each drawn simulator, before the best ones descend."""

@@ -2,15 +2,19 @@
 
 A simulation has only one robustness, but its trace has thousands of numbers. For slow simulations
 this search learns a model of the traces (`trace_model`), and descends on the robustness of modelled
-traces with gradients. The loop provides the traces and the monitor (`falsification/surrogates.py`);
-without them the search is `TuRBO`. Some points always come from `TuRBO`, in case the model is
-wrong.
+traces with gradients. The loop provides the traces; without them the search is `TuRBO`. Some points
+always come from `TuRBO`, in case the model is wrong.
 """
 
 from dataclasses import dataclass, replace
 
-from verifai_jax.search.base import TraceOptions, Wants
-from verifai_jax.search.turbo import TuRBO, TuRBOState
+from jaxtyping import Array, Key
+
+from verifai_jax.addons.searches.surrogates import Surrogate
+from verifai_jax.addons.searches.trace_model import TraceOptions
+from verifai_jax.addons.searches.turbo import TuRBO, TuRBOState
+from verifai_jax.problem.problem import Problem
+from verifai_jax.search.base import Wants
 from verifai_jax.search.wrapper import Wrapper
 
 MAX_BATCH = 8
@@ -31,6 +35,8 @@ class TraceSurrogate(TraceOptions, Wrapper[TuRBOState]):
     **Raises:** `ValueError` for values out of range.
     """
 
+    _internal = frozenset(("trace_model",))
+
     @property
     def search(self) -> TuRBO:
         """The search that is used without traces."""
@@ -42,5 +48,8 @@ class TraceSurrogate(TraceOptions, Wrapper[TuRBOState]):
 
     @property
     def wants(self) -> Wants:
-        options = TraceOptions(self.initial, self.share, self.capacity, self.starts, self.steps)
-        return replace(self.search.wants, traces=options, max_batch=MAX_BATCH)
+        return replace(self.search.wants, traces=self, max_batch=MAX_BATCH)
+
+    def trace_model(self, problem: Problem, key: Key[Array, ""]) -> Surrogate:
+        """Return a model of the traces of a problem, without rows."""
+        return Surrogate(problem, self, key)

@@ -27,13 +27,9 @@ import numpy as np
 from jax.scipy.special import log_ndtr
 from jaxtyping import Array, Float, Int, Key, UInt32
 
-from verifai_jax.core.values.cube import Cube
-from verifai_jax.search.base import Asked, Observations, Search, Wants, check_options
-from verifai_jax.search.draws import draw_uniform, standard_normal
-from verifai_jax.search.gaussian_process import Posterior, TrainingData
-from verifai_jax.search.halton import halton_points
-from verifai_jax.search.improvement import APART, PARENTS, already_simulated, improving
-from verifai_jax.search.process_data import (
+from verifai_jax.addons.searches.gaussian_process import Posterior, TrainingData
+from verifai_jax.addons.searches.improvement import APART, PARENTS, already_simulated, improving
+from verifai_jax.addons.searches.process_data import (
     LARGEST,
     NO_VERDICT,
     ProcessMemory,
@@ -43,10 +39,14 @@ from verifai_jax.search.process_data import (
     snap,
     training_data,
 )
+from verifai_jax.core.values.cube import Cube
+from verifai_jax.search.base import Asked, Observations, Search, Wants, check_options
+from verifai_jax.search.draws import draw_uniform, standard_normal
+from verifai_jax.search.halton import halton_points
 
 # The numbers without another reason were chosen by hand; no comparison with other values is
 # recorded. With them it is held to 5 times fewer simulations than uniform sampling
-# (tests/search/test_bayes.py).
+# (tests/addons/searches/test_bayes.py).
 MAX_PATHS = 32  # functions drawn for a batch; larger batches take several points from each
 WAVES = 256  # random waves of such a function
 FIT_STEPS = 8

@@ -14,6 +14,7 @@ Karnick, Random feature maps for dot product kernels, AISTATS 2012).
 """
 
 import math
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import jax
@@ -23,7 +24,8 @@ from jax.scipy.linalg import cho_solve
 from jax.scipy.special import ndtri
 from jaxtyping import Array, Bool, Float, Key
 
-from verifai_jax.search.gaussian_process import SMALLEST, adam, finite_factor, matern
+from verifai_jax.addons.searches.gaussian_process import SMALLEST, adam, finite_factor, matern
+from verifai_jax.search.base import check_options
 
 # The numbers without another reason were chosen by hand; no comparison with other values is
 # recorded.
@@ -37,6 +39,29 @@ PARTS = np.array([0.0, 0.0, -2.0, -1.0], np.float32)
 """Prior means of the logarithms of the variances: constant, linear, quadratic, Matern."""
 NOISE = -8.0  # prior mean of the logarithm of the noise's variance
 MIN_NOISE = -10.0  # minimum of it, which keeps 32-bit factors finite
+
+
+@dataclass(frozen=True)
+class TraceOptions:
+    """Options of a model of the traces, and of the descents on it.
+
+    **Arguments:**
+    - `initial`: number of points of the prior before the model proposes any.
+    - `share`: share of the points that the model proposes; the search proposes the others.
+    - `capacity`: maximum number of rows in the model: the best half and the latest ones.
+    - `starts`: number of descents for each proposal; the best one is simulated.
+    - `steps`: number of steps of a descent.
+    **Raises:** `ValueError` for values out of range.
+    """
+
+    initial: int = 8
+    share: float = 0.75
+    capacity: int = 512
+    starts: int = 16
+    steps: int = 40
+
+    def __post_init__(self) -> None:
+        check_options(self, {"initial": 2, "capacity": 16, "starts": 1, "steps": 1}, ["share"])
 
 
 class TraceHyper(NamedTuple):
