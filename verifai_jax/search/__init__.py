@@ -33,12 +33,6 @@ if TYPE_CHECKING:
     from verifai_jax.search.sobol import Sobol as Sobol
     from verifai_jax.search.uniform import Uniform as Uniform
     from verifai_jax.search.wrapper import Wrapper as Wrapper
-# Imported when first used: a run needs few of these searches.
-GROUP = "verifai_jax.searches"
-"""Entry points of the searches of add-ons and of other packages, by name."""
-__getattr__, __dir__, __all__ = attach(
-    __name__, "from_json", "named", "names", "split", "to_json", group=GROUP, classes=True
-)
 _SEARCHES = {
     "uniform": "Uniform",
     "halton": "Halton",
@@ -49,7 +43,13 @@ _SEARCHES = {
     "descent": "Descent",
     "portfolio": "Portfolio",
 }
+GROUP = "verifai_jax.searches"
+"""Entry points of searches of other packages, by name."""
 _WRAPPERS = {"diverse": "Diverse", "likeliest": "Likeliest"}
+# Imported when first used: a run needs few of these searches.
+__getattr__, __dir__, __all__ = attach(
+    __name__, "from_json", "named", "names", "split", "to_json", group=GROUP, classes=True
+)
 
 
 def names() -> tuple[str, ...]:

@@ -92,29 +92,22 @@ def check_options(
 
 
 class TraceModel(Protocol):
-    """A model of the traces of a run, which proposes some of its points."""
+    """A model of the traces of a run, which proposes some of its points.
 
-    def learn(self, u: Float[Any, "n d"], verdicts: Any) -> None:
-        """Learn the rows of a round (`Verdicts`), with their traces."""
+    `learn` gets the rows of a round as `Verdicts`, with their traces; `improve` replaces some of a
+    round's points; what `checkpoint` returns determines the next ones.
+    """
 
-    def improve(self, points: Float[Any, "batch d"]) -> Float[Any, "batch d"]:
-        """Replace the model's share of the proposed points."""
-        ...
-
-    def checkpoint(self) -> dict[str, np.ndarray]:
-        """Return the state that determines the next proposals."""
-        ...
-
-    def restore(self, checkpoint: Mapping[str, Any]) -> None:
-        """Continue from a checkpoint; one without a model gives an empty model."""
+    def learn(self, u: Float[Any, "n d"], verdicts: Any) -> None: ...
+    def improve(self, points: Float[Any, "batch d"]) -> Float[Any, "batch d"]: ...
+    def checkpoint(self) -> dict[str, np.ndarray]: ...
+    def restore(self, checkpoint: Mapping[str, Any]) -> None: ...
 
 
 class ModelsTraces(Protocol):
-    """A search that has a model of the traces, as in `Wants.traces`."""
+    """A search that has a model of the traces; `key` is that of its random numbers."""
 
-    def trace_model(self, problem: Any, key: Key[Array, ""]) -> TraceModel:
-        """Return a model without rows for a problem; its random numbers come from the key."""
-        ...
+    def trace_model(self, problem: Any, key: Key[Array, ""]) -> TraceModel: ...
 
 
 @dataclass(frozen=True)

@@ -41,7 +41,7 @@ from verifai_jax.addons.searches.process_data import (
 )
 from verifai_jax.core.values.cube import Cube
 from verifai_jax.search.base import Asked, Observations, Search, Wants, check_options
-from verifai_jax.search.draws import draw_uniform, standard_normal
+from verifai_jax.search.draws import draw_uniform
 from verifai_jax.search.halton import halton_points
 
 # The numbers without another reason were chosen by hand; no comparison with other values is
@@ -182,7 +182,7 @@ class Bayes(Search[BayesState]):
         first, later = random[:half], random[half:].reshape(2, *steps, width)
         _, best = jax.lax.top_k(-memory.score, PARENTS)
         parent = best[jnp.minimum((first[:, 0] * PARENTS).astype(jnp.int32), PARENTS - 1)]
-        near = _near(memory.u[parent], first, cube, jnp.array([0.5, 0.01]))
+        near = near_others(memory.u[parent], first, cube, jnp.array([0.5, 0.01]))
         shared = jnp.concatenate([anywhere, near])
         if self.acquisition == "thompson":
             chosen = _minima(drawing, posterior, risk, cube, shared, later, paths)[:batch]
@@ -291,7 +291,7 @@ def _minima(
     ) -> tuple:
         best, lowest = carry
         parent = jnp.repeat(best, children, axis=0)
-        u = _near(parent, step[1].reshape(len(parent), -1), cube, step[0])
+        u = near_others(parent, step[1].reshape(len(parent), -1), cube, step[0])
         u = snap(u, cube)
         terms, penalty = basis(u)
         value = jnp.einsum("pcf,fp->pc", terms.reshape(count, each * children, -1), paths.weights)
@@ -305,19 +305,3 @@ def _minima(
     begin = (shared[index.reshape(-1)], -value.reshape(-1))
     (best, _), _ = jax.lax.scan(closer, begin, (jnp.array(CLOSER), random))
     return best
-
-
-def _near(
-    parent: Float[Array, "n d"], random: Float[Array, "n r"], cube: Cube, scales: Float[Array, " 2"]
-) -> Float[Array, "n d"]:
-    """Draw points around others: some coordinates moved by a step between two scales."""
-    d = cube.dim
-    step = scales[0] * (scales[1] / scales[0]) ** random[:, 1:2]
-    # From all coordinates to one on average, and always one.
-    share = float(d) ** -random[:, 2:3]
-    pick, noise = random[:, 3 : 3 + d], random[:, 3 + d :]
-    moves = (pick < share) | (pick == jnp.min(pick, axis=1, keepdims=True))
-    moved = jnp.clip(parent + step * standard_normal(noise), 0.0, 1.0)
-    # An unordered choice has no neighbours: any other.
-    codes = np.array(process_of(cube).unordered)
-    return jnp.where(moves, jnp.where(codes, noise, moved), parent)

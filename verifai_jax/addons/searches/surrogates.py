@@ -20,6 +20,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Key
 
 from verifai_jax.addons.searches import trace_model as models
+from verifai_jax.addons.searches.moves import near_others
 from verifai_jax.addons.searches.process_data import snap
 from verifai_jax.addons.searches.trace_form import TraceForm, signals_of
 from verifai_jax.addons.searches.trace_model import TraceOptions
@@ -32,7 +33,7 @@ from verifai_jax.mtl.clauses import goals_of
 from verifai_jax.mtl.evaluate import End
 from verifai_jax.mtl.semantics import Semantics
 from verifai_jax.problem.problem import Problem
-from verifai_jax.search.draws import draw_uniform, standard_normal
+from verifai_jax.search.draws import draw_uniform
 
 POOL = 512
 """Points that are monitored on each drawn simulator, before the best ones descend."""
@@ -395,11 +396,6 @@ def _pool(
     # Failures lie in corners more often than not.
     fresh = jnp.where(jnp.arange(half)[:, None] % 2 == 0, fresh, jnp.round(fresh))
     rest = random[half:]
-    noise, pick = standard_normal(rest[:, :d]), rest[:, d : 2 * d]
-    share = float(d) ** -rest[:, 2 * d :][:, :1]
-    moves = (pick < share) | (pick == jnp.min(pick, axis=1, keepdims=True))
-    size = 0.5 * 0.05 ** rest[:, 2 * d + 1 :]
-    parent = parents[jnp.arange(half) % PARENTS]
-    codes = np.array([n > 0 and not o for n, o in zip(cube.levels, cube.ordered, strict=True)])
-    moved = jnp.where(codes, rest[:, :d], jnp.clip(parent + size * noise, 0.0, 1.0))
-    return snap(jnp.concatenate([fresh, jnp.where(moves, moved, parent)]), cube)
+    rest = rest[:, np.r_[0, 2 * d + 1, 2 * d, d : 2 * d, :d]]
+    near = near_others(parents[jnp.arange(half) % PARENTS], rest, cube, jnp.array([0.5, 0.025]))
+    return snap(jnp.concatenate([fresh, near]), cube)

@@ -43,16 +43,7 @@ MIN_NOISE = -10.0  # minimum of it, which keeps 32-bit factors finite
 
 @dataclass(frozen=True)
 class TraceOptions:
-    """Options of a model of the traces, and of the descents on it.
-
-    **Arguments:**
-    - `initial`: number of points of the prior before the model proposes any.
-    - `share`: share of the points that the model proposes; the search proposes the others.
-    - `capacity`: maximum number of rows in the model: the best half and the latest ones.
-    - `starts`: number of descents for each proposal; the best one is simulated.
-    - `steps`: number of steps of a descent.
-    **Raises:** `ValueError` for values out of range.
-    """
+    """Options of a model of the traces, and of the descents on it; see `TraceSurrogate`."""
 
     initial: int = 8
     share: float = 0.75
