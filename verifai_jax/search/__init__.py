@@ -94,29 +94,24 @@ def _as_search(search: "str | Search") -> "Search":
 
 def to_json(search: "Search") -> dict[str, Any] | None:
     """Describe a search as plain data; None for one that has no name here."""
-    kind = type(search)
-    if not kind.__module__.startswith(f"{__name__}."):
-        name = entries(GROUP, classes=True).get(kind.__name__)
-        if name is None or extension(GROUP, name) is not kind:
-            return None
-        plain = {field.name: getattr(search, field.name) for field in fields(cast(Any, search))}
-        return {"name": name, "options": plain}
+    kind, ours = type(search), type(search).__module__.startswith(f"{__name__}.")
     # By the name of its class, since comparing with the classes would import all of them.
-    if kind.__name__ == "Split":
+    known = {of: name for name, of in _SEARCHES.items()} if ours else entries(GROUP, classes=True)
+    name = known.get(kind.__name__)
+    if not ours and (name is None or extension(GROUP, name) is not kind):
+        return None
+    if ours and kind.__name__ == "Split":
         splits = cast("Split", search)
         parts = [[name, to_json(part)] for name, part in splits.parts]
         rest = to_json(splits.rest)
         whole = rest is not None and all(part is not None for _, part in parts)
         return {"split": parts, "rest": rest} if whole else None
     options = {f.name: getattr(search, f.name) for f in fields(cast(Any, search))}
-    if kind.__name__ in _WRAPPERS.values():
+    if ours and kind.__name__ in _WRAPPERS.values():
         described: dict[str, Any] = {kind.__name__.lower(): to_json(options.pop("search"))}
         whole = described[kind.__name__.lower()] is not None
         return described | ({"options": options} if options else {}) if whole else None
-    for name, of in _SEARCHES.items():
-        if kind.__name__ == of:
-            return {"name": name, "options": options}
-    return None
+    return None if name is None else {"name": name, "options": options}
 
 
 def from_json(data: Mapping[str, Any]) -> "Search":

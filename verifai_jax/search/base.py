@@ -91,7 +91,7 @@ def check_options(
         check_positive(name, getattr(options, name), finite=True)
 
 
-class TraceModel(Protocol):
+class TraceProposer(Protocol):
     """A model of the traces of a run, which proposes some of its points.
 
     `learn` gets the rows of a round as `Verdicts`, with their traces; `improve` replaces some of a
@@ -107,7 +107,7 @@ class TraceModel(Protocol):
 class ModelsTraces(Protocol):
     """A search that has a model of the traces; `key` is that of its random numbers."""
 
-    def trace_model(self, problem: Any, key: Key[Array, ""]) -> TraceModel: ...
+    def trace_model(self, problem: Any, key: Key[Array, ""]) -> TraceProposer: ...
 
 
 @dataclass(frozen=True)

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 import verifai_jax as vj
-from verifai_jax.addons.searches.surrogates import Surrogate, padded_rows, spread_factor
 from verifai_jax.addons.searches.trace_form import TraceForm
-from verifai_jax.addons.searches.trace_surrogate import TraceSurrogate
+from verifai_jax.addons.searches.trace_model import spread_factor
+from verifai_jax.addons.searches.trace_surrogate import Surrogate, TraceSurrogate, padded_rows
 from verifai_jax.addons.searches.turbo import TuRBO
 from verifai_jax.evaluation.evaluator import Evaluator
 from verifai_jax.evaluation.host_engine import HostEngine

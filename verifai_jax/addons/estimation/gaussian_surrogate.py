@@ -14,12 +14,7 @@ from jaxtyping import Array, Float
 
 from verifai_jax.addons.estimation.answers import Cheap
 from verifai_jax.addons.estimation.normal_space import to_unit_cube
-from verifai_jax.addons.searches.gaussian_process import (
-    GaussianProcess,
-    Hyper,
-    Posterior,
-    TrainingData,
-)
+from verifai_jax.addons.searches.gaussian import GaussianProcess, Hyper, Posterior, TrainingData
 from verifai_jax.core.compute.compilation import power_of_two
 
 REACH = 16.0

@@ -27,8 +27,9 @@ import numpy as np
 from jax.scipy.special import log_ndtr
 from jaxtyping import Array, Float, Int, Key, UInt32
 
-from verifai_jax.addons.searches.gaussian_process import Posterior, TrainingData
+from verifai_jax.addons.searches.gaussian import Posterior, TrainingData
 from verifai_jax.addons.searches.improvement import APART, PARENTS, already_simulated, improving
+from verifai_jax.addons.searches.moves import near_others
 from verifai_jax.addons.searches.process_data import (
     LARGEST,
     NO_VERDICT,

@@ -13,7 +13,7 @@ import numpy as np
 from jax.scipy.special import log_ndtr, ndtr
 from jaxtyping import Array, Bool, Float
 
-from verifai_jax.addons.searches.gaussian_process import Posterior
+from verifai_jax.addons.searches.gaussian import Posterior
 from verifai_jax.addons.searches.process_data import encode, process_of, snap
 from verifai_jax.core.values.cube import Cube
 from verifai_jax.search.curvature import Curvature, advance, begin

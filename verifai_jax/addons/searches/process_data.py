@@ -14,12 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, UInt32
 
-from verifai_jax.addons.searches.gaussian_process import (
-    GaussianProcess,
-    Hyper,
-    Posterior,
-    TrainingData,
-)
+from verifai_jax.addons.searches.gaussian import GaussianProcess, Hyper, Posterior, TrainingData
 from verifai_jax.core.values.cube import Cube
 from verifai_jax.search.base import Observations
 
