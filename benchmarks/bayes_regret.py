@@ -23,8 +23,9 @@ from scipy.linalg import cho_factor, cho_solve
 from scipy.optimize import minimize
 from scipy.stats import norm, qmc
 
+from verifai_jax.addons.searches.bayes import Bayes
 from verifai_jax.core.values.cube import Cube
-from verifai_jax.search import Bayes, Observations
+from verifai_jax.search import Observations
 
 RAISED = 10.0
 

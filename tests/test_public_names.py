@@ -19,6 +19,7 @@ from typing import Any
 
 import pytest
 
+from verifai_jax.core.display.extensions import entries
 from verifai_jax.core.display.extensions import members as members_of_group
 
 TESTS = Path(__file__).parent
@@ -161,6 +162,7 @@ def test_names_and_signatures_are_those_of_the_list():
 def test_completion_shows_public_names_only(room):
     module = getattr(importlib.import_module("verifai_jax"), room)
     added = members_of_group(module.GROUP) if room == "mtl" else {}
+    added |= entries(module.GROUP, classes=True) if room == "search" else {}
     assert sorted(dir(module)) == sorted({*module.__all__, *added})
     for name in dir(module):
         assert not name.startswith("_")

@@ -8,6 +8,8 @@ from pathlib import Path
 
 import pytest
 
+import verifai_jax as vj
+
 ROOT = Path(__file__).parents[1]
 STUBS = {
     "markdown": ("Extension", "Markdown"),
@@ -46,3 +48,12 @@ def test_every_picture_is_where_its_page_looks(pages):
     # The first page is above the folder of the documentation, in which its pictures are.
     first = pages._links('<img src="docs/features.png"> [a](docs/ode.md)', "", "index.md")
     assert first == '<img src="features.png"> [a](ode.md)'
+
+
+@pytest.mark.addons
+def test_searches_of_the_add_on_are_in_the_reference(pages):
+    file, names = pages._rooms()["searches"]
+    assert file.exists()
+    assert "addons.searches.bayes.Bayes" in names
+    assert all(hasattr(vj.search, name.rpartition(".")[2]) for name in names)
+    assert "search.Bayes" not in pages._rooms()["search"][1]

@@ -13,8 +13,9 @@ PROGRAM = """
 import verifai_jax as vj
 
 assert "judge" not in dir(vj.mtl) and "mcp" not in str(vj.search.names())
-for names in (vj, vj.mtl):
-    for name in ("estimate", "judge"):
+assert "bayes" not in vj.search.names() and "Bayes" not in dir(vj.search)
+for names in (vj, vj.mtl, vj.search):
+    for name in ("estimate", "judge", "Bayes"):
         try:
             getattr(names, name)
         except AttributeError as error:

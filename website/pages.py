@@ -9,6 +9,7 @@ import base64
 import json
 import posixpath
 import re
+import tomllib
 from pathlib import Path
 from typing import Any
 
@@ -186,6 +187,10 @@ def _rooms() -> dict[str, tuple[Path, list[str]]]:
     # Names that an add-on gives to another room, by an entry point, stand with the add-on.
     monitoring = package / "addons" / "monitoring" / "__init__.py"
     rooms["monitoring"] = (monitoring, [f"addons.monitoring.{n}" for n in _exported(monitoring)])
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    searches = project["entry-points"]["verifai_jax.searches"].values()
+    names = [each.removeprefix("verifai_jax.").replace(":", ".") for each in searches]
+    rooms["searches"] = (package / "addons" / "searches" / "__init__.py", sorted(names))
     return dict(sorted(rooms.items()))
 
 

@@ -165,7 +165,10 @@ def same(one, other):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("search", ["portfolio", "gradient", "cross_entropy", "bayes"])
+@pytest.mark.parametrize(
+    "search",
+    ["portfolio", "gradient", "cross_entropy", pytest.param("bayes", marks=pytest.mark.addons)],
+)
 def test_a_search_is_the_same_recalled(folder, monkeypatch, search):
     from verifai_jax.search.search_program import compiled_search
 

@@ -89,6 +89,7 @@ def test_where_some_succeed_the_run_goes_on_with_the_same_rows(function):
     assert first.table.all.equals(again.table.all)
 
 
+@pytest.mark.addons
 @pytest.mark.thorough
 def test_a_small_grid_is_simulated_whole():
     grid = vj.search.Grid(points=5)

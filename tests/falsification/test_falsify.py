@@ -57,7 +57,6 @@ def test_the_usual_batch_leaves_a_search_time_to_learn(problem):
     assert batches == [16, 128, 1024]
     assert vj.falsify(problem, "cross_entropy", 1000).batch == 32
     assert vj.falsify(problem, "cross_entropy", 5).batch == 5
-    assert vj.search.Bayes().wants.max_batch == 16
 
 
 @pytest.mark.thorough

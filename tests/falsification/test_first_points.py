@@ -48,7 +48,9 @@ def test_first_points_come_first_and_the_search_goes_on_as_ever():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("search", ["cross_entropy", "coverage", "portfolio"])
+@pytest.mark.parametrize(
+    "search", ["cross_entropy", pytest.param("coverage", marks=pytest.mark.addons), "portfolio"]
+)
 def test_a_search_learns_from_them_and_resuming_keeps_them(search, tmp_path):
     options = {"batch": 8, "first": FIRST, "seed": 3}
     whole = vj.falsify(PROBLEM, search, 40, **options)

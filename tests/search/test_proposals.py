@@ -9,7 +9,7 @@ import pytest
 from scipy import stats
 
 import verifai_jax as vj
-from verifai_jax.search import Grid, Search, named, names
+from verifai_jax.search import Search, named, names
 from verifai_jax.search.proposals import ConstraintError, Proposals
 from verifai_jax.testing import check_search
 
@@ -97,9 +97,11 @@ def test_sequences_do_not_depend_on_the_batch():
         np.testing.assert_array_equal(parts, np.asarray(large.next(32)))
 
 
+@pytest.mark.addons
 @pytest.mark.thorough
 def test_a_grid_ends():
-    proposals = Proposals(Grid(5), SPACE.cube, 16, KEY, SPACE.constraint)
+    grid = named("grid", points=5)
+    proposals = Proposals(grid, SPACE.cube, 16, KEY, SPACE.constraint)
     assert proposals.total == 75
     points = np.concatenate([np.asarray(proposals.next(16)) for _ in range(5)])
     assert proposals.exhausted
@@ -109,13 +111,13 @@ def test_a_grid_ends():
     problem = vj.Problem(
         "grid", SPACE, lambda f, key: vj.Trace({"x": f["x"][None]}, dt=1.0), "x < 2"
     )
-    run = vj.falsify(problem, Grid(5), batch=16)
+    run = vj.falsify(problem, grid, batch=16)
     assert (run.stopped, run.simulations) == ("exhausted", 20)
     assert run.acceptance == pytest.approx(20 / 75)
     assert "let through 26.7 % of all proposals" in run.summary()
     assert vj.resume(run, budget=500).simulations == 20
     assert not any("cut short" in note for note in run.notes)
-    part = vj.falsify(problem, Grid(5), budget=8, batch=16)
+    part = vj.falsify(problem, grid, budget=8, batch=16)
     note = "grid cut short: 8 of its 75 points were simulated (11 %), in a random order over the"
     assert any(each.startswith(note) for each in part.notes)
     assert not any("cut short" in each for each in vj.resume(part, budget=75).notes)

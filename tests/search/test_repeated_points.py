@@ -113,6 +113,7 @@ def test_resumed_it_remembers_the_points_of_the_process_before(tmp_path):
     np.testing.assert_array_equal(whole["x0"], resumed["x0"])
 
 
+@pytest.mark.addons
 @pytest.mark.slow
 @pytest.mark.parametrize("search", ["bayes", "turbo"])
 def test_a_half_without_verdicts_is_left_alone(search):

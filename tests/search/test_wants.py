@@ -12,20 +12,15 @@ from checked_types import unchecked
 import verifai_jax as vj
 from verifai_jax.core.values.cube import Cube
 from verifai_jax.search import (
-    Bayes,
-    Coverage,
     CrossEntropy,
     Diverse,
     Gradient,
-    Grid,
     Halton,
     Observations,
     PointList,
     Portfolio,
     Search,
     Split,
-    TraceSurrogate,
-    TuRBO,
     Uniform,
     Wants,
     Wrapper,
@@ -102,8 +97,9 @@ def test_observations_have_what_is_wanted():
     assert Wants(coverage_ids=True).form(CUBE, 4, 2).coverage_ids.shape == (4, 2)
 
 
+@pytest.mark.addons
 def test_two_searches_want_what_either_does_in_the_smaller_rounds():
-    both = Coverage().wants | Bayes().wants
+    both = named("coverage").wants | named("bayes").wants
     assert both == Wants(coverage_ids=True, no_verdict_rows=True, max_batch=16)
 
 
@@ -141,7 +137,6 @@ def test_what_takes_the_place_of_a_search():
     assert Portfolio().fallback == without
     assert without.fallback is None
     assert Gradient().fallback is None
-    assert TraceSurrogate(initial=5).fallback == TuRBO(initial=5)
     assert Diverse(Portfolio()).fallback == Diverse(without)
     assert Split({"x": Portfolio()}, Halton()).fallback == Split({"x": without}, Halton())
     assert Split({"x": Gradient()}, Portfolio()).fallback is None
@@ -153,7 +148,12 @@ def test_what_takes_the_place_of_a_search():
 
 def test_a_wrapper_of_given_points_is_one_of_given_points():
     assert Rounded(PointList([[0.5, 0.5]])).origin == "given"
-    assert Rounded(Grid(3)).sequence[0] == "grid"
+
+
+@pytest.mark.addons
+def test_searches_of_add_ons_have_a_fallback_and_words_of_their_own():
+    assert named("trace_surrogate", initial=5).fallback == named("turbo", initial=5)
+    assert Rounded(named("grid", points=3)).sequence[0] == "grid"
 
 
 def test_a_wrapper_that_moves_points_has_none_of_the_prior():

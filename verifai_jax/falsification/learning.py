@@ -7,7 +7,7 @@
 
 A search minimises the robustness of the worst formula or, for formulas with a priority, the number
 of `problem.rulebook.Objective`; a guide adds its term. Some searches also need coverage ids,
-traces, or a model of the traces (`Surrogate`).
+traces, or a model of the traces (`TraceProposer`).
 """
 
 from collections.abc import Mapping
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
     from verifai_jax.falsification.coverage_counts import CoverageCounts
     from verifai_jax.falsification.likelihood import Likelihood
-    from verifai_jax.falsification.surrogates import Surrogate
+    from verifai_jax.search.base import TraceProposer
 MAX_WARM = 2048
 """Rows of an earlier table that a search starts with at most, the worst ones: a bound on what the
 first `tell` costs, whatever the length of that table."""
@@ -76,7 +76,7 @@ class Learning:
             from verifai_jax.falsification import coverage_counts
 
             self.coverage_ids = coverage_counts.CoverageCounts(problem)
-        self.surrogate: Surrogate | None = None
+        self.surrogate: TraceProposer | None = None
         self._objective: Objective | None = None
         self._likelihood: Likelihood | None = None
         if search.wants.likelihood:
@@ -92,9 +92,7 @@ class Learning:
         """Use this search from now on."""
         self.search = search
         if search.wants.traces is not None:
-            from verifai_jax.falsification.surrogates import Surrogate
-
-            self.surrogate = Surrogate(self.problem, search.wants.traces, self._key)
+            self.surrogate = search.wants.traces.trace_model(self.problem, self._key)
 
     @property
     def coverage_id_count(self) -> int:

@@ -296,12 +296,14 @@ def slow_search(problem: Problem, seconds: float) -> tuple[Search, str] | None:
     if seconds < SLOW:
         return None
     if _why_no_traces(problem, None) is None:
-        search, name = searches.TraceSurrogate(), "trace_surrogate"
-    elif problem.space.dim > FEW_DIMENSIONS:
-        search, name = searches.TuRBO(), "turbo"
+        name = "trace_surrogate"
     else:
-        search, name = searches.Bayes(), "bayes"
-    return search, f"search {name}: a simulation takes {seconds:z.2g} s; search= sets another"
+        name = "turbo" if problem.space.dim > FEW_DIMENSIONS else "bayes"
+    why = f"a simulation takes {seconds:z.2g} s"
+    if name in searches.names():
+        return searches.named(name), f"search {name}: {why}; search= sets another"
+    note = f"search portfolio: {why}, but {name}, which needs fewer of them, is not installed"
+    return searches.Portfolio(gradients=False), note
 
 
 def check_rule(search: Search, rule: "StoppingRule | None") -> None:

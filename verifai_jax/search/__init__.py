@@ -9,58 +9,36 @@ from collections.abc import Mapping
 from dataclasses import fields
 from typing import TYPE_CHECKING, Any, cast
 
-from verifai_jax.core.display.extensions import extension, extensions
+from verifai_jax.core.display.extensions import entries, extension, extensions
 from verifai_jax.core.display.lazy import attach, lazy_import
 from verifai_jax.core.messages.errors import check_names, unknown_name
 
 if TYPE_CHECKING:
     from verifai_jax.core.values.cube import Cube as Cube
     from verifai_jax.search._split import Split as Split
-    from verifai_jax.search.annealing import Annealing as Annealing
-    from verifai_jax.search.bandit import Bandit as Bandit
     from verifai_jax.search.base import Observations as Observations
     from verifai_jax.search.base import Plan as Plan
     from verifai_jax.search.base import Search as Search
     from verifai_jax.search.base import Wants as Wants
-    from verifai_jax.search.bayes import Bayes as Bayes
-    from verifai_jax.search.ce_compat import CECompat as CECompat
-    from verifai_jax.search.cmaes import CMAES as CMAES
-    from verifai_jax.search.coverage import Coverage as Coverage
     from verifai_jax.search.cross_entropy import CrossEntropy as CrossEntropy
     from verifai_jax.search.descent import Descent as Descent
     from verifai_jax.search.diverse import Diverse as Diverse
     from verifai_jax.search.diverse import distinct as distinct
-    from verifai_jax.search.epsilon_greedy import EpsilonGreedy as EpsilonGreedy
     from verifai_jax.search.gradient import Gradient as Gradient
-    from verifai_jax.search.grid import Grid as Grid
     from verifai_jax.search.halton import Halton as Halton
     from verifai_jax.search.likeliest import Likeliest as Likeliest
     from verifai_jax.search.mutation import Mutation as Mutation
     from verifai_jax.search.point_list import PointList as PointList
     from verifai_jax.search.portfolio import Portfolio as Portfolio
     from verifai_jax.search.sobol import Sobol as Sobol
-    from verifai_jax.search.trace_surrogate import TraceSurrogate as TraceSurrogate
-    from verifai_jax.search.turbo import TuRBO as TuRBO
     from verifai_jax.search.uniform import Uniform as Uniform
     from verifai_jax.search.wrapper import Wrapper as Wrapper
-# Imported when first used: a run needs few of these searches.
-__getattr__, __dir__, __all__ = attach(__name__, "from_json", "named", "names", "split", "to_json")
 _SEARCHES = {
     "uniform": "Uniform",
     "halton": "Halton",
     "sobol": "Sobol",
-    "grid": "Grid",
-    "annealing": "Annealing",
     "cross_entropy": "CrossEntropy",
-    "ce_compat": "CECompat",
-    "bandit": "Bandit",
-    "epsilon_greedy": "EpsilonGreedy",
-    "bayes": "Bayes",
-    "turbo": "TuRBO",
-    "trace_surrogate": "TraceSurrogate",
-    "cmaes": "CMAES",
     "mutation": "Mutation",
-    "coverage": "Coverage",
     "gradient": "Gradient",
     "descent": "Descent",
     "portfolio": "Portfolio",
@@ -68,6 +46,10 @@ _SEARCHES = {
 GROUP = "verifai_jax.searches"
 """Entry points of searches of other packages, by name."""
 _WRAPPERS = {"diverse": "Diverse", "likeliest": "Likeliest"}
+# Imported when first used: a run needs few of these searches.
+__getattr__, __dir__, __all__ = attach(
+    __name__, "from_json", "named", "names", "split", "to_json", group=GROUP, classes=True
+)
 
 
 def names() -> tuple[str, ...]:
@@ -112,29 +94,24 @@ def _as_search(search: "str | Search") -> "Search":
 
 def to_json(search: "Search") -> dict[str, Any] | None:
     """Describe a search as plain data; None for one that has no name here."""
-    kind = type(search)
-    if not kind.__module__.startswith(f"{__name__}."):
-        of_others = {extension(GROUP, name): name for name in extensions(GROUP)}
-        if kind not in of_others:
-            return None
-        plain = {field.name: getattr(search, field.name) for field in fields(cast(Any, search))}
-        return {"name": of_others[kind], "options": plain}
+    kind, ours = type(search), type(search).__module__.startswith(f"{__name__}.")
     # By the name of its class, since comparing with the classes would import all of them.
-    if kind.__name__ == "Split":
+    known = {of: name for name, of in _SEARCHES.items()} if ours else entries(GROUP, classes=True)
+    name = known.get(kind.__name__)
+    if not ours and (name is None or extension(GROUP, name) is not kind):
+        return None
+    if ours and kind.__name__ == "Split":
         splits = cast("Split", search)
         parts = [[name, to_json(part)] for name, part in splits.parts]
         rest = to_json(splits.rest)
         whole = rest is not None and all(part is not None for _, part in parts)
         return {"split": parts, "rest": rest} if whole else None
     options = {f.name: getattr(search, f.name) for f in fields(cast(Any, search))}
-    if kind.__name__ in _WRAPPERS.values():
+    if ours and kind.__name__ in _WRAPPERS.values():
         described: dict[str, Any] = {kind.__name__.lower(): to_json(options.pop("search"))}
         whole = described[kind.__name__.lower()] is not None
         return described | ({"options": options} if options else {}) if whole else None
-    for name, of in _SEARCHES.items():
-        if kind.__name__ == of:
-            return {"name": name, "options": options}
-    return None
+    return None if name is None else {"name": name, "options": options}
 
 
 def from_json(data: Mapping[str, Any]) -> "Search":

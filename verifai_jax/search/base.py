@@ -11,10 +11,11 @@ pytree, so that it can be jitted, scanned, saved and resumed. It knows nothing o
 import abc
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
-from typing import Any, Generic, Literal, NamedTuple, TypeAlias, TypeVar
+from typing import Any, Generic, Literal, NamedTuple, Protocol, TypeAlias, TypeVar
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.typing import DTypeLike
 from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
@@ -90,27 +91,23 @@ def check_options(
         check_positive(name, getattr(options, name), finite=True)
 
 
-@dataclass(frozen=True)
-class TraceOptions:
-    """Options of a model of the traces, which the loop fits for a search and descends on.
+class TraceProposer(Protocol):
+    """A model of the traces of a run, which proposes some of its points.
 
-    **Arguments:**
-    - `initial`: number of points of the prior before the model proposes any.
-    - `share`: share of the points that the model proposes; the search proposes the others.
-    - `capacity`: maximum number of rows in the model: the best half and the latest ones.
-    - `starts`: number of descents for each proposal; the best one is simulated.
-    - `steps`: number of steps of a descent.
-    **Raises:** `ValueError` for values out of range.
+    `learn` gets the rows of a round as `Verdicts`, with their traces; `improve` replaces some of a
+    round's points; what `checkpoint` returns determines the next ones.
     """
 
-    initial: int = 8
-    share: float = 0.75
-    capacity: int = 512
-    starts: int = 16
-    steps: int = 40
+    def learn(self, u: Float[Any, "n d"], verdicts: Any) -> None: ...
+    def improve(self, points: Float[Any, "batch d"]) -> Float[Any, "batch d"]: ...
+    def checkpoint(self) -> dict[str, np.ndarray]: ...
+    def restore(self, checkpoint: Mapping[str, Any]) -> None: ...
 
-    def __post_init__(self) -> None:
-        check_options(self, {"initial": 2, "capacity": 16, "starts": 1, "steps": 1}, ["share"])
+
+class ModelsTraces(Protocol):
+    """A search that has a model of the traces; `key` is that of its random numbers."""
+
+    def trace_model(self, problem: Any, key: Key[Array, ""]) -> TraceProposer: ...
 
 
 @dataclass(frozen=True)
@@ -125,7 +122,7 @@ class Wants:
     - `outcomes`: `Observations.outcomes`.
     - `no_verdict_rows`: whether simulations without a verdict are valid rows with robustness NaN,
       so that a model of the robustness learns to avoid them.
-    - `traces`: options of a model of the traces that proposes some of the points; None without one.
+    - `traces`: what makes a model of the traces that proposes some of the points; None without one.
     - `likelihood`: whether the objective prefers likely failures, instead of the robustness.
     - `max_batch`: size of a round beyond which more rounds are better than larger ones. At the
       default size compiled simulators run at three quarters of their maximum speed or more
@@ -138,7 +135,7 @@ class Wants:
     coverage_ids: bool = False
     outcomes: bool = False
     no_verdict_rows: bool = False
-    traces: TraceOptions | None = None
+    traces: ModelsTraces | None = None
     likelihood: bool = False
     max_batch: int = 1024
 

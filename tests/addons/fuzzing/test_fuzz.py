@@ -11,9 +11,9 @@ from checked_types import unchecked
 
 import verifai_jax as vj
 from verifai_jax.addons.fuzzing.implicit import with_implicit
+from verifai_jax.addons.searches.coverage import Coverage
 from verifai_jax.falsification.derived import as_simulated
 from verifai_jax.problem.behaviour import Behaviour
-from verifai_jax.search import Coverage
 
 TRAFFIC = vj.events.Automaton(
     "free",

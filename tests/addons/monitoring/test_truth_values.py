@@ -6,8 +6,8 @@ import pandas as pd
 import pytest
 
 from verifai_jax import mtl
+from verifai_jax.addons.searches.trace_form import TraceForm, signals_of
 from verifai_jax.core.values.trace import Trace
-from verifai_jax.falsification.trace_form import TraceForm, signals_of
 
 OFF, ON = np.zeros(4, bool), np.ones(4, bool)
 PULSE = np.array([False, True, True, False])

@@ -14,8 +14,8 @@ from jaxtyping import Array, Float
 
 from verifai_jax.addons.estimation.answers import Cheap
 from verifai_jax.addons.estimation.normal_space import to_unit_cube
+from verifai_jax.addons.searches.gaussian import GaussianProcess, Hyper, Posterior, TrainingData
 from verifai_jax.core.compute.compilation import power_of_two
-from verifai_jax.search.gaussian_process import GaussianProcess, Hyper, Posterior, TrainingData
 
 REACH = 16.0
 """Width of the box of normal space that is the cube of the Gaussian process."""

@@ -14,13 +14,14 @@ from pathlib import Path
 
 from verifai_jax.addons.fuzzing.implicit import with_implicit
 from verifai_jax.addons.fuzzing.run import FuzzRun, as_made
+from verifai_jax.addons.searches.coverage import Coverage
 from verifai_jax.core.display.progress import shows_progress
 from verifai_jax.core.messages.errors import suggests_options
 from verifai_jax.core.values.trace import Trace
 from verifai_jax.falsification import falsify
 from verifai_jax.features import Domain, FeatureSpace
 from verifai_jax.problem.problem import Problem
-from verifai_jax.search import Coverage, Search
+from verifai_jax.search import Search
 
 
 @suggests_options

@@ -39,6 +39,12 @@ def extensions(group: str) -> tuple[str, ...]:
     return tuple(sorted(_entry_points().get(group, ())))
 
 
+def entries(group: str, classes: bool) -> dict[str, str]:
+    """Return the names of a group's entries, or of their classes, with the entry of each."""
+    points = _entry_points().get(group, {})
+    return {point.attr if classes else name: name for name, point in points.items()}
+
+
 def extension(group: str, name: str) -> Any:
     """Import the object that an entry point names.
 

@@ -21,7 +21,7 @@ def lazy_import(module: str, name: str) -> Any:
 
 
 def attach(
-    package: str, *others: str, group: str | None = None
+    package: str, *others: str, group: str | None = None, classes: bool = False
 ) -> tuple[Callable[[str], Any], Callable[[], list[str]], list[str]]:
     """Return `__getattr__`, `__dir__` and `__all__` of a package whose names are imported lazily.
 
@@ -32,6 +32,7 @@ def attach(
     - `package`: the name of the package that is being imported.
     - `others`: further names that it already has.
     - `group`: a group of entry points by which other packages add names; see `extensions`.
+    - `classes`: whether these are the names of the classes, instead of those of the entries.
     """
     source = sys.modules[package].__loader__.get_source(package)  # pyright: ignore
     begin = source.index("if TYPE_CHECKING:")
@@ -41,15 +42,21 @@ def attach(
     }
     known = [*others, *module_of]
 
+    def added() -> dict[str, str]:
+        from verifai_jax.core.display.extensions import entries
+
+        return {} if group is None else entries(group, classes)
+
     def get(name: str) -> Any:
         if name not in module_of:
-            from verifai_jax.core.display.extensions import extension, extensions
+            from verifai_jax.core.display.extensions import extension
             from verifai_jax.core.messages.errors import nearest_names
 
-            if group is not None and not name.startswith("_") and name in extensions(group):
-                return extension(group, name)
-
-            raise AttributeError(f"{package} has no {name!r}{nearest_names(name, known)}")
+            found = {} if name.startswith("_") else added()
+            if name not in found:
+                near = nearest_names(name, [*known, *found])
+                raise AttributeError(f"{package} has no {name!r}{near}")
+            return extension(str(group), found[name])
         module = module_of[name]
         if module == package:
             value = importlib.import_module(f"{package}.{name}")
@@ -65,4 +72,4 @@ def attach(
         setattr(sys.modules[package], name, value)
         return value
 
-    return get, lambda: sorted(known), known
+    return get, lambda: sorted({*known, *added()}), known

@@ -1,17 +1,17 @@
-"""A model of the traces of a run, monitored in place of the system: proposals of `TraceSurrogate`.
+"""Search on a model of the traces, for simulators that take seconds.
 
-    surrogate = Surrogate(problem, search.wants.traces, key)
-    surrogate.learn(u, verdicts)                        # the rows of a round, with their traces
-    points = surrogate.improve(points)                  # some of a round's points replaced
-
-Each proposal comes from a simulator drawn from the model's posterior (`search/trace_model.py`):
-many points are monitored on it, and gradient descents on the smooth robustness start from the best,
-all in one batch. If the model is certain of a failure, all proposals go there; otherwise they
-differ according to its uncertainty (Thompson sampling). The real system decides the verdict of
-each.
+A simulation has only one robustness, but its trace has thousands of numbers. For slow simulations
+this search learns a model of the traces (`trace_model`), and monitors it in place of the system.
+Each proposal comes from a simulator drawn from the model's posterior: many points are monitored on
+it, and gradient descents on the smooth robustness start from the best, all in one batch. If the
+model is certain of a failure, all proposals go there; otherwise they differ according to its
+uncertainty (Thompson sampling). The real system decides the verdict of each. The loop provides the
+traces; without them the search is `TuRBO`. Some points always come from `TuRBO`, in case the model
+is wrong.
 """
 
 from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from typing import Any
 
 import jax
@@ -19,20 +19,23 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Key
 
+from verifai_jax.addons.searches import trace_model as models
+from verifai_jax.addons.searches.moves import near_others
+from verifai_jax.addons.searches.process_data import snap
+from verifai_jax.addons.searches.trace_form import TraceForm, signals_of
+from verifai_jax.addons.searches.turbo import TuRBO, TuRBOState
 from verifai_jax.core.compute.compilation import Slot
 from verifai_jax.core.values.cube import Cube
 from verifai_jax.core.values.trace import Trace
 from verifai_jax.evaluation.verdicts import Verdicts
-from verifai_jax.falsification.trace_form import TraceForm, signals_of
 from verifai_jax.mtl import hard, smooth
 from verifai_jax.mtl.clauses import goals_of
 from verifai_jax.mtl.evaluate import End
 from verifai_jax.mtl.semantics import Semantics
 from verifai_jax.problem.problem import Problem
-from verifai_jax.search import trace_model as models
-from verifai_jax.search.base import TraceOptions
-from verifai_jax.search.draws import draw_uniform, standard_normal
-from verifai_jax.search.process_data import snap
+from verifai_jax.search.base import Wants, check_options
+from verifai_jax.search.draws import draw_uniform
+from verifai_jax.search.wrapper import Wrapper
 
 POOL = 512
 """Points that are monitored on each drawn simulator, before the best ones descend."""
@@ -49,17 +52,53 @@ TEMPERATURES = (0.3, 0.02)
 MEANS = 6
 """Of so many proposals one is the model's own guess, the mean of its posterior; where all are, a
 model that is wrong is not left."""
-PATIENCE = 8
-"""Rows for each dimension without progress, before any failure, from which on the model is believed
-less."""
-PROGRESS = 0.9
-"""A row is progress if its robustness is below this share of the least so far."""
-MAX_SPREAD = 5.0
-"""Maximum factor on the standard deviations of the model."""
-SPREADS = 4
-"""Number of factors, from one to the maximum, used in turn."""
 APART = 1e-3
 """Distance in the maximum norm below which two points count as the same."""
+MAX_BATCH = 8
+"""Points in a round by default: in rounds of eight it was compared with other searches
+(`benchmarks/RESULTS.md`, "Slow black boxes")."""
+
+
+@dataclass(frozen=True)
+class TraceSurrogate(Wrapper[TuRBOState]):
+    """A model of the traces on which searches descend; real simulations decide.
+
+    **Arguments:**
+    - `initial`: number of points of the prior before the model proposes any.
+    - `share`: share of the points that the model proposes; `TuRBO` proposes the others.
+    - `capacity`: maximum number of rows in the model: the best half and the latest ones.
+    - `starts`: number of descents for each proposal; the best one is simulated.
+    - `steps`: number of steps of a descent.
+    **Raises:** `ValueError` for values out of range.
+    """
+
+    initial: int = 8
+    share: float = 0.75
+    capacity: int = 512
+    starts: int = 16
+    steps: int = 40
+
+    _internal = frozenset(("trace_model",))
+
+    def __post_init__(self) -> None:
+        check_options(self, {"initial": 2, "capacity": 16, "starts": 1, "steps": 1}, ["share"])
+
+    @property
+    def search(self) -> TuRBO:
+        """The search that is used without traces."""
+        return TuRBO(initial=self.initial, capacity=self.capacity)
+
+    @property
+    def fallback(self) -> TuRBO:
+        return self.search
+
+    @property
+    def wants(self) -> Wants:
+        return replace(self.search.wants, traces=self, max_batch=MAX_BATCH)
+
+    def trace_model(self, problem: Problem, key: Key[Array, ""]) -> "Surrogate":
+        """Return a model of the traces of a problem, without rows."""
+        return Surrogate(problem, self, key)
 
 
 class Surrogate:
@@ -71,7 +110,7 @@ class Surrogate:
     - `key`: the key of its random numbers.
     """
 
-    def __init__(self, problem: Problem, options: TraceOptions, key: Key[Array, ""]) -> None:
+    def __init__(self, problem: Problem, options: TraceSurrogate, key: Key[Array, ""]) -> None:
         self.problem, self.options = problem, options
         self.cube = problem.space.cube
         self.key = jax.random.fold_in(key, 0x7ACE)
@@ -80,7 +119,7 @@ class Surrogate:
         self.traces = np.zeros((0, 0), np.float32)
         self.rho = np.zeros(0, np.float32)
         self.round = self.fitted = 0
-        self.hyper = models.first_hyper(_width(self.cube))
+        self.hyper = models.first_hyper(models.width_of(self.cube))
         self._programs = problem.programs.get(DESCENTS, options, lambda: Descents(problem, options))
 
     def learn(self, u: Float[Any, "n d"], verdicts: Verdicts) -> None:
@@ -210,7 +249,7 @@ class Surrogate:
             self.fitted = len(self.rho)
         parents = np.resize(self._parents(), (PARENTS, self.cube.dim))
         key = jax.random.fold_in(self.key, np.uint32(self.round))
-        spread = np.float32(spread_factor(self.rho, self.round, self.cube.dim))
+        spread = np.float32(models.spread_factor(self.rho, self.round, self.cube.dim))
         ends, value = self._programs.descend(
             form, count, self.hyper, u, mask, coefficients, mean * scale, components * scale,
             parents, key, np.bool_(guess), spread,
@@ -245,14 +284,14 @@ class Surrogate:
 class Descents:
     """The compiled programs of a problem: the fit, and descents on simulators drawn from it."""
 
-    def __init__(self, problem: Problem, options: TraceOptions) -> None:
+    def __init__(self, problem: Problem, options: TraceSurrogate) -> None:
         self.end: End = problem.end
         self.options, self.cube = options, problem.space.cube
         self.goals = goals_of(problem.formulas.values())
         # Rows become what the model takes inside of the programs: outside each operation would
         # compile a program for each number of rows.
         cube = self.cube
-        self.fit = jax.jit(lambda hyper, u, *rest: models.fit(hyper, _embed(u, cube), *rest))
+        self.fit = jax.jit(lambda hyper, u, *rest: models.fit(hyper, models.embed(u, cube), *rest))
         self.descend: Any = jax.jit(self._descend, static_argnums=(0, 1))
 
     def _descend(
@@ -272,7 +311,7 @@ class Descents:
     ) -> tuple[Float[Array, "count starts d"], Float[Array, "count starts"]]:
         """Return the end points of the descents on `count` drawn simulators, and their values."""
         cube = self.cube
-        x = _embed(u, cube)
+        x = models.embed(u, cube)
         model = models.condition(hyper, x, mask, coefficients, mean, components)
         drawing, placing = jax.random.split(key)
         waves, weights = models.draw(model, drawing, count, guess, spread)
@@ -281,7 +320,7 @@ class Descents:
         def values(
             u: Float[Array, "m d"], weights: Float[Array, "terms c"], semantics: Semantics
         ) -> Float[Array, " m"]:
-            terms = models.basis(model, waves, _embed(u, cube))
+            terms = models.basis(model, waves, models.embed(u, cube))
             flat = model.decode(terms @ weights)
             return jax.vmap(lambda row: self._value(form.trace(row), semantics))(flat)
 
@@ -325,55 +364,12 @@ class Descents:
         return jnp.min(jnp.max(clauses, axis=1))
 
 
-DESCENTS: Slot[TraceOptions, Descents] = Slot("descents on a model of the traces")
+DESCENTS: Slot[TraceSurrogate, Descents] = Slot("descents on a model of the traces")
 """The programs of a problem for its surrogates, by their options."""
-
-
-def spread_factor(rho: Float[np.ndarray, " n"], number: int, dim: int) -> float:
-    """Return the factor on the model's standard deviations; it grows while no row improves.
-
-    An overconfident model proposes points near one local minimum again and again; with a wider
-    spread its simulators have minima elsewhere. After a failure this is not needed.
-
-    **Arguments:**
-    - `rho`: robustness of the rows, in the order in which they were simulated.
-    - `number`: number of the round.
-    - `dim`: the dimension of the cube.
-    """
-    lowest = np.minimum.accumulate(rho)
-    if lowest[-1] <= 0:
-        return 1.0
-    best, last = rho[0], 0
-    for i in np.flatnonzero(np.diff(lowest)) + 1:
-        if rho[i] < PROGRESS * best:
-            best, last = rho[i], i
-    idle = len(rho) - 1 - last
-    maximum = min(max(1.0, idle / (PATIENCE * dim)), MAX_SPREAD)
-    return maximum ** (number % SPREADS / (SPREADS - 1))
 
 
 def _number(value: Float[Array, " m"]) -> Float[Array, " m"]:
     return jnp.where(jnp.isfinite(value), value, jnp.inf)
-
-
-def _width(cube: Cube) -> int:
-    """Return the number of coordinates of embedded points."""
-    codes = [n for n, ordered in zip(cube.levels, cube.ordered, strict=True) if n and not ordered]
-    return cube.dim - len(codes) + sum(codes)
-
-
-def _embed(u: Float[Any, "n d"], cube: Cube) -> Float[Array, "n x"]:
-    """Return points as model inputs: centred, with a coordinate for each unordered choice."""
-    u = snap(jnp.asarray(u), cube)
-    columns: list[Array] = []
-    cells = cube.cells(u)
-    for i, (levels, ordered) in enumerate(zip(cube.levels, cube.ordered, strict=True)):
-        if levels and not ordered:
-            cell = cells[:, int(np.searchsorted(cube.discrete, i))]
-            columns.append(0.7 * jax.nn.one_hot(cell, levels, dtype=jnp.float32))
-        else:
-            columns.append(u[:, i : i + 1] - 0.5)
-    return jnp.concatenate(columns, axis=1)
 
 
 def padded_rows(rows: int, capacity: int) -> int:
@@ -395,11 +391,6 @@ def _pool(
     # Failures lie in corners more often than not.
     fresh = jnp.where(jnp.arange(half)[:, None] % 2 == 0, fresh, jnp.round(fresh))
     rest = random[half:]
-    noise, pick = standard_normal(rest[:, :d]), rest[:, d : 2 * d]
-    share = float(d) ** -rest[:, 2 * d :][:, :1]
-    moves = (pick < share) | (pick == jnp.min(pick, axis=1, keepdims=True))
-    size = 0.5 * 0.05 ** rest[:, 2 * d + 1 :]
-    parent = parents[jnp.arange(half) % PARENTS]
-    codes = np.array([n > 0 and not o for n, o in zip(cube.levels, cube.ordered, strict=True)])
-    moved = jnp.where(codes, rest[:, :d], jnp.clip(parent + size * noise, 0.0, 1.0))
-    return snap(jnp.concatenate([fresh, jnp.where(moves, moved, parent)]), cube)
+    rest = rest[:, np.r_[0, 2 * d + 1, 2 * d, d : 2 * d, :d]]
+    near = near_others(parents[jnp.arange(half) % PARENTS], rest, cube, jnp.array([0.5, 0.025]))
+    return snap(jnp.concatenate([fresh, near]), cube)

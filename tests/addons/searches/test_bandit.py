@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from checked_types import unchecked
 
+from verifai_jax.addons.searches.bandit import Bandit, draw_cells, fill_cells
 from verifai_jax.core.values.cube import Cube
 from verifai_jax.search import Observations
-from verifai_jax.search.bandit import Bandit, draw_cells, fill_cells
 
 
 def told(u, rho, valid=None):

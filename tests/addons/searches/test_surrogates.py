@@ -6,13 +6,14 @@ import numpy as np
 import pytest
 
 import verifai_jax as vj
+from verifai_jax.addons.searches.trace_form import TraceForm
+from verifai_jax.addons.searches.trace_model import spread_factor
+from verifai_jax.addons.searches.trace_surrogate import Surrogate, TraceSurrogate, padded_rows
+from verifai_jax.addons.searches.turbo import TuRBO
 from verifai_jax.evaluation.evaluator import Evaluator
 from verifai_jax.evaluation.host_engine import HostEngine
 from verifai_jax.falsification import simulations
-from verifai_jax.falsification.surrogates import Surrogate, padded_rows, spread_factor
-from verifai_jax.falsification.trace_form import TraceForm
 from verifai_jax.mtl import parse, robustness
-from verifai_jax.search import TraceSurrogate, TuRBO
 
 DIM = 6
 SMALL = TraceSurrogate(initial=6, starts=4, steps=8)

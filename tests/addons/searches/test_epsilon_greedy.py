@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from checked_types import unchecked
 
+from verifai_jax.addons.searches.epsilon_greedy import EpsilonGreedy
 from verifai_jax.core.values.cube import Cube
 from verifai_jax.search import Observations
-from verifai_jax.search.epsilon_greedy import EpsilonGreedy
 
 
 def learned(search, cube, rho, rounds, batch=16, key=0):

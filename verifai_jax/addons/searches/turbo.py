@@ -21,12 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Key, UInt32
 
-from verifai_jax.core.messages.checks import check_positive
-from verifai_jax.core.values.cube import Cube
-from verifai_jax.search.base import Asked, Observations, Search, Wants, check_options, choose
-from verifai_jax.search.draws import draw_uniform
-from verifai_jax.search.halton import halton_points
-from verifai_jax.search.process_data import (
+from verifai_jax.addons.searches.process_data import (
     LARGEST,
     NO_VERDICT,
     ProcessMemory,
@@ -35,6 +30,11 @@ from verifai_jax.search.process_data import (
     scores,
     snap,
 )
+from verifai_jax.core.messages.checks import check_positive
+from verifai_jax.core.values.cube import Cube
+from verifai_jax.search.base import Asked, Observations, Search, Wants, check_options, choose
+from verifai_jax.search.draws import draw_uniform
+from verifai_jax.search.halton import halton_points
 
 # The first two as in `bayes`, the third chosen by hand; no comparison with others is recorded.
 MAX_PATHS = 32  # functions drawn for a batch; larger batches take several points from each

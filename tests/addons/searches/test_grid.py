@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from checked_types import unchecked
 
+from verifai_jax.addons.searches.grid import STEPS, Grid, permuted
 from verifai_jax.core.values.cube import Cube
-from verifai_jax.search.grid import STEPS, Grid, permuted
 from verifai_jax.testing import check_batch_independence, check_search
 
 

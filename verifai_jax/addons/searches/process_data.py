@@ -14,9 +14,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, UInt32
 
+from verifai_jax.addons.searches.gaussian import GaussianProcess, Hyper, Posterior, TrainingData
 from verifai_jax.core.values.cube import Cube
 from verifai_jax.search.base import Observations
-from verifai_jax.search.gaussian_process import GaussianProcess, Hyper, Posterior, TrainingData
 
 CAP = 30.0
 """Quartiles of the robustness above which all values are the same to the process, so that a few

@@ -9,12 +9,12 @@ points with one covariance: constant, linear, quadratic and Matern-5/2 parts ove
 scales. So a nearly linear system is learned from about as many rows as it has inputs, and any other
 system as by a usual process (for traces of simulators: Higdon, Gattiker, Williams, Rightley,
 Computer model calibration using high-dimensional output, JASA 2008). Functions are drawn by
-pathwise conditioning, as in `gaussian_process`; the quadratic part by random products (Kar,
+pathwise conditioning, as in `gaussian`; the quadratic part by random products (Kar,
 Karnick, Random feature maps for dot product kernels, AISTATS 2012).
 """
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -23,7 +23,9 @@ from jax.scipy.linalg import cho_solve
 from jax.scipy.special import ndtri
 from jaxtyping import Array, Bool, Float, Key
 
-from verifai_jax.search.gaussian_process import SMALLEST, adam, finite_factor, matern
+from verifai_jax.addons.searches.gaussian import SMALLEST, adam, finite_factor, matern
+from verifai_jax.addons.searches.process_data import snap
+from verifai_jax.core.values.cube import Cube
 
 # The numbers without another reason were chosen by hand; no comparison with other values is
 # recorded.
@@ -37,6 +39,15 @@ PARTS = np.array([0.0, 0.0, -2.0, -1.0], np.float32)
 """Prior means of the logarithms of the variances: constant, linear, quadratic, Matern."""
 NOISE = -8.0  # prior mean of the logarithm of the noise's variance
 MIN_NOISE = -10.0  # minimum of it, which keeps 32-bit factors finite
+PATIENCE = 8
+"""Rows for each dimension without progress, before any failure, from which on the model is believed
+less."""
+PROGRESS = 0.9
+"""A row is progress if its robustness is below this share of the least so far."""
+MAX_SPREAD = 5.0
+"""Maximum factor on the standard deviations of the model."""
+SPREADS = 4
+"""Number of factors, from one to the maximum, used in turn."""
 
 
 class TraceHyper(NamedTuple):
@@ -52,6 +63,49 @@ def first_hyper(width: int) -> TraceHyper:
     return TraceHyper(
         jnp.full(width, _mean_length(width), jnp.float32), jnp.asarray(PARTS), jnp.float32(NOISE)
     )
+
+
+def width_of(cube: Cube) -> int:
+    """Return the number of coordinates of embedded points."""
+    codes = [n for n, ordered in zip(cube.levels, cube.ordered, strict=True) if n and not ordered]
+    return cube.dim - len(codes) + sum(codes)
+
+
+def embed(u: Float[Any, "n d"], cube: Cube) -> Float[Array, "n x"]:
+    """Return points as model inputs: centred, with a coordinate for each unordered choice."""
+    u = snap(jnp.asarray(u), cube)
+    columns: list[Array] = []
+    cells = cube.cells(u)
+    for i, (levels, ordered) in enumerate(zip(cube.levels, cube.ordered, strict=True)):
+        if levels and not ordered:
+            cell = cells[:, int(np.searchsorted(cube.discrete, i))]
+            columns.append(0.7 * jax.nn.one_hot(cell, levels, dtype=jnp.float32))
+        else:
+            columns.append(u[:, i : i + 1] - 0.5)
+    return jnp.concatenate(columns, axis=1)
+
+
+def spread_factor(rho: Float[np.ndarray, " n"], number: int, dim: int) -> float:
+    """Return the factor on the model's standard deviations; it grows while no row improves.
+
+    An overconfident model proposes points near one local minimum again and again; with a wider
+    spread its simulators have minima elsewhere. After a failure this is not needed.
+
+    **Arguments:**
+    - `rho`: robustness of the rows, in the order in which they were simulated.
+    - `number`: number of the round.
+    - `dim`: the dimension of the cube.
+    """
+    lowest = np.minimum.accumulate(rho)
+    if lowest[-1] <= 0:
+        return 1.0
+    best, last = rho[0], 0
+    for i in np.flatnonzero(np.diff(lowest)) + 1:
+        if rho[i] < PROGRESS * best:
+            best, last = rho[i], i
+    idle = len(rho) - 1 - last
+    maximum = min(max(1.0, idle / (PATIENCE * dim)), MAX_SPREAD)
+    return maximum ** (number % SPREADS / (SPREADS - 1))
 
 
 class TraceModel(NamedTuple):

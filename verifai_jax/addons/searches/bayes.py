@@ -27,13 +27,10 @@ import numpy as np
 from jax.scipy.special import log_ndtr
 from jaxtyping import Array, Float, Int, Key, UInt32
 
-from verifai_jax.core.values.cube import Cube
-from verifai_jax.search.base import Asked, Observations, Search, Wants, check_options
-from verifai_jax.search.draws import draw_uniform, standard_normal
-from verifai_jax.search.gaussian_process import Posterior, TrainingData
-from verifai_jax.search.halton import halton_points
-from verifai_jax.search.improvement import APART, PARENTS, already_simulated, improving
-from verifai_jax.search.process_data import (
+from verifai_jax.addons.searches.gaussian import Posterior, TrainingData
+from verifai_jax.addons.searches.improvement import APART, PARENTS, already_simulated, improving
+from verifai_jax.addons.searches.moves import near_others
+from verifai_jax.addons.searches.process_data import (
     LARGEST,
     NO_VERDICT,
     ProcessMemory,
@@ -43,10 +40,14 @@ from verifai_jax.search.process_data import (
     snap,
     training_data,
 )
+from verifai_jax.core.values.cube import Cube
+from verifai_jax.search.base import Asked, Observations, Search, Wants, check_options
+from verifai_jax.search.draws import draw_uniform
+from verifai_jax.search.halton import halton_points
 
 # The numbers without another reason were chosen by hand; no comparison with other values is
 # recorded. With them it is held to 5 times fewer simulations than uniform sampling
-# (tests/search/test_bayes.py).
+# (tests/addons/searches/test_bayes.py).
 MAX_PATHS = 32  # functions drawn for a batch; larger batches take several points from each
 WAVES = 256  # random waves of such a function
 FIT_STEPS = 8
@@ -182,7 +183,7 @@ class Bayes(Search[BayesState]):
         first, later = random[:half], random[half:].reshape(2, *steps, width)
         _, best = jax.lax.top_k(-memory.score, PARENTS)
         parent = best[jnp.minimum((first[:, 0] * PARENTS).astype(jnp.int32), PARENTS - 1)]
-        near = _near(memory.u[parent], first, cube, jnp.array([0.5, 0.01]))
+        near = near_others(memory.u[parent], first, cube, jnp.array([0.5, 0.01]))
         shared = jnp.concatenate([anywhere, near])
         if self.acquisition == "thompson":
             chosen = _minima(drawing, posterior, risk, cube, shared, later, paths)[:batch]
@@ -291,7 +292,7 @@ def _minima(
     ) -> tuple:
         best, lowest = carry
         parent = jnp.repeat(best, children, axis=0)
-        u = _near(parent, step[1].reshape(len(parent), -1), cube, step[0])
+        u = near_others(parent, step[1].reshape(len(parent), -1), cube, step[0])
         u = snap(u, cube)
         terms, penalty = basis(u)
         value = jnp.einsum("pcf,fp->pc", terms.reshape(count, each * children, -1), paths.weights)
@@ -305,19 +306,3 @@ def _minima(
     begin = (shared[index.reshape(-1)], -value.reshape(-1))
     (best, _), _ = jax.lax.scan(closer, begin, (jnp.array(CLOSER), random))
     return best
-
-
-def _near(
-    parent: Float[Array, "n d"], random: Float[Array, "n r"], cube: Cube, scales: Float[Array, " 2"]
-) -> Float[Array, "n d"]:
-    """Draw points around others: some coordinates moved by a step between two scales."""
-    d = cube.dim
-    step = scales[0] * (scales[1] / scales[0]) ** random[:, 1:2]
-    # From all coordinates to one on average, and always one.
-    share = float(d) ** -random[:, 2:3]
-    pick, noise = random[:, 3 : 3 + d], random[:, 3 + d :]
-    moves = (pick < share) | (pick == jnp.min(pick, axis=1, keepdims=True))
-    moved = jnp.clip(parent + step * standard_normal(noise), 0.0, 1.0)
-    # An unordered choice has no neighbours: any other.
-    codes = np.array(process_of(cube).unordered)
-    return jnp.where(moves, jnp.where(codes, noise, moved), parent)

@@ -9,9 +9,9 @@ import pytest
 from checked_types import unchecked
 from playing import gain, play
 
+from verifai_jax.addons.searches.bayes import Bayes
 from verifai_jax.core.values.cube import Cube
 from verifai_jax.search import Observations
-from verifai_jax.search.bayes import Bayes
 from verifai_jax.search.halton import halton_points
 from verifai_jax.testing import check_search
 

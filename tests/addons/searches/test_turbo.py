@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from checked_types import unchecked
 
+from verifai_jax.addons.searches.turbo import SIDES, TuRBO, trust_box
 from verifai_jax.core.values.cube import Cube
 from verifai_jax.search import Observations, named
 from verifai_jax.search.halton import halton_points
-from verifai_jax.search.turbo import SIDES, TuRBO, trust_box
 
 KEY = jax.random.key(0)
 SMALL = TuRBO(capacity=128, candidates=256)

@@ -7,10 +7,10 @@ import pytest
 from checked_types import unchecked
 from playing import gain, play
 
+from verifai_jax.addons.searches.cmaes import CMAES
+from verifai_jax.addons.searches.evolution import Evolution, recombination, reverse_recombination
 from verifai_jax.core.values.cube import Cube
 from verifai_jax.search import Observations
-from verifai_jax.search.cmaes import CMAES
-from verifai_jax.search.evolution import Evolution, recombination, reverse_recombination
 from verifai_jax.search.halton import halton_points
 from verifai_jax.testing import check_search
 

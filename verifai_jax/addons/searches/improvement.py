@@ -13,10 +13,10 @@ import numpy as np
 from jax.scipy.special import log_ndtr, ndtr
 from jaxtyping import Array, Bool, Float
 
+from verifai_jax.addons.searches.gaussian import Posterior
+from verifai_jax.addons.searches.process_data import encode, process_of, snap
 from verifai_jax.core.values.cube import Cube
 from verifai_jax.search.curvature import Curvature, advance, begin
-from verifai_jax.search.gaussian_process import Posterior
-from verifai_jax.search.process_data import encode, process_of, snap
 
 PARENTS = 8  # best candidates that climb. Chosen by hand
 APART = 1e-4

@@ -6,15 +6,15 @@ import numpy as np
 import pytest
 from checked_types import unchecked
 
-from verifai_jax.core.values.cube import Cube
-from verifai_jax.search import Observations
-from verifai_jax.search.annealing import (
+from verifai_jax.addons.searches.annealing import (
     Annealing,
     best_to_median,
     exchange,
     partners_of,
     reflect,
 )
+from verifai_jax.core.values.cube import Cube
+from verifai_jax.search import Observations
 from verifai_jax.testing import check_search
 
 

@@ -29,10 +29,15 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Key, UInt32
 
+from verifai_jax.addons.searches.evolution import (
+    Evolution,
+    rates,
+    recombination,
+    reverse_recombination,
+)
 from verifai_jax.core.values.cube import Cube
 from verifai_jax.search.base import Asked, Observations, Search, check_options, choose
 from verifai_jax.search.draws import draw_uniform, standard_normal
-from verifai_jax.search.evolution import Evolution, rates, recombination, reverse_recombination
 from verifai_jax.search.halton import halton_points
 
 MAX_CELLS = 32

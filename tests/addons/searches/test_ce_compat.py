@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from checked_types import unchecked
 
+from verifai_jax.addons.searches.ce_compat import CECompat
 from verifai_jax.core.values.cube import Cube
 from verifai_jax.search import Observations
-from verifai_jax.search.ce_compat import CECompat
 from verifai_jax.testing import check_search
 
 NAN = float("nan")

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.stats import multivariate_normal
 
-from verifai_jax.search.gaussian_process import GaussianProcess, Hyper, TrainingData
+from verifai_jax.addons.searches.gaussian import GaussianProcess, Hyper, TrainingData
 
 KEY = jax.random.key(0)
 LENGTHS = np.array([0.3, 0.8, 1.7])

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from verifai_jax.search import trace_model as models
+from verifai_jax.addons.searches import trace_model as models
 
 WIDTH, ROWS, SIZE = 3, 10, 16
 

@@ -18,11 +18,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Key, UInt32
 
+from verifai_jax.addons.searches.moves import all_or_some, has_fine_cells
 from verifai_jax.core.values.cube import Cube
 from verifai_jax.search.base import Asked, Observations, Search, check_options
 from verifai_jax.search.best_points import keep_best
 from verifai_jax.search.draws import draw_columns, standard_normal
-from verifai_jax.search.moves import all_or_some, has_fine_cells
 
 # Chosen by hand; no comparison with other values is recorded. With them the search is held to 4
 # times fewer simulations than uniform sampling (tests/search/test_quality.py).

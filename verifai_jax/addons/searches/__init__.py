@@ -1,0 +1,1 @@
+"""Searches beyond those of the falsifier: names of `verifai_jax.search`, found by entry points."""
