@@ -92,7 +92,7 @@ some processors to the last bit, in programs without long chains of products and
 rounds each product."""
 _OPTIONS: dict[XlaOptimization, dict[str, Any]] = {
     "most": {},
-    "little": {"xla_cpu_use_fusion_emitters": False, "xla_backend_optimization_level": 1},
+    "little": {"xla_cpu_use_fusion_emitters": False, "xla_backend_optimization_level": 2},
     "least": {"xla_cpu_use_fusion_emitters": False, "xla_backend_optimization_level": 0},
 }
 _WHOLE_LOOPS = {"xla_disable_hlo_passes": "cpu-parallel-task-assigner"}
