@@ -54,9 +54,8 @@ ADDONS = {
 """The other add-ons that each add-on may import; each is below those that import it."""
 USES_PUBLIC_NAMES = {"cli"}
 """Rooms that import what a user imports, from `verifai_jax` itself."""
-BESIDE = {"remote_client", "__init__", "__main__"}
-"""Files at the root that no room imports: a client to copy, the public names, the
-command line as a module."""
+BESIDE = {"__init__", "__main__"}
+"""Files at the root that no room imports: the public names, the command line as a module."""
 
 
 def module_name(file: Path) -> str:
@@ -308,7 +307,7 @@ def test_an_asked_class_would_be_found():
 
 
 def test_few_files_at_the_root():
-    assert len(list(PACKAGE.glob("*.py"))) <= 5
+    assert len(list(PACKAGE.glob("*.py"))) <= 3
 
 
 def test_library_does_not_know_its_content():
