@@ -26,6 +26,7 @@ matplotlib.use("Agg")
 PACKAGE = Path(__file__).parents[1] / "verifai_jax"
 
 CHECKED_ROOMS: list[str] = [
+    "addons.checking",
     "analysis",
     "core.user_code.callbacks",
     "core.values.cube",
@@ -52,7 +53,6 @@ CHECKED_ROOMS: list[str] = [
     "statistics",
     "synthesis",
     "systems",
-    "testing.checking",
     "training.augmentation",
     "training.sweeps",
 ]

@@ -36,6 +36,7 @@ ADDONS = {
     "native": set(),
     "clusters": set(),
     "agents": set(),
+    "checking": set(),
     "simulators": set(),
     "scenic": set(),
     "fuzzing": set(),
@@ -49,7 +50,7 @@ ADDONS = {
     "synthesis": {"estimation", "verification"},
     "perception": {"analysis"},
     "training": {"analysis", "estimation", "monitoring", "reports", "rl"},
-    "assurance": {"analysis", "estimation", "monitoring", "reports", "verification"},
+    "assurance": {"analysis", "checking", "estimation", "monitoring", "reports", "verification"},
 }
 """The other add-ons that each add-on may import; each is below those that import it."""
 USES_PUBLIC_NAMES = {"cli"}

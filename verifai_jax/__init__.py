@@ -20,6 +20,8 @@ if TYPE_CHECKING:
     from verifai_jax.addons.assurance.qualification import qualify as qualify
     from verifai_jax.addons.assurance.traceability import TraceMatrix as TraceMatrix
     from verifai_jax.addons.assurance.traceability import trace_matrix as trace_matrix
+    from verifai_jax.addons.checking import replay_counterexamples as replay_counterexamples
+    from verifai_jax.addons.checking import test as test
     from verifai_jax.addons.estimation import Estimate as Estimate
     from verifai_jax.addons.estimation import SequenceEstimate as SequenceEstimate
     from verifai_jax.addons.estimation import estimate as estimate
@@ -91,7 +93,6 @@ if TYPE_CHECKING:
     from verifai_jax.counterexamples import Confirmations as Confirmations
     from verifai_jax.counterexamples import confirm as confirm
     from verifai_jax.counterexamples import explain as explain
-    from verifai_jax.counterexamples import replay_counterexamples as replay_counterexamples
     from verifai_jax.counterexamples import shrink as shrink
     from verifai_jax.falsification import ErrorTable as ErrorTable
     from verifai_jax.falsification import Replay as Replay
@@ -149,7 +150,6 @@ if TYPE_CHECKING:
     from verifai_jax.systems.ode import blocks as blocks
     from verifai_jax.systems.ode import ode as ode
     from verifai_jax.systems.ode import sin_cos as sin_cos
-    from verifai_jax.testing.checking import test as test
 # Imported when first used (PEP 562), so that importing this package takes milliseconds.
 __getattr__, __dir__, __all__ = _attach(__name__, "__version__", group="verifai_jax.systems")
 _claim_cores()
