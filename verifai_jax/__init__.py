@@ -11,6 +11,7 @@ if TYPE_CHECKING:
     from verifai_jax import search as search
     from verifai_jax.addons import analysis as analysis
     from verifai_jax.addons import clusters as clusters
+    from verifai_jax.addons import events as events
     from verifai_jax.addons import faults as faults
     from verifai_jax.addons import perception as perception
     from verifai_jax.addons import rl as rl
@@ -41,6 +42,7 @@ if TYPE_CHECKING:
     from verifai_jax.addons.estimation.trials import compare_trials as compare_trials
     from verifai_jax.addons.estimation.trials import real_trials as real_trials
     from verifai_jax.addons.estimation.trials import trial_protocol as trial_protocol
+    from verifai_jax.addons.events.reactive import Reactive as Reactive
     from verifai_jax.addons.faults.failure_table import FailureTable as FailureTable
     from verifai_jax.addons.faults.failure_table import fmea as fmea
     from verifai_jax.addons.fuzzing import FuzzCoverage as FuzzCoverage
@@ -116,13 +118,11 @@ if TYPE_CHECKING:
     from verifai_jax.features import LogNormal as LogNormal
     from verifai_jax.features import LogUniform as LogUniform
     from verifai_jax.features import Normal as Normal
-    from verifai_jax.features import Reactive as Reactive
     from verifai_jax.features import Signal as Signal
     from verifai_jax.features import Struct as Struct
     from verifai_jax.features import Triangular as Triangular
     from verifai_jax.features import TruncatedNormal as TruncatedNormal
     from verifai_jax.features import Weibull as Weibull
-    from verifai_jax.features import events as events
     from verifai_jax.mtl import Formula as Formula
     from verifai_jax.mtl import FormulaSyntaxError as FormulaSyntaxError
     from verifai_jax.mtl import always as always

@@ -253,6 +253,7 @@ def test_arrays_and_pools_of_black_boxes_can_be_sent():
     assert sent.system.pool._setup == pooled.system.pool._setup
 
 
+@pytest.mark.addons
 @pytest.mark.thorough
 def test_every_problem_of_the_project_can_be_sent():
     cloudpickle = pytest.importorskip("cloudpickle")
