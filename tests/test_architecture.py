@@ -43,14 +43,14 @@ ADDONS = {
     "fuzzing": {"events"},
     "analysis": set(),
     "reports": {"analysis"},
-    "monitoring": {"native", "reports"},
+    "monitoring": {"clusters", "native", "reports"},
     "verification": {"reports"},
     "rl": {"simulators"},
-    "estimation": {"analysis", "monitoring", "reports", "rl", "verification"},
+    "estimation": {"analysis", "clusters", "monitoring", "reports", "rl", "verification"},
     "faults": {"estimation", "reports"},
     "synthesis": {"estimation", "verification"},
     "perception": {"analysis"},
-    "training": {"analysis", "estimation", "monitoring", "reports", "rl"},
+    "training": {"analysis", "clusters", "estimation", "monitoring", "reports", "rl"},
     "assurance": {"analysis", "checking", "estimation", "monitoring", "reports", "verification"},
 }
 """The other add-ons that each add-on may import; each is below those that import it."""

@@ -17,6 +17,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from verifai_jax.addons.clusters.executors import check_executor, gather
 from verifai_jax.addons.monitoring import resampling
 from verifai_jax.addons.monitoring.columns import LeftOut
 from verifai_jax.addons.monitoring.containers import Episode
@@ -26,7 +27,7 @@ from verifai_jax.addons.monitoring.recorded import Recording, Recordings, named_
 from verifai_jax.addons.monitoring.recording import read
 from verifai_jax.addons.monitoring.requirement_files import Requirements, requirements_of
 from verifai_jax.addons.monitoring.resampling import Method, Missing
-from verifai_jax.core.compute.executors import Executor, check_executor, gather
+from verifai_jax.core.compute.executors import Executor
 from verifai_jax.core.display.progress import count_done, shows_progress
 from verifai_jax.core.messages.text import format_time, listed, one_line
 from verifai_jax.core.user_code.sources import Source, hashed_files

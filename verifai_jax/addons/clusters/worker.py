@@ -15,9 +15,9 @@ import jax
 import numpy as np
 from jaxtyping import Float, UInt32
 
+from verifai_jax.addons.clusters.executors import Shipment
 from verifai_jax.core.compute.compilation import Slot
 from verifai_jax.core.compute.devices import describe_processor
-from verifai_jax.core.compute.executors import Shipment
 from verifai_jax.core.compute.keys import as_key
 from verifai_jax.core.compute.precision import reproducible_settings
 from verifai_jax.evaluation.engine import Engine
