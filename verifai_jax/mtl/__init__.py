@@ -29,7 +29,6 @@ from verifai_jax.mtl.operators import (
     sometime_during,
     until,
 )
-from verifai_jax.mtl.plot import draw
 from verifai_jax.mtl.requirements import Requirement
 from verifai_jax.mtl.rewriting import nnf, simplify
 from verifai_jax.mtl.semantics import Semantics, boolean, hard, smooth
@@ -38,7 +37,7 @@ from verifai_jax.mtl.setting import HorizonError, SamplingError
 __all__ = [
     "FALSE", "TRUE", "End", "Explanation", "Expression", "Formula", "FormulaSyntaxError",
     "HorizonError", "IntervalError", "Online", "Requirement", "SamplingError", "Semantics",
-    "SmoothingError", "always", "anneal", "boolean", "draw", "duration", "during",
+    "SmoothingError", "always", "anneal", "boolean", "duration", "during",
     "eventually", "explain", "fall", "hard", "historically", "latex", "next_", "nnf",
     "normalize", "once", "online", "parse", "phase", "prev", "rise",
     "robustness", "robustness_signal", "satisfied", "signal", "simplify", "since", "smooth",

@@ -27,6 +27,7 @@ from verifai_jax.addons.monitoring.recorded import Recording, Recordings, named_
 from verifai_jax.addons.monitoring.recording import read
 from verifai_jax.addons.monitoring.requirement_files import Requirements, requirements_of
 from verifai_jax.addons.monitoring.resampling import Method, Missing
+from verifai_jax.addons.monitoring.units import plain_unit, unit_of, units_of
 from verifai_jax.core.compute.executors import Executor
 from verifai_jax.core.display.progress import count_done, shows_progress
 from verifai_jax.core.messages.text import format_time, listed, one_line
@@ -39,7 +40,6 @@ from verifai_jax.mtl.host_values import HostValues
 from verifai_jax.mtl.requirements import Requirement
 from verifai_jax.mtl.setting import SamplingError, check_horizon, check_reach, check_signals, period
 from verifai_jax.mtl.shortfalls import shortfalls_in
-from verifai_jax.mtl.units import plain_unit, unit_of, units_of
 
 _text = functools.lru_cache(1024)(Formula.__str__)
 """A fleet asks the same of a few formulas again and again."""
