@@ -5,7 +5,6 @@ from typing import TYPE_CHECKING
 from verifai_jax.core.display.lazy import attach
 
 if TYPE_CHECKING:
-    from verifai_jax.addons.checking._replay_counterexamples import CorpusReplay as CorpusReplay
     from verifai_jax.addons.checking._replay_counterexamples import (
         replay_counterexamples as replay_counterexamples,
     )
@@ -15,7 +14,6 @@ if TYPE_CHECKING:
     from verifai_jax.addons.checking.check import Check as Check
     from verifai_jax.addons.checking.check import CheckOutcome as CheckOutcome
     from verifai_jax.addons.checking.check import CounterexampleFound as CounterexampleFound
-    from verifai_jax.addons.checking.corpus import CorpusError as CorpusError
     from verifai_jax.addons.checking.corpus import SavedCounterexample as SavedCounterexample
     from verifai_jax.addons.checking.corpus import save_counterexamples as save_counterexamples
 __getattr__, __dir__, __all__ = attach(__name__)
