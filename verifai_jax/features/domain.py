@@ -215,10 +215,9 @@ class Domain(ForUsers, abc.ABC):
         return ""
 
     def plain(self, nested: "Callable[[Domain], dict[str, Any]]") -> dict[str, Any] | None:
-        """Return what `from_plain` builds the domain from, for JSON; None if `arguments` do.
+        """Return what `from_plain` needs, for JSON; None if it is `arguments`.
 
-        **Arguments:**
-        - `nested`: the function that converts a domain within this one.
+        `nested` converts a domain within this one.
         """
         return None
 
@@ -226,12 +225,7 @@ class Domain(ForUsers, abc.ABC):
     def from_plain(
         cls, data: Mapping[str, Any], nested: "Callable[[Mapping[str, Any]], Domain]"
     ) -> "Domain":
-        """Build the domain from what `plain` returned, or from its `arguments`.
-
-        **Arguments:**
-        - `data`: the plain data.
-        - `nested`: the function that builds a domain within this one.
-        """
+        """Build the domain from what `plain` returned; `nested` builds one within this one."""
         return cls(**{name: data[name] for name in cls.arguments or ()})
 
     def parts(self, name: str) -> "tuple[tuple[str, Domain], ...]":

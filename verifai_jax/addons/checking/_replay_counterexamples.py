@@ -34,13 +34,8 @@ from verifai_jax.problem.problem import Problem
 
 if TYPE_CHECKING:
     import pandas as pd
-FAILING, FIXED, WITHOUT_VERDICT, INVALID, OTHER = (
-    "failing",
-    "fixed",
-    "without a verdict",
-    "no longer valid",
-    "of another problem",
-)
+FAILING, FIXED, WITHOUT_VERDICT = "failing", "fixed", "without a verdict"
+INVALID, OTHER = "no longer valid", "of another problem"
 """What may be said of a file."""
 CLOSE = 1e-4
 """Share of a feature's value by which a point of the space may differ from it, for rounding."""

@@ -200,12 +200,9 @@ class ExecutorEngine:
         """Return the verdicts of rows in the journal."""
         if self._recalling is None:
             self._recalling = HostEngine(
-                self.problem,
-                self.precision,
-                self._journal,
-                guidance=self.mode.guidance,
-                given=self.mode.given,
-            )
+                self.problem, self.precision, self._journal,
+                guidance=self.mode.guidance, given=self.mode.given,
+            )  # fmt: skip
         return self._recalling.evaluate(u, key, first, padded_to=self.mode.padded_to)
 
     def receive(self, result: dict[str, Any], u: Float[np.ndarray, "n d"], first: int) -> Verdicts:

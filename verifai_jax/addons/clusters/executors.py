@@ -48,7 +48,6 @@ class Future(Protocol):
 
     def result(self) -> Any:
         """Wait for the result and return it, or raise the error of the call."""
-        ...
 
     def done(self) -> bool:
         """Return whether there is a result."""
@@ -56,7 +55,6 @@ class Future(Protocol):
 
     def cancel(self) -> Any:
         """Remove the call from the queue if it has not started."""
-        ...
 
 
 def check_executor(executor: object) -> None:

@@ -33,13 +33,9 @@ class ExecutorReplays(HostReplays):
     """
 
     def __init__(
-        self,
-        problem: Problem,
-        precision: str,
-        key: Key[Any, ""],
-        executor: Executor,
+        self, problem: Problem, precision: str, key: Key[Any, ""], executor: Executor,
         target: str | None = None,
-    ) -> None:
+    ) -> None:  # fmt: skip
         super().__init__(problem, precision, key)
         check_executor(executor)
         self._executor, self._shipment = executor, shipped(problem, executor, target)
