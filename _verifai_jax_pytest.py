@@ -75,7 +75,7 @@ class SpecFile(pytest.File):
 
     def collect(self) -> Iterator[pytest.Item]:
         """Yield a test for each problem of the file."""
-        from verifai_jax.testing.checking._test import problems_of
+        from verifai_jax.addons.checking._test import problems_of
 
         place = _place(self)
         for name, problem in problems_of(place).items():
@@ -104,8 +104,8 @@ class ProblemItem(pytest.Item):
 
     def runtest(self) -> None:
         """Replay the corpus, then spend the budget."""
-        from verifai_jax.testing.checking import Check, session
-        from verifai_jax.testing.checking._test import run_check
+        from verifai_jax.addons.checking import Check, session
+        from verifai_jax.addons.checking._test import run_check
 
         budget = self.config.getini("vj_budget")
         probability = self.config.getini("vj_max_failure_probability")
@@ -130,7 +130,7 @@ class ProblemItem(pytest.Item):
 
     def repr_failure(self, excinfo: pytest.ExceptionInfo[BaseException], style: Any = None) -> Any:
         """Write a counterexample as the run that found it does, and how to see it again."""
-        from verifai_jax.testing.checking import CounterexampleFound
+        from verifai_jax.addons.checking import CounterexampleFound
 
         if isinstance(excinfo.value, CounterexampleFound):
             return _failure(self, excinfo.value, self.target)
@@ -146,7 +146,7 @@ def pytest_pyfunc_call(pyfuncitem: pytest.Function) -> Generator[None, Any, Any]
     """Run a test that `vj.test` has made with the options of this session."""
     if getattr(pyfuncitem.obj, _MARK, None) is None:
         return (yield)
-    from verifai_jax.testing.checking import CounterexampleFound, session
+    from verifai_jax.addons.checking import CounterexampleFound, session
 
     with session(_session(pyfuncitem)) as now:
         try:
@@ -183,7 +183,7 @@ def _clean(text: str) -> str:
 
 
 def _session(item: pytest.Item) -> Any:
-    from verifai_jax.testing.checking import Session
+    from verifai_jax.addons.checking import Session
 
     config = item.config
     return Session(
@@ -196,7 +196,7 @@ def _session(item: pytest.Item) -> Any:
 
 def _tell(item: pytest.Item, now: Any) -> None:
     """Note what came of a test where JUnit's report takes it from."""
-    from verifai_jax.testing.checking._test import source_hash
+    from verifai_jax.addons.checking._test import source_hash
 
     for outcome in now.outcomes:
         item.user_properties += list(outcome.properties.items())

@@ -32,7 +32,7 @@ from specs.lane_keeping import learned
 from specs.mountain_car import climb_with, safe_training
 from specs.reacher import reach_with
 from verifai_jax.addons.rl import PPO
-from verifai_jax.statistics.paired import paired_difference
+from verifai_jax.addons.training.paired import paired_difference
 
 WIDE = {
     "x0": vj.Box(-1.5, 1.5),

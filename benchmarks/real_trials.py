@@ -12,7 +12,7 @@ import argparse
 
 import numpy as np
 
-from verifai_jax.statistics.stratified_rate import stratified_rate
+from verifai_jax.addons.estimation.stratified_rate import stratified_rate
 
 TRIALS = (30, 50, 100)
 KINDS = {

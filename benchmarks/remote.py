@@ -31,7 +31,7 @@ def simulate(features, seed):
 def main() -> None:
     """Measure, and print a line for each way."""
     import verifai_jax as vj
-    from verifai_jax import remote_client
+    from verifai_jax.addons.simulators import remote_client
     from verifai_jax.addons.simulators.remote import remote
 
     parser = argparse.ArgumentParser()

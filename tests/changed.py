@@ -21,7 +21,7 @@ SHARED = {"conftest.py", "checked_types.py", "xla_flags.py"}
 EVERYTHING = {"pyproject.toml", "constraints.txt", "_verifai_jax_pytest.py"}
 LAWS = ("test_architecture.py", "test_language.py", "test_public_names.py")
 """Tests that read the whole package, and run whenever a file of it changes."""
-ELSEWHERE = {"_version": "cli", "remote_client": "addons/simulators/remote"}
+ELSEWHERE = {"_version": "cli"}
 """Tests of files at the root."""
 
 

@@ -26,6 +26,12 @@ matplotlib.use("Agg")
 PACKAGE = Path(__file__).parents[1] / "verifai_jax"
 
 CHECKED_ROOMS: list[str] = [
+    "addons.checking",
+    "addons.events.automaton",
+    "addons.events.event_tables",
+    "addons.events.reactive",
+    "addons.events.transitions",
+    "addons.events.written_events",
     "analysis",
     "core.user_code.callbacks",
     "core.values.cube",
@@ -52,7 +58,6 @@ CHECKED_ROOMS: list[str] = [
     "statistics",
     "synthesis",
     "systems",
-    "testing.checking",
     "training.augmentation",
     "training.sweeps",
 ]

@@ -35,7 +35,7 @@ def test_a_file_that_is_gone_calls_for_all_that_its_room_does():
         ("docs/formulas.md", ["tests/test_documents.py"]),
         ("README.md", ["tests/test_documents.py"]),
         ("specs/cartpole.py", ["tests/addons/envs", "tests/addons/rl", "tests/envs"]),
-        ("verifai_jax/remote_client.py", ["tests/addons/simulators/remote", *LAWS]),
+        ("verifai_jax/addons/simulators/remote_client.py", ["tests/addons/simulators", *LAWS]),
         ("LICENSE", []),
     ],
 )

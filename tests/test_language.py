@@ -143,7 +143,7 @@ def test_no_zero_is_printed_with_a_sign(package):
         f"{file}:{line} {spec}"
         for file, nodes in package.items()
         # A client is copied to where Python is older.
-        if file != "remote_client.py"
+        if file != "addons/simulators/remote_client.py"
         for line, spec in signed_zeros(nodes)
     ]
     assert not wrong, "\n".join(wrong)

@@ -11,6 +11,7 @@ if TYPE_CHECKING:
     from verifai_jax import search as search
     from verifai_jax.addons import analysis as analysis
     from verifai_jax.addons import clusters as clusters
+    from verifai_jax.addons import events as events
     from verifai_jax.addons import faults as faults
     from verifai_jax.addons import perception as perception
     from verifai_jax.addons import rl as rl
@@ -20,6 +21,8 @@ if TYPE_CHECKING:
     from verifai_jax.addons.assurance.qualification import qualify as qualify
     from verifai_jax.addons.assurance.traceability import TraceMatrix as TraceMatrix
     from verifai_jax.addons.assurance.traceability import trace_matrix as trace_matrix
+    from verifai_jax.addons.checking import replay_counterexamples as replay_counterexamples
+    from verifai_jax.addons.checking import test as test
     from verifai_jax.addons.estimation import Estimate as Estimate
     from verifai_jax.addons.estimation import SequenceEstimate as SequenceEstimate
     from verifai_jax.addons.estimation import estimate as estimate
@@ -39,6 +42,7 @@ if TYPE_CHECKING:
     from verifai_jax.addons.estimation.trials import compare_trials as compare_trials
     from verifai_jax.addons.estimation.trials import real_trials as real_trials
     from verifai_jax.addons.estimation.trials import trial_protocol as trial_protocol
+    from verifai_jax.addons.events.reactive import Reactive as Reactive
     from verifai_jax.addons.faults.failure_table import FailureTable as FailureTable
     from verifai_jax.addons.faults.failure_table import fmea as fmea
     from verifai_jax.addons.fuzzing import FuzzCoverage as FuzzCoverage
@@ -91,7 +95,6 @@ if TYPE_CHECKING:
     from verifai_jax.counterexamples import Confirmations as Confirmations
     from verifai_jax.counterexamples import confirm as confirm
     from verifai_jax.counterexamples import explain as explain
-    from verifai_jax.counterexamples import replay_counterexamples as replay_counterexamples
     from verifai_jax.counterexamples import shrink as shrink
     from verifai_jax.falsification import ErrorTable as ErrorTable
     from verifai_jax.falsification import Replay as Replay
@@ -115,13 +118,11 @@ if TYPE_CHECKING:
     from verifai_jax.features import LogNormal as LogNormal
     from verifai_jax.features import LogUniform as LogUniform
     from verifai_jax.features import Normal as Normal
-    from verifai_jax.features import Reactive as Reactive
     from verifai_jax.features import Signal as Signal
     from verifai_jax.features import Struct as Struct
     from verifai_jax.features import Triangular as Triangular
     from verifai_jax.features import TruncatedNormal as TruncatedNormal
     from verifai_jax.features import Weibull as Weibull
-    from verifai_jax.features import events as events
     from verifai_jax.mtl import Formula as Formula
     from verifai_jax.mtl import FormulaSyntaxError as FormulaSyntaxError
     from verifai_jax.mtl import always as always
@@ -149,7 +150,6 @@ if TYPE_CHECKING:
     from verifai_jax.systems.ode import blocks as blocks
     from verifai_jax.systems.ode import ode as ode
     from verifai_jax.systems.ode import sin_cos as sin_cos
-    from verifai_jax.testing.checking import test as test
 # Imported when first used (PEP 562), so that importing this package takes milliseconds.
 __getattr__, __dir__, __all__ = _attach(__name__, "__version__", group="verifai_jax.systems")
 _claim_cores()

@@ -19,7 +19,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from benchmarks.faults.cases import Broken, chance
-from verifai_jax import remote_client
+from verifai_jax.addons.simulators import remote_client
 from verifai_jax.addons.simulators.remote._remote import Remote, remote
 from verifai_jax.core.values.trace import Status
 

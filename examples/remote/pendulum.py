@@ -4,7 +4,7 @@ import sys
 
 import numpy as np
 
-from verifai_jax.remote_client import serve
+from verifai_jax.addons.simulators.remote_client import serve
 
 DT, SAMPLES = 0.02, 200
 

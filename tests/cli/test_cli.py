@@ -666,6 +666,7 @@ def test_new_writes_a_project(call, tmp_path):
     assert "has .gitignore, README.md" in call("new", "my_project", code=2)
 
 
+@pytest.mark.addons
 @pytest.mark.slow
 def test_a_new_project_passes_its_tests(call, tmp_path):
     call("new", "my_project")

@@ -96,6 +96,7 @@ def test_values_as_plain_data():
     assert (plain["number"], plain["flag"]) == (0.5, True)
 
 
+@pytest.mark.addons
 @pytest.mark.slow
 def test_falsify_with_a_rate_and_what_follows_a_run(call):
     few = ("--search", "uniform", "--budget", 500, "--no-pictures")

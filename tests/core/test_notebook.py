@@ -61,6 +61,7 @@ def test_results_show_themselves(problem, run):
 def test_results_of_every_verb_show_themselves():
     from verifai_jax import counterexamples
     from verifai_jax.addons import analysis, synthesis
+    from verifai_jax.addons.checking.check import CheckOutcome
     from verifai_jax.addons.estimation.certification.result import Certificate
     from verifai_jax.addons.estimation.comparison.result import Transfer
     from verifai_jax.addons.estimation.sequence_result import SequenceEstimate
@@ -69,7 +70,6 @@ def test_results_of_every_verb_show_themselves():
     from verifai_jax.addons.training.hardening.result import Hardening
     from verifai_jax.addons.training.sweeps.importance import HyperparameterImportance
     from verifai_jax.core.display.notebook import InNotebook
-    from verifai_jax.testing.checking.check import CheckOutcome
 
     verbs = [vj.Estimate, vj.Modes, vj.Comparison, vj.Certificates, vj.Augmentation]
     verbs += [vj.Synthesis, vj.Repair, vj.Confirmation, vj.Confirmations, vj.FuzzRun]
@@ -142,6 +142,7 @@ def test_a_table_is_shown_and_written(tmp_path, index):
     assert list(pd.read_csv(path)) == [*filter(None, [index]), "low"]
 
 
+@pytest.mark.addons
 @pytest.mark.thorough
 def test_names_of_others_steer_no_terminal_and_draw_no_warnings(tmp_path):
     # Right-to-left writing, a clear screen, a character that the font lacks; a long name.

@@ -15,7 +15,6 @@ import pytest
 from checked_types import unchecked
 
 import verifai_jax as vj
-from verifai_jax.core.user_code.revisions import load_at_revision
 from verifai_jax.core.user_code.sources import Sources, list_changes
 from verifai_jax.core.user_code.targets import load_target
 from verifai_jax.core.user_code.user_files import file_hash, is_user_file
@@ -236,7 +235,10 @@ def test_functions_of_a_notebook_are_recorded_by_their_text():
     assert change.name == "simulate (notebook)"
 
 
+@pytest.mark.addons
 def test_a_revision_of_git_has_its_own_files(project):
+    from verifai_jax.addons.estimation.revisions import load_at_revision
+
     who = ("-c", "user.name=a", "-c", "user.email=a@example.org")
     for command in (("init", "-q"), ("add", "-A"), (*who, "commit", "-qm", "first")):
         subprocess.run(["git", *command], check=True)

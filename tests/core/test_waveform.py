@@ -11,7 +11,6 @@ from scipy.interpolate import PchipInterpolator
 
 import verifai_jax as vj
 from verifai_jax.core.values.waveform import Waveform, set_durations
-from verifai_jax.remote_client import Waveform as ClientWaveform
 
 KNOTS = np.float32([1, -2, 0.5, 4, 4])
 LINEAR = Waveform(jnp.asarray(KNOTS), "linear", 2.0)
@@ -125,7 +124,7 @@ UNEVEN = (0.0, 0.3, 1.0, 1.1, 2.0)
 
 @pytest.mark.parametrize(("times", "count"), [(None, 5), (UNEVEN, 3), (None, 2), (UNEVEN, 5)])
 def test_pchip_is_that_of_scipy(times, count):
-    """On the host, traced, and by the client that simulators elsewhere copy."""
+    """On the host, and traced."""
     rng = np.random.default_rng(count)
     where = np.linspace(0, 2, count) if times is None else np.asarray(times[:count])
     clock, times = np.linspace(-0.5, 2.5, 121), None if times is None else times[:count]
@@ -137,8 +136,6 @@ def test_pchip_is_that_of_scipy(times, count):
         if count != 5 or knots.ndim == 2:
             traced = jax.jit(jax.vmap(Waveform(knots, "pchip", 2.0, times)))(jnp.asarray(clock))
             np.testing.assert_allclose(traced, oracle, atol=1e-5)
-        client = ClientWaveform(knots, "pchip", 2.0, times)
-        np.testing.assert_allclose([client(float(t)) for t in clock], oracle, atol=1e-6)
 
 
 @given(st.lists(st.floats(-1, 1, width=32), min_size=3, max_size=6), st.floats(0, 2))
@@ -200,8 +197,6 @@ def test_pulses_return_to_zero(times, width):
         ]
     wave = Waveform(jnp.asarray(knots), "pulse", 2.0, times, width)
     np.testing.assert_array_equal(jax.jit(jax.vmap(wave))(clock), expected)
-    client = ClientWaveform(knots, "pulse", 2.0, times, width)
-    np.testing.assert_array_equal([client(t) for t in clock.tolist()], expected)
     both = Waveform(np.stack([knots, 2 * knots], 1), "pulse", 2.0, times, width)
     np.testing.assert_array_equal(both(0.5), [expected[150], 2 * expected[150]])
 

@@ -129,6 +129,7 @@ def test_a_run_that_has_no_room_leaves_the_one_that_was_there(runs, tmp_path):
     )
 
 
+@pytest.mark.addons
 @pytest.mark.slow
 @pytest.mark.parametrize("what", ["picture", "report", "analysis", "counterexample"])
 def test_results_that_have_no_room_leave_nothing_of_a_file(runs, tmp_path, what):

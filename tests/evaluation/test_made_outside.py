@@ -16,17 +16,20 @@ from verifai_jax.evaluation.replay import replay
 from verifai_jax.systems.ode.blocks import LookupTable, delay_line
 
 CAR = vj.Struct({"size": vj.Box(1, 2), "at": vj.Struct({"kind": vj.Categorical("a", "b")})})
-TRAFFIC = vj.events.Automaton(
-    start="s",
-    max_events=3,
-    min_events=2,
-    events={("s", "go"): {"to": "s", "wait": vj.Box(0.5, 1.0), "gap": vj.LogUniform(1, 9)}},
-)
+
+
+def traffic():
+    event = {"to": "s", "wait": vj.Box(0.5, 1.0), "gap": vj.LogUniform(1, 9)}
+    return vj.events.Automaton("s", {("s", "go"): event}, max_events=3, min_events=2)
+
+
+EVENTS = {
+    "events, two at least": traffic,
+    "a structure of all": lambda: vj.Struct({"cars": vj.Array(CAR, length=(2, 3)), "t": traffic()}),
+}
 DOMAINS = {
     "a varying number of structures": vj.Array(CAR, length=(1, 4)),
     "no fewer than three": vj.Array(vj.DiscreteBox(3, 5), length=(3, 4)),
-    "events, two at least": TRAFFIC,
-    "a structure of all": vj.Struct({"cars": vj.Array(CAR, length=(2, 3)), "t": TRAFFIC}),
     "numbers without zero": vj.Categorical(1.5, 2.5),
 }
 
@@ -40,9 +43,11 @@ def _problem(domain):
 
 
 @pytest.mark.parametrize("precision", ["float32", "float64"])
-@pytest.mark.parametrize("name", DOMAINS)
+@pytest.mark.parametrize(
+    "name", [*DOMAINS, *(pytest.param(name, marks=pytest.mark.addons) for name in EVENTS)]
+)
 def test_replays_are_planned_before_there_is_a_row(name, precision):
-    problem = _problem(DOMAINS[name])
+    problem = _problem(DOMAINS[name] if name in DOMAINS else EVENTS[name]())
     confirmer = Confirmer(problem, precision)
     confirmer.prepare()
     assert not confirmer.raised
@@ -57,9 +62,10 @@ def test_replays_are_planned_before_there_is_a_row(name, precision):
         assert wanted.shape == leaf.shape[1:]
 
 
+@pytest.mark.addons
 @pytest.mark.thorough
 def test_failures_with_items_are_confirmed():
-    run = vj.falsify(_problem(DOMAINS["a structure of all"]), "uniform", 24, progress=False)
+    run = vj.falsify(_problem(EVENTS["a structure of all"]()), "uniform", 24, progress=False)
     failing = run.table.all.query("rho < 0")
     assert len(failing) > 4
     assert set(failing["verdict"]) == {"confirmed"}

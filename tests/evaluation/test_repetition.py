@@ -262,6 +262,7 @@ def test_certificates_show_what_came_again():
     assert note.startswith("policy 0: the system has memory or chance of its own")
 
 
+@pytest.mark.addons
 def test_a_corpus_holds_what_comes_again(tmp_path):
     wavering = Counter(lambda a, count: 1.0 if count % 2 else -1.0)
     run = falsified(wavering, 10, batch=10, confirm=False)

@@ -25,9 +25,10 @@ def test_uniform_sampling_imports_no_other_search_and_no_other_engine():
     assert done.returncode == 0, done.stderr
     imported = set(done.stdout.split())
     searches = ("portfolio", "gradient", "descent", "mutation", "cross_entropy", "halton")
-    engines = ("executor_engine", "host_engine", "journal")
+    engines = ("host_engine", "journal")
     unwanted = {f"verifai_jax.search.{name}" for name in searches}
     assert not any(".addons.searches." in name for name in imported)
     unwanted |= {f"verifai_jax.evaluation.{name}" for name in engines}
     assert not imported & unwanted
+    assert not [name for name in imported if name.startswith("verifai_jax.addons.clusters")]
     assert "verifai_jax.search.uniform" in imported

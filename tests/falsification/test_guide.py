@@ -135,6 +135,7 @@ def test_a_black_box_is_guided_too_and_goes_on_as_it_was(tmp_path):
     assert vj.load(tmp_path / "run").guide["weight"] == 0.5
 
 
+@pytest.mark.addons
 @pytest.mark.thorough
 def test_workers_of_an_executor_tell_the_same():
     options = {"budget": 96, "batch": 16, "seed": 0, "diverse": "behaviour"}

@@ -141,9 +141,6 @@ def test_departures_are_those_of_the_density():
     np.testing.assert_allclose(found.slope(points)[:, free], rise[:, free], rtol=0.05, atol=0.05)
 
 
-DRIVE = vj.events.Automaton("a", {("a", "a"): {"wait": vj.Box(0.1, 1.0)}}, max_events=2)
-
-
 def test_searches_for_likely_failures_are_checked():
     search = Likeliest(CrossEntropy())
     assert search.wants.likelihood
@@ -156,5 +153,10 @@ def test_searches_for_likely_failures_are_checked():
         vj.falsify(HALF, objective="likely")  # pyright: ignore[reportArgumentType]
     with pytest.raises(ValueError, match="leave out one of them"):
         vj.falsify(HALF, objective="likelihood", diverse=True)
+
+
+@pytest.mark.addons
+def test_sequences_of_events_have_no_density():
+    drive = vj.events.Automaton("a", {("a", "a"): {"wait": vj.Box(0.1, 1.0)}}, max_events=2)
     with pytest.raises(NoDensityError, match="the prior of drive has no density"):
-        Improbability(vj.FeatureSpace({"drive": DRIVE}))
+        Improbability(vj.FeatureSpace({"drive": drive}))

@@ -240,6 +240,7 @@ def test_studies_of_a_row_begin_with_it(folder):
         assert "its number again" not in str(found)
 
 
+@pytest.mark.addons
 def test_a_saved_counterexample_knows_its_model(folder, tmp_path):
     run = vj.load(folder, slope())
     (path, *_) = run.save_counterexamples(tmp_path / "corpus", shrink=False)
@@ -252,6 +253,7 @@ def test_a_saved_counterexample_knows_its_model(folder, tmp_path):
     assert f"the model has changed since {len(other.replayed)} of them were saved" in str(other)
 
 
+@pytest.mark.addons
 def test_a_counterexample_that_gives_another_number_of_itself(tmp_path):
     problem = load_target("counting.py:memory", vj.Problem)
     run = falsified(problem)

@@ -9,14 +9,7 @@ if TYPE_CHECKING:
     from verifai_jax.counterexamples._explain import Explained as Explained
     from verifai_jax.counterexamples._explain import Influence as Influence
     from verifai_jax.counterexamples._explain import explain as explain
-    from verifai_jax.counterexamples._replay_counterexamples import CorpusReplay as CorpusReplay
-    from verifai_jax.counterexamples._replay_counterexamples import (
-        replay_counterexamples as replay_counterexamples,
-    )
     from verifai_jax.counterexamples._shrink import shrink as shrink
-    from verifai_jax.counterexamples.corpus import CorpusError as CorpusError
-    from verifai_jax.counterexamples.corpus import SavedCounterexample as SavedCounterexample
-    from verifai_jax.counterexamples.corpus import save_counterexamples as save_counterexamples
     from verifai_jax.counterexamples.shrunk import Shrunk as Shrunk
     from verifai_jax.evaluation.confirmations import Confirmation as Confirmation
     from verifai_jax.evaluation.confirmations import Confirmations as Confirmations

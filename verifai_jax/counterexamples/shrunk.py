@@ -8,8 +8,6 @@ from jaxtyping import Array, Float, Key
 
 from verifai_jax.core.display.figure import Drawn
 from verifai_jax.core.display.notebook import InNotebook
-from verifai_jax.core.messages.text import format_seconds
-from verifai_jax.core.values.events import Events
 from verifai_jax.counterexamples.selection import columns_at
 from verifai_jax.evaluation.replay import Replay, replay
 from verifai_jax.problem.problem import Problem
@@ -120,9 +118,9 @@ class Shrunk(Drawn, InNotebook):
                 for name, (was, now) in zip(names, self.changed.values(), strict=True)
             ]
         lines += [
-            f"  {name}: {_events(value)}"
-            for name, value in self.features.items()
-            if isinstance(value, Events)
+            f"  {name}: {words}"
+            for name, domain in self.problem.space.domains.items()
+            if (words := domain.words_for(self.features[name]))
         ]
         if len(self.problem.formulas) > 1:
             lines.append(f"  {self._breaks()}")
@@ -157,11 +155,6 @@ class Shrunk(Drawn, InNotebook):
 
 def _of(count: int, d: int) -> str:
     return f"{count} of {d} features" if d != 1 else "its one feature"
-
-
-def _events(events: Events) -> str:
-    each = [f"{event['kind']} at {format_seconds(event['time'], 4)}" for event in events.listed()]
-    return f"{len(each)} event{'s' * (len(each) != 1)}{': ' * bool(each)}{', '.join(each)}"
 
 
 def _shown(value: object) -> str:

@@ -10,7 +10,7 @@ executor. The random key of a simulation follows from its number.
 
 from collections.abc import Callable
 from functools import partial
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Array, Float, Key
@@ -28,18 +28,30 @@ from verifai_jax.problem.problem import Problem
 
 if TYPE_CHECKING:
     from verifai_jax.core.compute.executors import Executor
-    from verifai_jax.evaluation.executor_engine import ExecutorEngine, Pending
     from verifai_jax.evaluation.host_engine import HostEngine
     from verifai_jax.evaluation.journal import Journal
     from verifai_jax.evaluation.unfinished import Part
 ENGINES = "verifai_jax.engines"
-"""Entry points of engines around XLA's; those of add-ons take `(engine, wanted, budget)`."""
-NATIVE = "native"
+"""Entry points of engines: one around XLA's, and one that sends rows to an executor's workers."""
+NATIVE, EXECUTOR = "native", "executor"
 NOT_NATIVE = (
     "simulated without native code, which supports only systems that JAX traces, in single "
     "precision and in this process"
 )
 """Note of a run for which requested native code was not possible."""
+
+
+@runtime_checkable
+class Pending(Protocol):
+    """Points on their way to the workers of an executor."""
+
+    def result(self) -> Verdicts:
+        """Wait for the verdicts, in the order of the points."""
+        ...
+
+    def cancel(self) -> None:
+        """Remove points that have not started from the workers' queue."""
+        ...
 
 
 class Evaluator:
@@ -93,12 +105,10 @@ class Evaluator:
         self._dtype = np.dtype(precision if self.given else "float32")
         self.engine: Any
         self._host: HostEngine | None = None
-        self.sender: ExecutorEngine | None = None
+        self.sender: Any = None
         self._native: Any = None
         if executor is not None:
-            from verifai_jax.evaluation import executor_engine
-
-            self.engine = self.sender = executor_engine.ExecutorEngine(
+            self.engine = self.sender = extension(ENGINES, EXECUTOR)(
                 problem, batch, executor, gradient=gradient, clauses=clauses,
                 precision=precision, journal=journal, target=target, guidance=guidance,
                 given=self.given,

@@ -18,12 +18,13 @@ from typing import TYPE_CHECKING, Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Int, Key, PyTree, UInt32
+from jaxtyping import Array, Int, Key, PyTree
 
 from verifai_jax.core.compute.compilation import Slot
 from verifai_jax.core.compute.devices import enable_compile_cache
 from verifai_jax.core.compute.keys import as_key, simulation_key
-from verifai_jax.core.compute.precision import in_precision, reproducible_settings
+from verifai_jax.core.compute.precision import in_precision
+from verifai_jax.core.display.extensions import verb
 from verifai_jax.core.display.progress import count_done
 from verifai_jax.core.messages.text import format_error
 from verifai_jax.core.values.trace import Status
@@ -34,7 +35,7 @@ from verifai_jax.problem.problem import Problem
 from verifai_jax.systems.base import System
 
 if TYPE_CHECKING:
-    from verifai_jax.core.compute.executors import Executor, Shipment
+    from verifai_jax.core.compute.executors import Executor
 ONE_BY_ONE = 16
 """Rows up to which they are replayed one by one: that program is compiled much sooner."""
 SEEDS = 32
@@ -189,15 +190,10 @@ REPLAYS: Slot[tuple[str, int, int], Engine] = Slot("replays")
 
 
 class HostReplays:
-    """Replays of a problem on the host, in this process or on an executor's workers.
-
-    A simulator that exists only on the workers cannot be started here, and a run shared by many
-    workers would wait for one process.
+    """Replays of a problem on the host, in this process.
 
     **Arguments:**
     - `problem`, `precision`, `key`: as in `Replays`.
-    - `executor`: an executor with `submit`; this process simulates when left out.
-    - `target`: the name of the problem, for an executor that cannot pickle it.
 
     `draws` is False: a black box gets an integer seed, which is the same in every precision.
     """
@@ -205,31 +201,13 @@ class HostReplays:
     draws = False
     compile_seconds = 0.0
 
-    def __init__(
-        self,
-        problem: Problem,
-        precision: str,
-        key: Key[Any, ""],
-        executor: "Executor | None" = None,
-        target: str | None = None,
-    ) -> None:
+    def __init__(self, problem: Problem, precision: str, key: Key[Any, ""]) -> None:
         from verifai_jax.evaluation.host_engine import HostEngine
 
         self.problem, self.precision, self.key = problem, precision, key
         self.refiner = Refiner(problem.system)
         enable_compile_cache()
         self._engine = HostEngine(problem, precision)
-        self._executor = executor
-        if executor is not None:
-            from verifai_jax.core.compute.executors import check_executor, ship
-            from verifai_jax.evaluation.executor_engine import SHIPMENTS, identity
-
-            check_executor(executor)
-            self._shipment = problem.programs.get(
-                SHIPMENTS,
-                (type(executor).__module__ + type(executor).__name__, target),
-                lambda: ship(problem, executor, target, identity),
-            )
 
     def begin_compiling(self, factor: int, count: int, times: int) -> None:
         """Do nothing, because a black box is not compiled."""
@@ -238,8 +216,6 @@ class HostReplays:
         self, factor: int, each: Sequence[PyTree], numbers: Int[np.ndarray, " n"]
     ) -> list[Verdicts]:
         """Simulate the rows of these numbers again, with a `factor` times smaller step."""
-        if self._executor is not None:
-            return [self._sent(features, numbers, factor, False) for features in each]
         return self._replay(self.refiner(factor), each, numbers)
 
     def anew(self, features: PyTree, numbers: Int[np.ndarray, " n"]) -> list[Verdicts]:
@@ -247,8 +223,6 @@ class HostReplays:
 
         If the system cannot be copied, it is used itself.
         """
-        if self._executor is not None:
-            return [self._sent(features, numbers, 1, True)]
         return self._replay(self._renewed, [features], numbers)
 
     @cached_property
@@ -276,33 +250,6 @@ class HostReplays:
             count_done(count)
         return parts
 
-    def _sent(
-        self, features: PyTree, numbers: Int[np.ndarray, " n"], factor: int, anew: bool
-    ) -> Verdicts:
-        from verifai_jax.core.compute.executors import gather
-        from verifai_jax.evaluation.executor_engine import TOGETHER
-
-        executor, system = self._executor, self.problem.system
-        assert executor is not None
-        backend = system.backend if system.backends else None
-        how = (backend, self.precision, factor, anew)
-        words = np.asarray(jax.random.key_data(self.key))
-        step = TOGETHER if system.can_simulate_batch else 1
-        futures = []
-        for start in range(0, len(numbers), step):
-            block = slice(start, start + step)
-            leaves = [np.asarray(leaf)[block] for leaf in jax.tree.leaves(features)]
-            given = (self._shipment, how, words, leaves, numbers[block])
-            futures.append(executor.submit(replay_block, *given))
-        found: dict[int, Verdicts] = {}
-
-        def ended(index: int, result: dict[str, Any]) -> None:
-            found[index] = Verdicts(**result)
-            count_done(len(found[index].status))
-
-        gather(futures, ended)
-        return Verdicts.concatenate([found[index] for index in range(len(futures))])
-
 
 def finest_replays(
     problem: Problem,
@@ -315,12 +262,17 @@ def finest_replays(
 
     **Arguments:**
     - `run`: precision of the run.
-    - `key`, `executor`, `target`: as in `HostReplays`.
+    - `key`: as in `HostReplays`.
+    - `executor`, `target`: an executor whose workers simulate the rows of a black box, and the name
+      of the problem for one that cannot pickle it.
     **Returns:** the replays, None if they cannot be traced; notes on checks that are left out; the
     error raised in tracing, empty if there was none.
     """
     if problem.black_box:
-        replays = HostReplays(problem, run, key, executor, target)
+        if executor is None:
+            replays = HostReplays(problem, run, key)
+        else:
+            replays = verb("replays")(problem, run, key, executor, target)
         return replays, ["not checked in float64: a black box"], ""
     note = "not checked in float64: in it the system would draw other random numbers"
     if run != "float64" and problem.system.can_refine:
@@ -344,36 +296,6 @@ def finest_replays(
     except Exception as error:
         raised = raised or f"the replay raised: {format_error(error)}"
         return None, [note, f"not simulated again: {format_error(error)}"], raised
-
-
-@reproducible_settings()
-def replay_block(
-    shipment: "Shipment[Problem]",
-    how: tuple[str | None, str, int, bool],
-    words: UInt32[np.ndarray, "2"],
-    leaves: Sequence[np.ndarray],
-    numbers: Int[np.ndarray, " n"],
-) -> dict[str, Any]:
-    """Simulate rows again; called by a worker.
-
-    **Arguments:**
-    - `shipment`: the pickled problem.
-    - `how`: backend, precision, divisor of the step, and whether to use a new copy of the system.
-    - `words`: the two words of the key of the run's simulations.
-    - `leaves`: the leaves of the features, `[n, ...]` each.
-    **Returns:** `rho`, `status`, `violated` and `messages` of the rows.
-    """
-    from verifai_jax.evaluation.worker import computing
-
-    backend, precision, factor, anew = how
-    problem = shipment.thing
-    if backend is not None:
-        problem = problem.on_backend(backend)
-    features = jax.tree.unflatten(jax.tree.structure(problem.space.feature_form), leaves)
-    replays = HostReplays(problem, precision, as_key(words))
-    with computing:
-        [found] = replays.anew(features, numbers) if anew else replays(factor, [features], numbers)
-    return {name: getattr(found, name) for name in ("rho", "status", "violated", "messages")}
 
 
 @jax.jit

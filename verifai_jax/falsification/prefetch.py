@@ -13,18 +13,15 @@ from collections import deque
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import AbstractContextManager, nullcontext
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
 from verifai_jax.core.compute.precision import reproducible_settings
-from verifai_jax.evaluation.evaluator import Evaluator
+from verifai_jax.evaluation.evaluator import Evaluator, Pending
 from verifai_jax.evaluation.verdicts import Verdicts
 from verifai_jax.search.proposals import Proposals
-
-if TYPE_CHECKING:
-    from verifai_jax.evaluation.executor_engine import Pending
 
 AHEAD = 3
 """Rounds of this process that are simulated or wait to be, so that one is ready while an earlier
@@ -35,7 +32,7 @@ class _Round(NamedTuple):
     """One round: its points, its offset among the rows sent together, and the state after it."""
 
     points: Float[Any, "n d"]
-    pending: "Pending | Future[Verdicts]"
+    pending: Pending | Future[Verdicts]
     begin: int
     checkpoint: dict[str, Any]
 

@@ -394,13 +394,11 @@ class Run(InNotebook):
 
         **Arguments:**
         - `folder`: the folder, made if there is none.
-        - `options`: the options of `counterexamples.save_counterexamples`: `max_count`, `shrink`,
-          `budget`.
+        - `options`: `max_count`, `shrink` (whether each is shrunk first), and `budget`, the
+          simulations to shrink each one.
         **Raises:** `ValueError` for a run without its problem or without a counterexample.
         """
-        return lazy_import("verifai_jax.counterexamples", "save_counterexamples")(
-            self, folder, **options
-        )
+        return verb("save_counterexamples")(self, folder, **options)
 
     def summary(self) -> str:
         """Write what failed, how often, the worst case and how to replay it."""

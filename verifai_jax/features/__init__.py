@@ -3,7 +3,6 @@
 from verifai_jax.features.arrays import Array as Array
 from verifai_jax.features.arrays import Items as Items
 from verifai_jax.features.arrays import VariableArray as VariableArray
-from verifai_jax.features.automaton import Automaton as Automaton
 from verifai_jax.features.box import Box as Box
 from verifai_jax.features.box import DiscreteBox as DiscreteBox
 from verifai_jax.features.choice import Categorical as Categorical
@@ -18,10 +17,8 @@ from verifai_jax.features.families import Exponential as Exponential
 from verifai_jax.features.families import LogNormal as LogNormal
 from verifai_jax.features.families import Triangular as Triangular
 from verifai_jax.features.families import Weibull as Weibull
-from verifai_jax.features.reactive import Reactive as Reactive
 from verifai_jax.features.signal import Signal as Signal
 from verifai_jax.features.space import FeatureSpace as FeatureSpace
 from verifai_jax.features.tabulated import Beta as Beta
 from verifai_jax.features.tabulated import Empirical as Empirical
 from verifai_jax.features.tabulated import Gamma as Gamma
-from verifai_jax.features.transitions import Past as Past

@@ -4,14 +4,13 @@
     DiscreteBox(1, 4), DiscreteBox([0, 0], [3, 5])      # box.py: an integer, a vector of two
     Categorical("ppo", "sac"), Constant(9.8)            # choice.py
     Array(Struct({"x": Box(0, 50), "v": Box(0, 20)}), length=3)             # compound.py, arrays.py
-    Automaton("idle", {("idle", "gust"): dict(wait=Box(1, 5))}, max_events=3)     # automaton.py
 
 The unit cube is the probability space: uniform coordinates give the prior on the values.
 """
 
 import abc
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from decimal import Decimal
 from fractions import Fraction
 from typing import Any, ClassVar, Literal, NamedTuple, Protocol, TypeAlias, TypeVar
@@ -77,9 +76,10 @@ class Domain(ForUsers, abc.ABC):
     _internal = frozenset((
         "arguments", "check_reachable", "closed", "coerce", "coordinates", "ends", "facts",
         "from_columns", "graph", "held_at", "items", "labels", "lengths", "levels", "monotone",
-        "coverage_id_count", "coverage_ids", "named", "nominal", "numeric", "ordered", "parts",
-        "refine", "refined", "rounded", "sequences", "settled", "signals", "spans", "tail",
-        "tailed", "to_columns", "tuning", "uniform", "used", "weights", "without", "words",
+        "coverage_id_count", "coverage_ids", "from_plain", "named", "nominal", "numeric", "ordered",
+        "parts", "plain", "refine", "refined", "rounded", "sequences", "settled", "signals",
+        "spans", "tail", "tailed", "to_columns", "tuning", "uniform", "used", "weights", "without",
+        "words", "words_for",
     ))  # fmt: skip
     arguments: ClassVar[tuple[str, ...] | None] = None
     """Attributes from which it can be rebuilt; None for a domain defined by a user."""
@@ -209,6 +209,24 @@ class Domain(ForUsers, abc.ABC):
     def words(self) -> str:
         """Describe the possible values and their probabilities in English."""
         return one_line(repr(self))
+
+    def words_for(self, value: PyTree) -> str:
+        """Describe a value in words, if its coordinates alone do not tell; empty otherwise."""
+        return ""
+
+    def plain(self, nested: "Callable[[Domain], dict[str, Any]]") -> dict[str, Any] | None:
+        """Return what `from_plain` needs, for JSON; None if it is `arguments`.
+
+        `nested` converts a domain within this one.
+        """
+        return None
+
+    @classmethod
+    def from_plain(
+        cls, data: Mapping[str, Any], nested: "Callable[[Mapping[str, Any]], Domain]"
+    ) -> "Domain":
+        """Build the domain from what `plain` returned; `nested` builds one within this one."""
+        return cls(**{name: data[name] for name in cls.arguments or ()})
 
     def parts(self, name: str) -> "tuple[tuple[str, Domain], ...]":
         """Return the domains of a value's parts, with the names of their columns.

@@ -10,9 +10,9 @@ from typing import Any
 from jaxtyping import PyTree
 
 from verifai_jax.core.compute.precision import in_precision
+from verifai_jax.core.display.extensions import extension, extensions
 from verifai_jax.core.messages.errors import unknown_name
 from verifai_jax.features.arrays import Array, VariableArray
-from verifai_jax.features.automaton import Automaton
 from verifai_jax.features.box import Box
 from verifai_jax.features.choice import Categorical
 from verifai_jax.features.compound import Struct
@@ -22,6 +22,8 @@ from verifai_jax.features.fixed import Fixed
 from verifai_jax.features.signal import Signal
 from verifai_jax.features.tabulated import Empirical
 
+GROUP = "verifai_jax.domains"
+"""Entry points of the domains of add-ons and of other packages, each named as its class."""
 SIGNAL_OPTIONS = ("times", "width")
 """Arguments of a Signal that are written where they are given."""
 
@@ -49,8 +51,8 @@ def to_plain(domain: Domain) -> dict[str, Any]:
             return {"kind": "Fixed", "domain": to_plain(domain.domain), "row": row}
         case Distribution():
             return {"kind": "Distribution", "name": domain.name}
-        case Automaton():
-            return _automaton_to_plain(domain)
+    if (own := domain.plain(to_plain)) is not None:
+        return {"kind": type(domain).__name__, **own}
     if domain.arguments is None:
         raise ValueError(f"{domain!r} is a domain of your own, which JSON cannot describe")
     data: dict[str, Any] = {"kind": type(domain).__name__}
@@ -110,11 +112,11 @@ def _build(data: Mapping[str, Any], distributions: Mapping[str, Distribution]) -
                     "contain; give it: from_json(data, distributions={...})"
                 )
             return distributions[data["name"]]
-        case "Automaton":
-            return _automaton_from_plain(data, distributions)
+    if kind in extensions(GROUP):
+        return extension(GROUP, kind).from_plain(data, lambda one: from_plain(one, distributions))
     kinds = {each.__name__: each for each in _kinds(Domain)}
     if kind not in kinds:
-        others = ("Struct", "Categorical", "Fixed", "Distribution", "Automaton")
+        others = ("Struct", "Categorical", "Fixed", "Distribution", *extensions(GROUP))
         raise unknown_name("kind of domain", kind, (*kinds, *others))
     arguments: dict[str, Any] = {
         name: from_plain(data[name], distributions) if name == "domain" else data[name]
@@ -135,31 +137,6 @@ def _kinds(kind: type[Domain]) -> Iterator[type[Domain]]:
         if below.__module__.startswith("verifai_jax.") and "arguments" in vars(below):
             yield below
         yield from _kinds(below)
-
-
-def _automaton_to_plain(domain: Automaton) -> dict[str, Any]:
-    events = []
-    for each in domain.transitions:
-        if each.guard is not None:
-            raise ValueError(f"the guard of {each.label} is code, which JSON cannot contain")
-        options = {"to": each.to, "weight": each.weight, "after": list(each.after)}
-        domains = [[name, to_plain(part)] for name, part in each.parameters]
-        event = {**options, "at_most": each.at_most, "wait": to_plain(each.wait)}
-        events.append([each.source, each.name, {**event, "parameters": domains}])
-    ends = {"min_events": domain.min_events, "max_events": domain.max_events}
-    return {"kind": "Automaton", "start": domain.start, "events": events, **ends}
-
-
-def _automaton_from_plain(
-    data: Mapping[str, Any], distributions: Mapping[str, Distribution]
-) -> Automaton:
-    events: dict[tuple[str, str], dict[str, Any]] = {}
-    for source, name, event in data["events"]:
-        options = {key: event[key] for key in ("to", "weight", "after", "at_most")}
-        options["wait"] = from_plain(event["wait"], distributions)
-        parameters = {key: from_plain(part, distributions) for key, part in event["parameters"]}
-        events[source, name] = {**options, **parameters}
-    return Automaton(data["start"], events, data["max_events"], data["min_events"])
 
 
 def _lists(value: PyTree) -> PyTree:

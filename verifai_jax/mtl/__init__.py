@@ -29,8 +29,7 @@ from verifai_jax.mtl.operators import (
     sometime_during,
     until,
 )
-from verifai_jax.mtl.plot import draw
-from verifai_jax.mtl.requirements import Requirement, read_requirements, write_requirements
+from verifai_jax.mtl.requirements import Requirement
 from verifai_jax.mtl.rewriting import nnf, simplify
 from verifai_jax.mtl.semantics import Semantics, boolean, hard, smooth
 from verifai_jax.mtl.setting import HorizonError, SamplingError
@@ -38,11 +37,11 @@ from verifai_jax.mtl.setting import HorizonError, SamplingError
 __all__ = [
     "FALSE", "TRUE", "End", "Explanation", "Expression", "Formula", "FormulaSyntaxError",
     "HorizonError", "IntervalError", "Online", "Requirement", "SamplingError", "Semantics",
-    "SmoothingError", "always", "anneal", "boolean", "draw", "duration", "during",
+    "SmoothingError", "always", "anneal", "boolean", "duration", "during",
     "eventually", "explain", "fall", "hard", "historically", "latex", "next_", "nnf",
-    "normalize", "once", "online", "parse", "phase", "prev", "read_requirements", "rise",
+    "normalize", "once", "online", "parse", "phase", "prev", "rise",
     "robustness", "robustness_signal", "satisfied", "signal", "simplify", "since", "smooth",
-    "smoothing_error", "sometime_during", "until", "write_requirements",
+    "smoothing_error", "sometime_during", "until",
 ]  # fmt: skip
 GROUP = "verifai_jax.formulas"
 """Entry points of modules whose names belong here, too: what add-ons do with formulas."""

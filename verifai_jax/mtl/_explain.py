@@ -3,7 +3,6 @@
     why = explain("always[0, 4] (abs(x) <= 2.4 & abs(theta) <= 0.2095)", trace)
     print(why)                                        # the path, the tree, the critical instants
     why.predicate, why.time, why.robustness
-    draw(why)                                         # see `plot.py`
 
 The hard robustness is the value of one predicate at one instant, found by walking from the root to
 the operand that decides each minimum or maximum.

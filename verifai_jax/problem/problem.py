@@ -40,7 +40,7 @@ from verifai_jax.features import Domain, FeatureSpace
 from verifai_jax.mtl import Formula, hard, parse, robustness
 from verifai_jax.mtl.deciding import leaves_of
 from verifai_jax.mtl.evaluate import End
-from verifai_jax.mtl.requirements import Requirement, read_requirements
+from verifai_jax.mtl.requirements import Requirement
 from verifai_jax.mtl.semantics import Semantics
 from verifai_jax.problem.behaviour import Behaviour
 from verifai_jax.problem.guide import Guide, Term
@@ -427,7 +427,7 @@ def _rulebook(
 
 def _requirements(given: str | Path | Iterable[Requirement] | None) -> tuple[Requirement, ...]:
     if isinstance(given, str | Path):
-        return read_requirements(given, need_formulas=False)
+        return verb("requirements")(given, need_formulas=False)
     found = tuple(given or ())
     if other := next((each for each in found if not isinstance(each, Requirement)), None):
         raise ProblemError(

@@ -2,7 +2,7 @@ import jax
 import numpy as np
 import pandas as pd
 
-from tests.features.test_automaton import POINTS, SPACE
+from tests.addons.events.test_automaton import POINTS, SPACE
 from verifai_jax.addons.analysis.data.columns import feature_columns
 
 

@@ -9,8 +9,8 @@ import pytest
 
 import verifai_jax as vj
 from verifai_jax.addons import faults
+from verifai_jax.addons.simulators.remote_client import serve
 from verifai_jax.core.messages.errors import UnknownNameError
-from verifai_jax.remote_client import serve
 
 KEY = jax.random.key(3)
 NO_KINDS = ("AtMost", "Fault", "on_host")

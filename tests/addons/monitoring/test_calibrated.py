@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from verifai_jax import mtl
+from verifai_jax.addons.monitoring.conformal import conformal_p_value, conformal_threshold
 from verifai_jax.core.messages.errors import UnknownNameError
 from verifai_jax.core.values.trace import Trace
-from verifai_jax.statistics.conformal import conformal_p_value, conformal_threshold
 
 DT, LENGTH = 0.1, 40
 

@@ -8,9 +8,9 @@ from checked_types import unchecked
 
 import verifai_jax as vj
 from verifai_jax.addons.simulators.remote.wire import Frames, trace_of
+from verifai_jax.addons.simulators.remote_client import encoded
 from verifai_jax.core.values.trace import Status, Trace
 from verifai_jax.mtl import online, read, resample, robustness, satisfied
-from verifai_jax.remote_client import encoded
 
 HIDDEN = np.ma.masked_array([0.0, 9e9, 0.0], mask=[0, 1, 0])
 

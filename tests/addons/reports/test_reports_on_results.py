@@ -12,12 +12,12 @@ from planted_sweep import SPACE, planted_rows, record_of
 
 import verifai_jax as vj
 from verifai_jax.addons.estimation.comparison.result import Compared, Comparison
+from verifai_jax.addons.estimation.paired_rates import paired_rates
 from verifai_jax.addons.estimation.result import Estimate
 from verifai_jax.addons.reports.stored import read_result
 from verifai_jax.addons.training.sweeps.result import Sweep, load_sweep
 from verifai_jax.cli.json_output import as_plain
 from verifai_jax.cli.main import main
-from verifai_jax.statistics.paired_rates import paired_rates
 
 PROBLEM = vj.Problem(
     "fall",

@@ -9,6 +9,7 @@ import pytest
 from PIL import Image, ImageSequence
 
 import verifai_jax as vj
+from verifai_jax.addons.simulators.pictures.frames import HEADER, film_samples, labelled
 from verifai_jax.addons.simulators.pictures.mujoco_motion import record
 from verifai_jax.addons.simulators.pictures.mujoco_scene import (
     NoRenderer,
@@ -18,7 +19,6 @@ from verifai_jax.addons.simulators.pictures.mujoco_scene import (
 )
 from verifai_jax.core.messages.errors import UnknownNameError
 from verifai_jax.evaluation.replay import replay
-from verifai_jax.pictures.film import HEADER, film_samples, labelled
 
 # A red ball that rolls along x, far from the cameras of the model: one looks at a wall, one away.
 HIDDEN = """

@@ -13,12 +13,12 @@ from PIL import Image, ImageSequence
 
 import verifai_jax as vj
 from verifai_jax.addons.simulators.mujoco.system import mujoco
+from verifai_jax.addons.simulators.pictures import frames as films
 from verifai_jax.addons.simulators.pictures import mujoco_motion
 from verifai_jax.addons.simulators.pictures import mujoco_scene as scene
 from verifai_jax.core.messages.errors import UnknownNameError
 from verifai_jax.evaluation.replay import replay
 from verifai_jax.pictures import animate
-from verifai_jax.pictures import film as films
 from verifai_jax.pictures.run_pictures import write_replay_pictures
 
 # A red ball above the ground, seen from the side; 2 m of height are 60 pixels.
@@ -201,9 +201,7 @@ try:
 except Exception:  # Its own import needs what the setting names.
     print("no MuJoCo")
     sys.exit()
-from verifai_jax.pictures import film as films
-from verifai_jax.pictures import mujoco_motion
-from verifai_jax.pictures import mujoco_scene as scene
+from verifai_jax.addons.simulators.pictures import mujoco_scene as scene
 try:
     with scene.canvas(mujoco.MjModel.from_xml_string({BALL!r}), (32, 32)):
         print("drew")

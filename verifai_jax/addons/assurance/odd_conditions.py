@@ -17,8 +17,8 @@ from typing import TypeAlias
 import jax
 import numpy as np
 
+from verifai_jax.addons.monitoring.units import plain_unit
 from verifai_jax.core.messages.errors import unknown_name
-from verifai_jax.mtl.units import plain_unit
 
 Values: TypeAlias = Mapping[str, np.ndarray | jax.Array]
 """Values of attributes, of the same shape."""

@@ -14,7 +14,8 @@ from collections.abc import Callable, Iterator
 from typing import Any
 from urllib.parse import parse_qsl, urlsplit
 
-from verifai_jax.core.compute.executors import Executor, Shipment
+from verifai_jax.addons.clusters.executors import Shipment
+from verifai_jax.core.compute.executors import Executor
 from verifai_jax.core.messages.errors import require, unknown_name
 
 KINDS = ("dask", "ray", "slurm")

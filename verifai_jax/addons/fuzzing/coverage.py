@@ -3,7 +3,7 @@
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import cast
+from typing import TYPE_CHECKING, cast
 
 import numpy as np
 from jaxtyping import Bool, Int
@@ -12,9 +12,11 @@ from verifai_jax.core.display.figure import Figure
 from verifai_jax.core.display.lazy import lazy_import
 from verifai_jax.core.display.notebook import InNotebook
 from verifai_jax.core.values.trace import Status
-from verifai_jax.features import Automaton, Domain
+from verifai_jax.features import Domain
 from verifai_jax.problem.problem import Problem
 
+if TYPE_CHECKING:
+    from verifai_jax.addons.events.automaton import Automaton
 MAX_NAMED = 4
 """Uncovered names that are listed at most."""
 
@@ -75,7 +77,7 @@ class FuzzCoverage(InNotebook):
     """Coverage of a run; `parts` holds a `Covered` for each feature and kind."""
 
     parts: tuple[Covered, ...]
-    automata: tuple[tuple[str, Automaton], ...] = ()
+    automata: "tuple[tuple[str, Automaton], ...]" = ()
 
     @classmethod
     def of(cls, problem: Problem, counts: Int[np.ndarray, " ids"]) -> "FuzzCoverage":
@@ -129,16 +131,16 @@ class FuzzCoverage(InNotebook):
     __repr__ = __str__
 
 
-def _automata(domain: Domain, name: str) -> Iterator[tuple[str, Automaton]]:
+def _automata(domain: Domain, name: str) -> "Iterator[tuple[str, Automaton]]":
     """Yield the automata of a space in the order of their coverage ids."""
     if domain.graph is not None:
-        yield name, cast(Automaton, domain)
+        yield name, cast("Automaton", domain)
     for field, part in domain.named:
         yield from _automata(part, f"{name}.{field}" if name else field)
 
 
 def _of_automaton(
-    name: str, automaton: Automaton, counts: Int[np.ndarray, " ids"]
+    name: str, automaton: "Automaton", counts: Int[np.ndarray, " ids"]
 ) -> list[Covered]:
     graph, labels = automaton.graph, [each.label for each in automaton.transitions]
     taken, pairs = counts[: len(labels)], counts[len(labels) :]

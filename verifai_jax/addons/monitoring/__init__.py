@@ -33,8 +33,15 @@ if TYPE_CHECKING:
     from verifai_jax.addons.monitoring.mutation import mutants as mutants
     from verifai_jax.addons.monitoring.parametric import Template as Template
     from verifai_jax.addons.monitoring.parametric import templates as templates
+    from verifai_jax.addons.monitoring.plot import draw as draw
     from verifai_jax.addons.monitoring.recording import TimeColumnError as TimeColumnError
     from verifai_jax.addons.monitoring.recording import read as read
+    from verifai_jax.addons.monitoring.requirement_files import (
+        read_requirements as read_requirements,
+    )
+    from verifai_jax.addons.monitoring.requirement_files import (
+        write_requirements as write_requirements,
+    )
     from verifai_jax.addons.monitoring.resampling import resample as resample
     from verifai_jax.addons.monitoring.watching import Watch as Watch
     from verifai_jax.addons.monitoring.watching import watch as watch

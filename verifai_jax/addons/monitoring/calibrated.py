@@ -24,6 +24,7 @@ from typing import Any, Generic, NamedTuple, Protocol, TypeVar
 import numpy as np
 from jaxtyping import Float
 
+from verifai_jax.addons.monitoring.conformal import conformal_p_value, conformal_threshold
 from verifai_jax.core.messages.errors import missing_name
 from verifai_jax.core.values.trace import Trace
 from verifai_jax.mtl import formula as ast
@@ -31,7 +32,6 @@ from verifai_jax.mtl._parse import parse
 from verifai_jax.mtl.formula import Formula, Interval
 from verifai_jax.mtl.host_values import HostValues
 from verifai_jax.statistics.binomial import Rate, clopper_pearson
-from verifai_jax.statistics.conformal import conformal_p_value, conformal_threshold
 
 Said = TypeVar("Said")
 Rows = Float[np.ndarray, "time columns"]

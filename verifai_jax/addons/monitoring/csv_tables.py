@@ -11,7 +11,7 @@ from typing import Any
 
 from verifai_jax.addons.monitoring.columns import GAPS, TRUTHS, is_numeric
 from verifai_jax.addons.monitoring.containers import UNIT, Table
-from verifai_jax.mtl.units import NONE
+from verifai_jax.addons.monitoring.units import NONE
 
 NUMBER = re.compile(r'^\s*"?[-+]?[.,]?\d')
 """The beginning of a number, or of a date."""

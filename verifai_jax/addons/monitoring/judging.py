@@ -17,6 +17,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from verifai_jax.addons.clusters.executors import check_executor, gather
 from verifai_jax.addons.monitoring import resampling
 from verifai_jax.addons.monitoring.columns import LeftOut
 from verifai_jax.addons.monitoring.containers import Episode
@@ -24,8 +25,10 @@ from verifai_jax.addons.monitoring.dense import DenseValues, NotDense
 from verifai_jax.addons.monitoring.judgement import Judgement, Row
 from verifai_jax.addons.monitoring.recorded import Recording, Recordings, named_recordings
 from verifai_jax.addons.monitoring.recording import read
+from verifai_jax.addons.monitoring.requirement_files import Requirements, requirements_of
 from verifai_jax.addons.monitoring.resampling import Method, Missing
-from verifai_jax.core.compute.executors import Executor, check_executor, gather
+from verifai_jax.addons.monitoring.units import plain_unit, unit_of, units_of
+from verifai_jax.core.compute.executors import Executor
 from verifai_jax.core.display.progress import count_done, shows_progress
 from verifai_jax.core.messages.text import format_time, listed, one_line
 from verifai_jax.core.user_code.sources import Source, hashed_files
@@ -34,10 +37,9 @@ from verifai_jax.mtl._robustness import first_nan
 from verifai_jax.mtl.evaluate import End
 from verifai_jax.mtl.formula import Formula
 from verifai_jax.mtl.host_values import HostValues
-from verifai_jax.mtl.requirements import Requirement, Requirements, requirements_of
+from verifai_jax.mtl.requirements import Requirement
 from verifai_jax.mtl.setting import SamplingError, check_horizon, check_reach, check_signals, period
 from verifai_jax.mtl.shortfalls import shortfalls_in
-from verifai_jax.mtl.units import plain_unit, unit_of, units_of
 
 _text = functools.lru_cache(1024)(Formula.__str__)
 """A fleet asks the same of a few formulas again and again."""

@@ -19,6 +19,8 @@ from verifai_jax.addons.monitoring.distinguishing import free_difference
 from verifai_jax.addons.monitoring.findings import Finding, Findings
 from verifai_jax.addons.monitoring.free_traces import FreeTraces
 from verifai_jax.addons.monitoring.recorded import Recordings, named_traces
+from verifai_jax.addons.monitoring.requirement_files import Requirements, requirements_of
+from verifai_jax.addons.monitoring.units import plain_unit, unit_of, units_of
 from verifai_jax.core.messages.errors import nearest_names
 from verifai_jax.core.messages.text import counted, listed
 from verifai_jax.core.values.trace import Trace
@@ -28,10 +30,9 @@ from verifai_jax.mtl.evaluate import End
 from verifai_jax.mtl.expression import durations_in
 from verifai_jax.mtl.formula import FALSE, TRUE, Formula, surface
 from verifai_jax.mtl.host_values import HostValues
-from verifai_jax.mtl.requirements import Requirement, Requirements, requirements_of
+from verifai_jax.mtl.requirements import Requirement
 from verifai_jax.mtl.rewriting import nnf, replaced
 from verifai_jax.mtl.shortfalls import Shortfall, shortfalls, shortfalls_in
-from verifai_jax.mtl.units import plain_unit, unit_of, units_of
 
 FAR, NEVER = 2.5, 0.5
 """Distances of a bound from all values, in widths of their range, from which on a predicate that

@@ -13,9 +13,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from verifai_jax.addons.monitoring.columns import numbers_of
+from verifai_jax.addons.monitoring.units import NONE
 from verifai_jax.core.messages.text import format_seconds
 from verifai_jax.mtl.setting import resolution_of
-from verifai_jax.mtl.units import NONE
 
 WORDS = {
     word: seconds

@@ -21,8 +21,10 @@ from jaxtyping import Float
 
 from verifai_jax.addons.synthesis import arguments, optimize
 from verifai_jax.addons.synthesis.adversary import attack
+from verifai_jax.addons.synthesis.budget import Budget, split_budget
 from verifai_jax.addons.synthesis.failure_counts import FailureCounts
 from verifai_jax.addons.synthesis.held_out import held_out
+from verifai_jax.addons.synthesis.max_min import max_min_step
 from verifai_jax.addons.synthesis.parametric import FeatureParameters, Parametric
 from verifai_jax.addons.synthesis.region import Region, region_of
 from verifai_jax.addons.synthesis.results import Repair, Round
@@ -30,12 +32,10 @@ from verifai_jax.core.display.progress import shows_progress
 from verifai_jax.core.messages.checks import check_options
 from verifai_jax.core.messages.errors import check_names, suggests_options
 from verifai_jax.core.user_code.source_collection import sources_of
-from verifai_jax.core.values.budget import Budget, split_budget
 from verifai_jax.falsification.run import Run
 from verifai_jax.falsification.validation import usual_batch
 from verifai_jax.problem.problem import Problem
 from verifai_jax.search import Search
-from verifai_jax.statistics.max_min import max_min_step
 from verifai_jax.statistics.smallest_change import smallest_change
 
 ADDED = 8

@@ -20,20 +20,20 @@ from jaxtyping import Float
 
 from verifai_jax.addons.synthesis import arguments, optimize
 from verifai_jax.addons.synthesis.adversary import attack
+from verifai_jax.addons.synthesis.budget import Budget, split_budget
 from verifai_jax.addons.synthesis.failure_counts import FailureCounts
 from verifai_jax.addons.synthesis.held_out import HeldOut, draw, held_out
+from verifai_jax.addons.synthesis.max_min import max_min_step
 from verifai_jax.addons.synthesis.parametric import FeatureParameters, Parametric, rows_of
 from verifai_jax.addons.synthesis.region import Region, region_of
 from verifai_jax.addons.synthesis.results import Synthesis
 from verifai_jax.core.display.progress import shows_progress
 from verifai_jax.core.messages.checks import check_options, check_positive
 from verifai_jax.core.messages.errors import check_names, suggests_options
-from verifai_jax.core.values.budget import Budget, split_budget
 from verifai_jax.falsification.validation import usual_batch
 from verifai_jax.problem.dependence import depends_on_key
 from verifai_jax.problem.problem import Problem
 from verifai_jax.search import Search
-from verifai_jax.statistics.max_min import max_min_step
 
 if TYPE_CHECKING:
     import pandas as pd

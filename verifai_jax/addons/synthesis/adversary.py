@@ -12,9 +12,9 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Float
 
+from verifai_jax.addons.synthesis.budget import Budget
 from verifai_jax.addons.synthesis.parametric import Pairs, Parametric
 from verifai_jax.addons.synthesis.region import Region
-from verifai_jax.core.values.budget import Budget
 from verifai_jax.search import Search
 from verifai_jax.search.proposals import Proposals
 

@@ -12,10 +12,10 @@ from cross-entropy, on few samples, then the best candidates on many fresh sampl
 import numpy as np
 from jaxtyping import Float
 
+from verifai_jax.addons.synthesis.budget import Budget
 from verifai_jax.addons.synthesis.held_out import draw
 from verifai_jax.addons.synthesis.optimize import Choice, typical_size, worst_case
 from verifai_jax.addons.synthesis.parametric import FeatureParameters
-from verifai_jax.core.values.budget import Budget
 
 CANDIDATES = 64
 """Candidates that the first samples are for, about."""

@@ -9,8 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
+from verifai_jax.addons.synthesis.budget import Budget
 from verifai_jax.addons.synthesis.parametric import Parametric
-from verifai_jax.core.values.budget import Budget
 from verifai_jax.statistics.binomial import Rate, clopper_pearson
 
 MAX_DRAWS = 1000

@@ -11,8 +11,8 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 from jaxtyping import Float
 
+from verifai_jax.addons.synthesis.budget import Budget
 from verifai_jax.addons.synthesis.parametric import Pairs, Parametric, accepted
-from verifai_jax.core.values.budget import Budget
 
 ACTIVE = 16
 """Environments, the least robust ones, that decide a step; its result is evaluated in all."""

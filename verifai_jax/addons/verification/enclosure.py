@@ -18,6 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, PyTree
 
+from verifai_jax.addons.verification.ranges import FeatureRanges
 from verifai_jax.addons.verification.sets import Form, Interpreter, Whole
 from verifai_jax.addons.verification.sets.functions import FUNCTIONS
 from verifai_jax.addons.verification.sets.interpreter import Value, as_form, as_whole
@@ -26,7 +27,6 @@ from verifai_jax.core.compute.fingerprint import without_unused
 from verifai_jax.core.compute.precision import in_precision
 from verifai_jax.evaluation.backends import resolved
 from verifai_jax.evaluation.verdicts import boolean_semantics, trace_verdict
-from verifai_jax.features.ranges import FeatureRanges
 from verifai_jax.problem.problem import Problem, ProblemError
 from verifai_jax.systems.ode import sin_cos
 

@@ -74,8 +74,8 @@ PLANTED = {
     "E46": ("evaluation/confirmer.py", "fails = np.all(list(failing.values()), axis=0)\n        refuted", "fails = np.zeros(len(found), bool)\n        refuted"),
     "E47": ("addons/estimation/comparison/_compare.py", "_failing(evaluators[name], u, first)", "_failing(evaluators[name], u[::-1], first)"),
     "E48": ("addons/estimation/comparison/_compare.py", "self.failing.append((one[0], other[0]))", "self.failing.append((other[0], one[0]))"),
-    "E49": ("statistics/divergence.py", "near = _tilted(values, weights, middle)[1] <= radius", "near = _tilted(values, weights, middle)[1] <= radius / 2"),
-    "E50": ("statistics/divergence.py", "return 0.0 if limit <= p else binary_divergence(limit, p)", "return 0.0 if limit <= p else 2 * binary_divergence(limit, p)"),
+    "E49": ("addons/estimation/divergence.py", "near = _tilted(values, weights, middle)[1] <= radius", "near = _tilted(values, weights, middle)[1] <= radius / 2"),
+    "E50": ("addons/estimation/divergence.py", "return 0.0 if limit <= p else binary_divergence(limit, p)", "return 0.0 if limit <= p else 2 * binary_divergence(limit, p)"),
     "E51": ("addons/verification/sets/whole.py", "(low < max(lower, -FAR)) | (high > min(upper, FAR))", "np.zeros((low + high).shape, bool)"),
     "E52": (
         "addons/verification/branch_and_bound.py",

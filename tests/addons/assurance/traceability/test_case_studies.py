@@ -43,7 +43,7 @@ def commands(name: str) -> list[list[str]]:
 
 def trace(arguments: list[str]):
     """Trace as another process would: nothing that was imported before is known."""
-    from verifai_jax.testing.checking._test import load, problems_of
+    from verifai_jax.addons.checking._test import load, problems_of
 
     load.cache_clear()
     problems_of.cache_clear()

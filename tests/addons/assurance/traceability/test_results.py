@@ -10,9 +10,9 @@ import pytest
 import verifai_jax as vj
 from verifai_jax.addons.assurance.traceability.evidence import outcome_of
 from verifai_jax.addons.assurance.traceability.tested import LIMIT, read_cases
+from verifai_jax.addons.checking import Session
+from verifai_jax.addons.checking._test import session, source_hash
 from verifai_jax.mtl import Requirement, parse
-from verifai_jax.testing.checking import Session
-from verifai_jax.testing.checking._test import session, source_hash
 
 DEMANDS = [Requirement("A", None, "a text"), Requirement("B")]
 

@@ -53,7 +53,7 @@ def write_spec(gap="2.0", first="always gap > 0", text="The gap stays positive."
 
 def traced():
     """Trace as another process would: nothing that was imported before is known."""
-    from verifai_jax.testing.checking._test import load, problems_of
+    from verifai_jax.addons.checking._test import load, problems_of
 
     load.cache_clear()
     problems_of.cache_clear()

@@ -11,9 +11,9 @@ from click.testing import CliRunner
 
 import verifai_jax as vj
 from verifai_jax.addons.estimation.comparison.result import judge
+from verifai_jax.addons.estimation.paired_rates import PairedRates, paired_rates
 from verifai_jax.cli.main import main
 from verifai_jax.problem import ProblemError
-from verifai_jax.statistics.paired_rates import PairedRates, paired_rates
 
 SPACE = {"a": vj.Box(0.0, 1.0), "b": vj.Box(0.0, 1.0)}
 

@@ -9,8 +9,8 @@ import pytest
 from click.testing import CliRunner
 
 import verifai_jax as vj
+from verifai_jax.addons.estimation.revisions import lies_in, load_at_revision, split_revision
 from verifai_jax.cli.main import main
-from verifai_jax.core.user_code.revisions import lies_in, load_at_revision, split_revision
 from verifai_jax.core.user_code.targets import TargetError
 
 SPEC = """

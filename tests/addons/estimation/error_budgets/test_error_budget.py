@@ -12,16 +12,16 @@ from click.testing import CliRunner
 from scipy.optimize import brentq, minimize
 
 import verifai_jax as vj
-from verifai_jax.cli.main import main
-from verifai_jax.evaluation.evaluator import Evaluator
-from verifai_jax.statistics.divergence import (
+from verifai_jax.addons.estimation.divergence import (
     binary_divergence,
     radius_of,
     radius_of_mean,
     worst_mean,
     worst_probability,
 )
-from verifai_jax.statistics.paired_rates import paired_rates
+from verifai_jax.addons.estimation.paired_rates import paired_rates
+from verifai_jax.cli.main import main
+from verifai_jax.evaluation.evaluator import Evaluator
 
 
 @pytest.mark.parametrize("p", [1e-9, 1e-4, 0.01, 0.3, 0.9])

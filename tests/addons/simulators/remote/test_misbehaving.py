@@ -10,8 +10,8 @@ import pytest
 
 import verifai_jax as vj
 from verifai_jax.addons.simulators.remote import wire
+from verifai_jax.addons.simulators.remote_client import answer
 from verifai_jax.core.values.trace import Status, Trace
-from verifai_jax.remote_client import answer
 from verifai_jax.systems.base import Outcome, outcome_of
 from verifai_jax.systems.blackbox import blackbox, workers
 

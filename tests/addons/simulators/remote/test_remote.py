@@ -23,7 +23,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import verifai_jax as vj
-from verifai_jax import remote_client
+from verifai_jax.addons.simulators import remote_client
 from verifai_jax.addons.simulators.remote import connection, server, wire
 from verifai_jax.addons.simulators.remote._remote import remote
 from verifai_jax.core.values.trace import Status
@@ -627,7 +627,8 @@ def test_nobody_there(caplog, monkeypatch):
     assert {o.message for o in outcomes} == {"no simulator was connected for 0.7 s"}
     assert (
         f"no simulator has connected to ('{host}', {port}) for 0 s; start one with "
-        f"`python -m verifai_jax.remote_client --address {host}:{port} MODULE:FUNCTION`"
+        "`python -m verifai_jax.addons.simulators.remote_client "
+        f"--address {host}:{port} MODULE:FUNCTION`"
     ) in caplog.text
 
 

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from verifai_jax import remote_client
+from verifai_jax.addons.simulators import remote_client
 from verifai_jax.addons.simulators.remote._remote import remote
 from verifai_jax.addons.simulators.remote.connection import Client
 from verifai_jax.core.values.trace import Status

@@ -12,12 +12,12 @@ from planted_sweep import SPACE, ToyStudy, ToyTrainer, curve_to, planted_rows, r
 
 import verifai_jax as vj
 from verifai_jax.addons.rl import load_policy
+from verifai_jax.addons.training.sweeps.pareto import fronts
 from verifai_jax.addons.training.sweeps.record import AFTER, BEFORE
 from verifai_jax.addons.training.sweeps.result import Sweep, load_sweep
 from verifai_jax.addons.training.sweeps.storage import SweepFileError
 from verifai_jax.addons.training.sweeps.summary import format_hyperparameters
 from verifai_jax.core.messages.errors import MissingExtra, UnknownNameError
-from verifai_jax.statistics.pareto import fronts
 
 NOT_TRAINED = {
     "nominal_return": np.nan,

@@ -311,7 +311,7 @@ def comparisons() -> None:
 
 def divergences() -> None:
     """Check the worst prior against all two-valued priors within the divergence."""
-    from verifai_jax.statistics.divergence import radius_of, worst_probability
+    from verifai_jax.addons.estimation.divergence import radius_of, worst_probability
 
     q = np.linspace(0.01, 0.99, 9801)
     for p, radius in ((0.01, 0.1), (0.3, 0.02)):

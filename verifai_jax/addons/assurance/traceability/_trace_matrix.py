@@ -20,10 +20,11 @@ from verifai_jax.addons.assurance.traceability.tested import (
     results_of,
     tests_in,
 )
+from verifai_jax.addons.monitoring.requirement_files import read_requirements
 from verifai_jax.core.user_code.sources import hashed_files
 from verifai_jax.core.user_code.targets import definitions, load_target
 from verifai_jax.falsification.run_folder import RECORD
-from verifai_jax.mtl.requirements import Requirement, read_requirements
+from verifai_jax.mtl.requirements import Requirement
 from verifai_jax.problem.model_digest import digest_of_model
 from verifai_jax.problem.problem import Problem
 

@@ -18,12 +18,12 @@ from verifai_jax.addons.assurance.traceability.result import (
     VIOLATED,
     Result,
 )
+from verifai_jax.addons.checking._test import MARK, source_hash, tested_problem
 from verifai_jax.core.messages.text import counted, one_line
 from verifai_jax.core.store.foreign_files import read_xml
 from verifai_jax.core.user_code.targets import NothingDefined, definitions, values_in
 from verifai_jax.problem.model_digest import digest_of_model
 from verifai_jax.problem.problem import Problem
-from verifai_jax.testing.checking._test import MARK, source_hash, tested_problem
 
 Location = str | Path
 SETTINGS = {"budget": "vj_budget", "seed": "vj_seed"}

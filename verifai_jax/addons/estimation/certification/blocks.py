@@ -17,6 +17,7 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from verifai_jax.addons.clusters.executors import Shipment, ship
 from verifai_jax.addons.estimation.certification.executor_simulator import ExecutorSimulator
 from verifai_jax.addons.estimation.certification.policy_groups import digest, group_policies
 from verifai_jax.addons.estimation.certification.simulators import (
@@ -25,7 +26,7 @@ from verifai_jax.addons.estimation.certification.simulators import (
     problem_with,
     shared_simulator,
 )
-from verifai_jax.core.compute.executors import Executor, Shipment, ship
+from verifai_jax.core.compute.executors import Executor
 from verifai_jax.core.compute.precision import truncate_silently
 from verifai_jax.core.user_code.source_collection import sources_of
 from verifai_jax.core.values.trace import Status

@@ -16,13 +16,13 @@ import jax
 import numpy as np
 from jaxtyping import Array, Float, Int, Key, UInt32
 
+from verifai_jax.addons.clusters import executors
 from verifai_jax.addons.estimation.certification.policy_groups import PolicyGroup
 from verifai_jax.addons.estimation.certification.simulators import (
     SeparateSimulators,
     problem_with,
     shared_simulator,
 )
-from verifai_jax.core.compute import executors
 from verifai_jax.core.compute.keys import as_key
 from verifai_jax.core.compute.precision import truncate_silently
 from verifai_jax.evaluation.verdicts import Verdicts

@@ -50,8 +50,8 @@ def compare(
     """
     from verifai_jax import Problem
     from verifai_jax import compare as run_compare
+    from verifai_jax.addons.estimation.revisions import load_at_revision
     from verifai_jax.core.messages.text import printable
-    from verifai_jax.core.user_code.revisions import load_at_revision
 
     with kept_until_done() as kept, on_cluster(cluster) as executor:
         named = {name: name for name in candidates}

@@ -19,20 +19,20 @@ import pandas as pd
 from jaxtyping import Array, Bool, Float, Key
 
 from verifai_jax.addons.estimation.comparison.result import UNDECIDED, Compared, Comparison, judge
+from verifai_jax.addons.estimation.paired_rates import PairedRates, paired_rates
+from verifai_jax.addons.estimation.revisions import load_at_revision, split_revision
 from verifai_jax.core.compute.executors import Executor
 from verifai_jax.core.compute.keys import run_keys
 from verifai_jax.core.compute.precision import reproducible_settings
 from verifai_jax.core.display.progress import shows_progress
 from verifai_jax.core.messages.checks import check_count, check_fraction
 from verifai_jax.core.messages.errors import end_if_interrupted, suggests_options
-from verifai_jax.core.user_code.revisions import load_at_revision, split_revision
 from verifai_jax.core.values.trace import Status
 from verifai_jax.evaluation.backends import resolved
 from verifai_jax.evaluation.evaluator import Evaluator
 from verifai_jax.features import Domain, FeatureSpace
 from verifai_jax.problem.problem import Problem, ProblemError
 from verifai_jax.problem.silent_mistakes import formula_notes
-from verifai_jax.statistics.paired_rates import PairedRates, paired_rates
 
 BLOCK = 1024
 """Points of the cube that are drawn at once."""

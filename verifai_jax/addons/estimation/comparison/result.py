@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from jaxtyping import Array, Key
 
+from verifai_jax.addons.estimation.paired_rates import PairedRates
 from verifai_jax.core.compute.keys import run_keys, simulation_key
 from verifai_jax.core.display.figure import Drawn, Reported
 from verifai_jax.core.display.lazy import lazy_import
@@ -14,7 +15,6 @@ from verifai_jax.core.display.notebook import InNotebook, picture_html
 from verifai_jax.core.messages.text import format_percent
 from verifai_jax.core.values.trace import Trace
 from verifai_jax.features import FeatureSpace
-from verifai_jax.statistics.paired_rates import PairedRates
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -19,6 +19,7 @@ from jaxtyping import Bool, Float
 from verifai_jax.addons.estimation import estimate
 from verifai_jax.addons.estimation.certification.result import Certificate
 from verifai_jax.addons.estimation.comparison.result import Compared
+from verifai_jax.addons.estimation.divergence import radius_of_mean, worst_mean
 from verifai_jax.addons.estimation.error_budgets.result import (
     DIFFERENCE,
     PROBABILITY,
@@ -26,6 +27,7 @@ from verifai_jax.addons.estimation.error_budgets.result import (
     ErrorPart,
     PriorError,
 )
+from verifai_jax.addons.estimation.paired_rates import PairedRates, paired_rates
 from verifai_jax.addons.estimation.result import Estimate
 from verifai_jax.core.messages.checks import check_count, check_fraction
 from verifai_jax.core.messages.errors import suggests_options
@@ -34,8 +36,6 @@ from verifai_jax.evaluation.evaluator import Evaluator
 from verifai_jax.problem.dependence import depends_on_key
 from verifai_jax.problem.problem import Problem
 from verifai_jax.statistics.binomial import Rate, clopper_pearson
-from verifai_jax.statistics.divergence import radius_of_mean, worst_mean
-from verifai_jax.statistics.paired_rates import PairedRates, paired_rates
 
 BATCH = 512
 """Simulations at once."""

@@ -6,10 +6,10 @@ from pathlib import Path
 from typing import Any
 
 from verifai_jax.addons.estimation.comparison.result import Compared, Comparison
+from verifai_jax.addons.estimation.paired_rates import PairedRates
 from verifai_jax.addons.estimation.result import METHODS, Estimate
 from verifai_jax.addons.reports.stored import sources_of, values_of
 from verifai_jax.features import FeatureSpace
-from verifai_jax.statistics.paired_rates import PairedRates
 
 NOT_FINITE = ("effective", "relative_error")
 """Numbers of an estimate that JSON has as null where they are not finite."""

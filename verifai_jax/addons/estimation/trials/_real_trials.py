@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from jaxtyping import Real
 
+from verifai_jax.addons.estimation.stratified_rate import stratified_rate
 from verifai_jax.addons.estimation.trials.reading import TrialTable, copies, read_trials
 from verifai_jax.addons.estimation.trials.result import RealTrials
 from verifai_jax.core.messages.checks import check_count, check_fraction
@@ -22,7 +23,6 @@ from verifai_jax.core.messages.text import counted
 from verifai_jax.falsification import falsify, simulate
 from verifai_jax.falsification.run import Run
 from verifai_jax.problem.problem import Problem
-from verifai_jax.statistics.stratified_rate import stratified_rate
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -11,11 +11,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from verifai_jax.addons.estimation.comparison.result import UNDECIDED, judge
+from verifai_jax.addons.estimation.paired_rates import PairedRates, paired_rates
 from verifai_jax.addons.estimation.trials import reading
 from verifai_jax.core.display.notebook import InNotebook
 from verifai_jax.core.messages.checks import check_fraction
 from verifai_jax.core.messages.errors import missing_name, unknown_name
-from verifai_jax.statistics.paired_rates import PairedRates, paired_rates
 
 MAX_FACTOR = 1024
 """Times as many pairs, beyond which their number is not forecast."""

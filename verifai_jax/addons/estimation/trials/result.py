@@ -8,12 +8,12 @@ from jaxtyping import Int
 
 from verifai_jax.addons.analysis import rules as find_rules
 from verifai_jax.addons.analysis.data.samples import Samples
+from verifai_jax.addons.estimation.stratified_rate import StratifiedRate
 from verifai_jax.core.display.notebook import InNotebook, frame_html
 from verifai_jax.core.messages.checks import check_count
 from verifai_jax.core.messages.text import counted, format_percent
 from verifai_jax.problem.problem import Problem
 from verifai_jax.statistics.binomial import Rate, clopper_pearson
-from verifai_jax.statistics.stratified_rate import StratifiedRate
 
 if TYPE_CHECKING:
     from collections.abc import Iterable

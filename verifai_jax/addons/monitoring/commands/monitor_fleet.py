@@ -82,6 +82,6 @@ def load_requirements(
 
 def _is_file(formula: str) -> bool:
     """Return whether an argument names a file of requirements, whether or not it can be read."""
-    from verifai_jax.mtl.requirements import ENDINGS
+    from verifai_jax.addons.monitoring.requirement_files import ENDINGS
 
     return Path(formula).suffix.lower() in ENDINGS

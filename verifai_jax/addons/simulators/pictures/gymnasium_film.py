@@ -8,8 +8,9 @@ import numpy as np
 from jaxtyping import UInt8
 
 from verifai_jax.addons.simulators.environments import EpisodeFunction
+from verifai_jax.addons.simulators.pictures import frames as film
 from verifai_jax.evaluation.replay import Replay
-from verifai_jax.pictures import film
+from verifai_jax.pictures.film import check_film
 from verifai_jax.systems.blackbox._blackbox import plain_leaves, seed_of
 
 FRAMES_PER_SECOND = 20
@@ -56,7 +57,7 @@ def film_episode(
     - `fps`: frames per second; `FRAMES_PER_SECOND` when left out.
     **Raises:** `ValueError` for an environment that draws no pictures.
     """
-    film.check_film(size, fps)
+    check_film(size, fps)
     clock = np.asarray(replay.trace.clock(), np.float64)
     samples, shown = film.film_samples(clock, fps, FRAMES_PER_SECOND)
     features, seed = plain_leaves(replay.features), seed_of(replay.key)

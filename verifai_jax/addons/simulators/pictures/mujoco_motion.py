@@ -14,10 +14,10 @@ from jaxtyping import Float
 
 from verifai_jax.addons.simulators.environments import Brax
 from verifai_jax.addons.simulators.mujoco.system import MuJoCo
+from verifai_jax.addons.simulators.pictures.frames import caption_of, decided_at
 from verifai_jax.core.compute.compilation import Slot
 from verifai_jax.core.values.waveform import set_durations
 from verifai_jax.evaluation.replay import Replay
-from verifai_jax.pictures.film import caption_of, decided_at
 
 
 @dataclass(frozen=True, eq=False)

@@ -22,18 +22,17 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
-from verifai_jax.addons.simulators.pictures.mujoco_motion import Motion
-from verifai_jax.core.messages.errors import require, unknown_name
-from verifai_jax.core.store.atomic_files import replacing
-from verifai_jax.pictures.film import (
+from verifai_jax.addons.simulators.pictures.frames import (
     BACKGROUND,
     Frame,
-    NoRenderer,
-    check_film,
     film_samples,
     gif,
     labelled,
 )
+from verifai_jax.addons.simulators.pictures.mujoco_motion import Motion
+from verifai_jax.core.messages.errors import require, unknown_name
+from verifai_jax.core.store.atomic_files import replacing
+from verifai_jax.pictures.film import NoRenderer, check_film
 
 FRAMES_PER_SECOND = 20
 SIZE = (480, 320)

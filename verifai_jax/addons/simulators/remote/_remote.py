@@ -6,7 +6,7 @@
     remote(host="0.0.0.0", port=4567, token=secret, certificate="run.pem")   # beyond this machine
     remote(signals=("x", "v"), dt=0.02, length=200)      # every trace is checked against these
 
-`verifai_jax.remote_client` is the other side in Python, `docs/remote.md` the protocol for others.
+`remote_client.py` is the other side in Python, and `docs/remote.md` the protocol for others.
 """
 
 import ipaddress

@@ -304,7 +304,7 @@ class Absence:
         self._next += min(self._next, 60.0)
         log.warning(
             "no simulator has connected to %s for %.0f s; start one with "
-            "`python -m verifai_jax.remote_client --address %s MODULE:FUNCTION`",
+            "`python -m verifai_jax.addons.simulators.remote_client --address %s MODULE:FUNCTION`",
             (host, port),
             seconds,
             f"[{host}]:{port}" if ":" in host else f"{host}:{port}",

@@ -13,13 +13,13 @@ import json
 import math
 import struct
 from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import fields, is_dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from verifai_jax.core.messages.checks import is_number
 from verifai_jax.core.messages.errors import check_names, unknown_name
-from verifai_jax.core.values.reaction import Reaction
 from verifai_jax.core.values.trace import Trace
 from verifai_jax.core.values.waveform import is_waveform
 
@@ -197,7 +197,7 @@ def _raw_array(name: str, value: dict[str, Any], raw: bytes) -> np.ndarray:
 
 def plain(value: Any) -> Any:
     """Return features for JSON: arrays as lists, a waveform as an object of its control points,
-    a reaction as one of its parameters.
+    another function, such as a reaction to signals, as one of its fields.
 
     **Raises:** `TypeError` for a value that JSON cannot hold.
     """
@@ -208,9 +208,8 @@ def plain(value: Any) -> Any:
         data = {"knots": knots, "hold": value.hold, "duration": value.duration}
         options = {"times": value.times, "width": value.width}
         return data | {name: plain(part) for name, part in options.items() if part is not None}
-    if isinstance(value, Reaction):
-        parts = {n: getattr(value, n) for n in ("parameters", "inputs", "hidden", "bounds")}
-        return plain(parts)
+    if callable(value) and is_dataclass(value):
+        return plain({part.name: getattr(value, part.name) for part in fields(value)})
     if isinstance(value, tuple | list):
         return [plain(inner) for inner in value]
     if value is None or isinstance(value, str | bool | int | float):

@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import pandas as pd
 
-from verifai_jax.statistics.paired import PairedDifference, paired_difference
+from verifai_jax.addons.training.paired import PairedDifference, paired_difference
 
 BASE = "base"
 """Name of the base network among the arms of a table."""

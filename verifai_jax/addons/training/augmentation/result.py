@@ -19,6 +19,7 @@ from verifai_jax.addons.training.augmentation.keys import choice_key
 from verifai_jax.addons.training.augmentation.outcome import Outcome
 from verifai_jax.addons.training.augmentation.summary import summarize
 from verifai_jax.addons.training.augmentation.task import SupervisedTask, Weights
+from verifai_jax.addons.training.paired import PairedDifference
 from verifai_jax.core.compute.precision import reproducible_settings
 from verifai_jax.core.display.figure import Figure
 from verifai_jax.core.display.lazy import lazy_import
@@ -26,7 +27,6 @@ from verifai_jax.core.display.notebook import InNotebook
 from verifai_jax.core.messages.errors import check_names, unknown_name
 from verifai_jax.core.store.files import replacing_all
 from verifai_jax.core.store.locks import write_lock
-from verifai_jax.statistics.paired import PairedDifference
 
 TABLE, ADDED, SUMMARY = "table.parquet", "added.parquet", "summary.txt"
 """Files of a result in a folder."""

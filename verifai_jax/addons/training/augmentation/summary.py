@@ -12,8 +12,8 @@ import numpy as np
 import pandas as pd
 
 from verifai_jax.addons.training.augmentation.outcome import BASE, SHARES, TRAINED, Outcome
+from verifai_jax.addons.training.paired import PairedDifference
 from verifai_jax.core.messages.text import counted, format_percent, one_line
-from verifai_jax.statistics.paired import PairedDifference
 
 REFERENCES = ("none", "random")
 """Arms that all others are compared with."""

@@ -24,6 +24,7 @@ from typing import Any, cast
 import jax
 import numpy as np
 
+from verifai_jax.addons.clusters.executors import check_executor, gather
 from verifai_jax.addons.rl.policies import Policy
 from verifai_jax.addons.rl.policies import policy as load
 from verifai_jax.addons.rl.policies.onnx_graph import read_graph
@@ -38,7 +39,7 @@ from verifai_jax.addons.training.sweeps.training_runs import (
     TrainingRuns,
 )
 from verifai_jax.core.compute.cores import available_cores
-from verifai_jax.core.compute.executors import Executor, check_executor, gather
+from verifai_jax.core.compute.executors import Executor
 from verifai_jax.core.messages.text import format_error, one_line
 from verifai_jax.core.store.cache import Cache
 from verifai_jax.core.store.log import Arrays

@@ -18,13 +18,14 @@ import jax
 import numpy as np
 from jaxtyping import Array, Key
 
+from verifai_jax.addons.clusters.executors import Shipment, check_executor, gather, ship
 from verifai_jax.addons.rl.batched_training import BatchedTraining, Configuration, policy_structure
 from verifai_jax.addons.training.sweeps.clock import Clock, OutOfTime
 from verifai_jax.addons.training.sweeps.fingerprint import digest
 from verifai_jax.addons.training.sweeps.hyperparameters import Hyperparameters
 from verifai_jax.addons.training.sweeps.record import Curve, TrainedPolicy
 from verifai_jax.addons.training.sweeps.study import Study
-from verifai_jax.core.compute.executors import Executor, Shipment, check_executor, gather, ship
+from verifai_jax.core.compute.executors import Executor
 from verifai_jax.core.store.cache import Cache, CacheError
 from verifai_jax.core.store.log import Arrays
 from verifai_jax.systems.policy import Policy

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import pytest
 
 import verifai_jax as vj
-from verifai_jax.testing.checking.check import Check
+from verifai_jax.addons.checking.check import Check
 
 SPACE = {"a": vj.Box(0.0, 2.0), "mode": vj.Categorical("calm", "storm")}
 

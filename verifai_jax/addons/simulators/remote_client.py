@@ -1,13 +1,13 @@
 """A simulator that answers a run over the network; needs nothing but Python and NumPy.
 
-    from verifai_jax.remote_client import serve
+    from verifai_jax.addons.simulators.remote_client import serve
 
     def simulate(features, seed):
         return {"x": x, "v": v, "dt": 0.02}
 
     serve(simulate, port=4567)
 
-or `python -m verifai_jax.remote_client --address 127.0.0.1:4567 mysimulator:simulate`.
+or `python -m verifai_jax.addons.simulators.remote_client mysimulator:simulate`.
 
 This file imports nothing of `verifai_jax`, so it may be copied to where that is not installed, or
 run by its path, which starts faster. `docs/remote.md` says what goes over the wire.

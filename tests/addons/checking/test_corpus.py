@@ -13,12 +13,11 @@ import pytest
 from click.testing import CliRunner
 
 import verifai_jax as vj
+from verifai_jax.addons.checking import Check, SavedCounterexample, save_counterexamples
+from verifai_jax.addons.checking._replay_counterexamples import OTHER
+from verifai_jax.addons.checking._test import tested_problem as problem_tested_by
+from verifai_jax.addons.checking.corpus import renamed
 from verifai_jax.cli.main import main
-from verifai_jax.counterexamples import SavedCounterexample, save_counterexamples
-from verifai_jax.counterexamples._replay_counterexamples import OTHER
-from verifai_jax.counterexamples.corpus import renamed
-from verifai_jax.testing.checking import Check
-from verifai_jax.testing.checking._test import tested_problem as problem_tested_by
 
 SPACE = {
     "a": vj.Box(0.0, 2.0),

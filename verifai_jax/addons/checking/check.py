@@ -13,12 +13,12 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
+from verifai_jax.addons.checking._replay_counterexamples import CorpusReplay
+from verifai_jax.addons.checking._replay_counterexamples import replay_counterexamples as replay
+from verifai_jax.addons.checking.corpus import SavedCounterexample, save_counterexamples
 from verifai_jax.core.display.notebook import InNotebook
 from verifai_jax.core.messages.checks import check_count, check_fraction
 from verifai_jax.core.messages.text import format_features, format_percent, printable
-from verifai_jax.counterexamples import SavedCounterexample, save_counterexamples
-from verifai_jax.counterexamples import replay_counterexamples as replay
-from verifai_jax.counterexamples._replay_counterexamples import CorpusReplay
 from verifai_jax.falsification import Run, falsify
 from verifai_jax.problem.problem import Problem
 from verifai_jax.search import Search

@@ -18,7 +18,8 @@ import jax
 import numpy as np
 from jaxtyping import Array, Float, Key, UInt32
 
-from verifai_jax.core.compute import executors
+from verifai_jax.addons.clusters import executors
+from verifai_jax.addons.clusters.worker import ARRAYS, BlockMode, evaluate_block, question_of
 from verifai_jax.core.compute.compilation import Slot, power_of_two
 from verifai_jax.core.compute.devices import describe_processor
 from verifai_jax.evaluation.guidance import NOTHING, Guidance
@@ -27,7 +28,6 @@ from verifai_jax.evaluation.journal import Journal
 from verifai_jax.evaluation.layout import chunks_and_lanes
 from verifai_jax.evaluation.remarks import Remarks
 from verifai_jax.evaluation.verdicts import RowVerdict, Verdicts
-from verifai_jax.evaluation.worker import ARRAYS, BlockMode, evaluate_block, question_of
 from verifai_jax.problem.problem import Problem
 
 AT_FIRST = 8
@@ -82,11 +82,7 @@ class ExecutorEngine:
         self.problem, self.executor, self.precision = problem, executor, precision
         self.compile_seconds = 0.0
         self._journal = journal if problem.black_box else None
-        self._shipment = problem.programs.get(
-            SHIPMENTS,
-            (type(executor).__module__ + type(executor).__name__, target),
-            lambda: executors.ship(problem, executor, target, identity),
-        )
+        self._shipment = shipped(problem, executor, target)
         form = problem.space.feature_form
         self._features: Any = jax.tree.structure(form)
         _, lanes = chunks_and_lanes(problem, batch, len(jax.local_devices()))
@@ -204,12 +200,9 @@ class ExecutorEngine:
         """Return the verdicts of rows in the journal."""
         if self._recalling is None:
             self._recalling = HostEngine(
-                self.problem,
-                self.precision,
-                self._journal,
-                guidance=self.mode.guidance,
-                given=self.mode.given,
-            )
+                self.problem, self.precision, self._journal,
+                guidance=self.mode.guidance, given=self.mode.given,
+            )  # fmt: skip
         return self._recalling.evaluate(u, key, first, padded_to=self.mode.padded_to)
 
     def receive(self, result: dict[str, Any], u: Float[np.ndarray, "n d"], first: int) -> Verdicts:
@@ -319,6 +312,17 @@ class Pending:
         self._unsent.clear()
         for _, _, future in self._sent:
             future.cancel()
+
+
+def shipped(
+    problem: Problem, executor: executors.Executor, target: str | None
+) -> executors.Shipment[Problem]:
+    """Return the problem as it is sent through this kind of executor, kept with its programs."""
+    return problem.programs.get(
+        SHIPMENTS,
+        (type(executor).__module__ + type(executor).__name__, target),
+        lambda: executors.ship(problem, executor, target, identity),
+    )
 
 
 def identity(problem: Problem) -> dict[str, str]:

@@ -19,12 +19,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Int, PyTree
 
+from verifai_jax.addons.events.event_tables import EventTables
+from verifai_jax.addons.events.sequence import ABSENT, Events
+from verifai_jax.addons.events.transitions import Past, Transition
 from verifai_jax.core.messages.checks import check_count, check_positive
 from verifai_jax.core.messages.errors import nearest_names, unknown_name
-from verifai_jax.core.values.events import ABSENT, Events
 from verifai_jax.features.domain import Domain, Row, as_numbers, as_real, dotted, indexed
-from verifai_jax.features.event_tables import EventTables
-from verifai_jax.features.transitions import Past, Transition
 
 
 @dataclass(frozen=True, eq=False)

@@ -15,9 +15,9 @@ import jax
 import numpy as np
 from jaxtyping import Float, UInt32
 
+from verifai_jax.addons.clusters.executors import Shipment
 from verifai_jax.core.compute.compilation import Slot
 from verifai_jax.core.compute.devices import describe_processor
-from verifai_jax.core.compute.executors import Shipment
 from verifai_jax.core.compute.keys import as_key
 from verifai_jax.core.compute.precision import reproducible_settings
 from verifai_jax.evaluation.engine import Engine
@@ -29,15 +29,9 @@ from verifai_jax.evaluation.verdicts import Verdicts
 from verifai_jax.problem.problem import Problem
 
 ARRAYS = (
-    "rho",
-    "status",
-    "violated",
-    "gradient",
-    "clauses",
-    "clause_gradients",
-    "coverage_ids",
+    "rho", "status", "violated", "gradient", "clauses", "clause_gradients", "coverage_ids",
     "guidance",
-)
+)  # fmt: skip
 """Parts of verdicts that come back as arrays under their names."""
 
 
@@ -154,17 +148,11 @@ def _compiled(
         ENGINES,
         (mode, len(devices)),
         lambda: Engine(
-            problem,
-            step,
-            mode.gradient,
-            devices,
-            mode.precision,
-            mode.clauses,
-            inputs=CubePoints(problem, mode.given, mode.precision),
-            lanes=mode.lanes,
+            problem, step, mode.gradient, devices, mode.precision, mode.clauses,
+            inputs=CubePoints(problem, mode.given, mode.precision), lanes=mode.lanes,
             guidance=mode.guidance,
         ),
-    )
+    )  # fmt: skip
     engine.compile()
     started, compiled, parts = time.perf_counter(), engine.compile_seconds, []
     for begin in range(0, len(u), step):

@@ -1,6 +1,6 @@
 """Sequences of timed events that an automaton allows (`Automaton`)."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -10,19 +10,20 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int, PyTree
 
-from verifai_jax.core.messages.checks import check_count
-from verifai_jax.core.messages.errors import unknown_name
-from verifai_jax.core.values.events import ABSENT, Events
-from verifai_jax.features.domain import Domain, Row, as_real, cell, centre, dotted, indexed
-from verifai_jax.features.event_tables import EventTables
-from verifai_jax.features.facts import Facts, integer_facts, joined_facts
-from verifai_jax.features.transitions import Graph, Transition, check_states, unfold
-from verifai_jax.features.written_events import (
+from verifai_jax.addons.events.event_tables import EventTables
+from verifai_jax.addons.events.sequence import ABSENT, Events
+from verifai_jax.addons.events.transitions import Graph, Transition, check_states, unfold
+from verifai_jax.addons.events.written_events import (
     WrittenEvents,
     describe_event,
     read_event,
     where_there,
 )
+from verifai_jax.core.messages.checks import check_count
+from verifai_jax.core.messages.errors import unknown_name
+from verifai_jax.core.messages.text import format_seconds
+from verifai_jax.features.domain import Domain, Row, as_real, cell, centre, dotted, indexed
+from verifai_jax.features.facts import Facts, integer_facts, joined_facts
 
 
 @dataclass(frozen=True, init=False, repr=False)
@@ -379,6 +380,35 @@ class Automaton(Domain):
                     for column, known in own.facts(f"{item}.{part}").items():
                         found[column] = joined_facts(found.get(column), known)
         return found
+
+    def words_for(self, value: Events) -> str:
+        listed = value.listed()
+        each = ", ".join(f"{one['kind']} at {format_seconds(one['time'], 4)}" for one in listed)
+        return f"{len(listed)} event{'s' * (len(listed) != 1)}{': ' * bool(each)}{each}"
+
+    def plain(self, nested: Callable[[Domain], dict[str, Any]]) -> dict[str, Any]:
+        events = []
+        for each in self.transitions:
+            if each.guard is not None:
+                raise ValueError(f"the guard of {each.label} is code, which JSON cannot contain")
+            options = {"to": each.to, "weight": each.weight, "after": list(each.after)}
+            domains = [[name, nested(part)] for name, part in each.parameters]
+            event = {**options, "at_most": each.at_most, "wait": nested(each.wait)}
+            events.append([each.source, each.name, {**event, "parameters": domains}])
+        ends = {"min_events": self.min_events, "max_events": self.max_events}
+        return {"start": self.start, "events": events, **ends}
+
+    @classmethod
+    def from_plain(
+        cls, data: Mapping[str, Any], nested: Callable[[Mapping[str, Any]], Domain]
+    ) -> "Automaton":
+        events: dict[tuple[str, str], dict[str, Any]] = {}
+        for source, name, event in data["events"]:
+            options = {key: event[key] for key in ("to", "weight", "after", "at_most")}
+            options["wait"] = nested(event["wait"])
+            parameters = {key: nested(part) for key, part in event["parameters"]}
+            events[source, name] = {**options, **parameters}
+        return cls(data["start"], events, data["max_events"], data["min_events"])
 
     def __repr__(self) -> str:
         events = ", ".join(describe_event(each) for each in self.transitions)

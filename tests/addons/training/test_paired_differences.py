@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from checked_types import unchecked
 
-from verifai_jax.statistics.paired import paired_difference
+from verifai_jax.addons.training.paired import paired_difference
 
 
 def test_interval_is_that_of_the_paired_t_test():

@@ -11,7 +11,8 @@ from checked_types import unchecked
 
 import verifai_jax as vj
 from specs import sway
-from verifai_jax.features import FeatureSpace, Reactive
+from verifai_jax.addons.events.reactive import Reactive
+from verifai_jax.features import FeatureSpace
 from verifai_jax.testing import check_domain
 
 NETWORK = Reactive({"gap": (0, 60), "v": (0, 30)}, hidden=3, bounds=(-4, 2))

@@ -19,12 +19,12 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+from verifai_jax.addons.checking.check import BUDGET, Check, CheckOutcome, CounterexampleFound
 from verifai_jax.core.messages.errors import suggests_options
 from verifai_jax.core.user_code.targets import definitions, load_target
 from verifai_jax.problem.problem import Problem
 from verifai_jax.problem.silent_mistakes import formula_notes
 from verifai_jax.search import Search
-from verifai_jax.testing.checking.check import BUDGET, Check, CheckOutcome, CounterexampleFound
 
 MARK = "verifai_jax_check"
 """Attribute of a test function by which the pytest plugin knows it."""

@@ -8,8 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PyTree
 
+from verifai_jax.addons.events.reaction import Reaction, parameter_count
 from verifai_jax.core.messages.checks import is_number
-from verifai_jax.core.values.reaction import Reaction, parameter_count
 from verifai_jax.features.box import Box
 from verifai_jax.features.domain import Domain, Row
 

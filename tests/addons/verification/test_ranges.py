@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 import verifai_jax as vj
-from verifai_jax.features.ranges import FeatureRanges
+from verifai_jax.addons.verification.ranges import FeatureRanges
 
 SPACE = vj.FeatureSpace(
     {

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
+from verifai_jax.addons.estimation.stratified_rate import stratified_rate
 from verifai_jax.statistics.binomial import exact_interval
 from verifai_jax.statistics.confidence_sequences import anytime_interval
-from verifai_jax.statistics.stratified_rate import stratified_rate
 
 
 def test_good_predictions_are_worth_as_many_trials_again():

@@ -12,6 +12,12 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 
+from verifai_jax.addons.checking.corpus import (
+    SavedCounterexample,
+    is_elsewhere,
+    read_corpus,
+    renamed,
+)
 from verifai_jax.core.compute.keys import run_keys
 from verifai_jax.core.display.notebook import InNotebook
 from verifai_jax.core.display.progress import shows_progress
@@ -19,12 +25,6 @@ from verifai_jax.core.messages.errors import suggests_options
 from verifai_jax.core.messages.text import format_error, one_line, printable
 from verifai_jax.core.user_code.sources import Change, Sources
 from verifai_jax.core.values.trace import Status
-from verifai_jax.counterexamples.corpus import (
-    SavedCounterexample,
-    is_elsewhere,
-    read_corpus,
-    renamed,
-)
 from verifai_jax.evaluation.backends import resolved
 from verifai_jax.evaluation.confirmer import Confirmer
 from verifai_jax.evaluation.resimulate import HostReplays, Replays
@@ -34,13 +34,8 @@ from verifai_jax.problem.problem import Problem
 
 if TYPE_CHECKING:
     import pandas as pd
-FAILING, FIXED, WITHOUT_VERDICT, INVALID, OTHER = (
-    "failing",
-    "fixed",
-    "without a verdict",
-    "no longer valid",
-    "of another problem",
-)
+FAILING, FIXED, WITHOUT_VERDICT = "failing", "fixed", "without a verdict"
+INVALID, OTHER = "no longer valid", "of another problem"
 """What may be said of a file."""
 CLOSE = 1e-4
 """Share of a feature's value by which a point of the space may differ from it, for rounding."""

@@ -13,7 +13,8 @@ import pandas as pd
 import pytest
 
 import verifai_jax as vj
-from verifai_jax.core.compute.executors import (
+from verifai_jax.addons.clusters.executor_engine import identity
+from verifai_jax.addons.clusters.executors import (
     Shipment,
     WorkerError,
     check_executor,
@@ -21,10 +22,9 @@ from verifai_jax.core.compute.executors import (
     gather,
     ship,
 )
+from verifai_jax.addons.clusters.worker import evaluate_block
 from verifai_jax.core.user_code.targets import load_target
 from verifai_jax.evaluation.evaluator import Evaluator
-from verifai_jax.evaluation.executor_engine import identity
-from verifai_jax.evaluation.worker import evaluate_block
 
 
 def line(features, key):
@@ -126,7 +126,7 @@ def test_a_constraint_is_kept_and_its_acceptance_is_that_of_the_rows_taken():
 
 
 def test_a_pool_that_loses_a_process_leaves_what_is_finished(tmp_path, monkeypatch):
-    monkeypatch.setattr("verifai_jax.core.compute.executors.SECONDS", 0.0)
+    monkeypatch.setattr("verifai_jax.addons.clusters.executors.SECONDS", 0.0)
     options = {"search": "uniform", "budget": 70, "batch": 20, "confirm": False}
     whole = vj.falsify(DECAY, **options)
     with pytest.raises(vj.RunError, match="a process pool does not replace it") as broken:
@@ -137,8 +137,8 @@ def test_a_pool_that_loses_a_process_leaves_what_is_finished(tmp_path, monkeypat
 
 
 def test_finished_rows_of_a_slow_black_box_are_not_simulated_again(tmp_path, monkeypatch):
-    monkeypatch.setattr("verifai_jax.core.compute.executors.SECONDS", 0.0)
-    monkeypatch.setattr("verifai_jax.evaluation.executor_engine.WORTH_KEEPING", 0.0)
+    monkeypatch.setattr("verifai_jax.addons.clusters.executors.SECONDS", 0.0)
+    monkeypatch.setattr("verifai_jax.addons.clusters.executor_engine.WORTH_KEEPING", 0.0)
     options = {"search": "uniform", "budget": 70, "batch": 70, "confirm": False}
     with pytest.raises(vj.RunError):
         vj.falsify(DECAY, **options, folder=tmp_path / "run", executor=Disorder(3, dies_at=30))
@@ -253,6 +253,7 @@ def test_arrays_and_pools_of_black_boxes_can_be_sent():
     assert sent.system.pool._setup == pooled.system.pool._setup
 
 
+@pytest.mark.addons
 @pytest.mark.thorough
 def test_every_problem_of_the_project_can_be_sent():
     cloudpickle = pytest.importorskip("cloudpickle")

@@ -10,9 +10,9 @@ import pytest
 from checked_types import unchecked
 
 import verifai_jax as vj
+from verifai_jax.addons.checking import Check, CounterexampleFound
+from verifai_jax.addons.checking.check import min_budget
 from verifai_jax.statistics.confidence_sequences import anytime_interval
-from verifai_jax.testing.checking import Check, CounterexampleFound
-from verifai_jax.testing.checking.check import min_budget
 
 pytest_plugins = ["pytester"]
 PLUGIN = ("-p", "_verifai_jax_pytest", "-p", "no:cacheprovider")

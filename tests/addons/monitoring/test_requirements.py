@@ -4,8 +4,8 @@ import zipfile
 
 import pytest
 
+from verifai_jax.addons.monitoring.requirement_files import read_requirements, write_requirements
 from verifai_jax.mtl import parse
-from verifai_jax.mtl.requirements import read_requirements, write_requirements
 
 HEAD = (
     '<?xml version="1.0" encoding="UTF-8"?><r:REQ-IF '

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from checked_types import unchecked
 
+from verifai_jax.addons.events import Automaton, Events, Past
 from verifai_jax.features import Array, Box, Categorical, DiscreteBox, FeatureSpace, Signal
-from verifai_jax.features.events import Automaton, Events, Past
 from verifai_jax.testing import check_domain
 
 CUT_IN = {"wait": Box(0.5, 4), "gap": Box(5, 20), "who": Categorical("car", "truck")}

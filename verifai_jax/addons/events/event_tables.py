@@ -13,9 +13,9 @@ from functools import cached_property
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from verifai_jax.core.values.events import ABSENT
+from verifai_jax.addons.events.sequence import ABSENT
+from verifai_jax.addons.events.transitions import Graph, Transition
 from verifai_jax.features.domain import Domain
-from verifai_jax.features.transitions import Graph, Transition
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from verifai_jax.statistics.pareto import fronts
+from verifai_jax.addons.training.sweeps.pareto import fronts
 
 
 def dominates(one, other):
@@ -41,7 +41,7 @@ def test_continuous_points():
 
 def test_many_points_are_compared_in_parts(monkeypatch):
     points = np.random.default_rng(1).normal(size=(80, 2))
-    monkeypatch.setattr("verifai_jax.statistics.pareto._MAX_PAIRS", 500)
+    monkeypatch.setattr("verifai_jax.addons.training.sweeps.pareto._MAX_PAIRS", 500)
     assert fronts(points).tolist() == brute_force(points.tolist())
 
 
