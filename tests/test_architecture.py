@@ -48,8 +48,14 @@ ADDONS = {
     "verification": {"reports"},
     "rl": {"simulators"},
     "estimation": {
-        "analysis", "clusters", "monitoring", "reports", "rl", "searches", "verification",
-    },  # fmt: skip
+        "analysis",
+        "clusters",
+        "monitoring",
+        "reports",
+        "rl",
+        "searches",
+        "verification",
+    },
     "faults": {"estimation", "reports"},
     "synthesis": {"estimation", "verification"},
     "perception": {"analysis"},

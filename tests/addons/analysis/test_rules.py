@@ -63,7 +63,8 @@ def test_of_many_rows_a_sample_makes_the_rules_and_all_kept_aside_measure_them()
     table["violated"] &= table.x > 0.997
     rare = rules(table)
     assert 20_000 < rare.made < 20_200
-    assert rare.precision is not None and rare.precision.estimate > 0.8
+    assert rare.precision is not None
+    assert rare.precision.estimate > 0.8
 
 
 def test_unordered_values_and_whole_numbers():
