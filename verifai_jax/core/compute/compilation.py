@@ -22,8 +22,8 @@ from collections.abc import Callable, Hashable, Iterator, Mapping
 from concurrent.futures import CancelledError, Future, ThreadPoolExecutor, wait
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
-from functools import cache
-from typing import Any, Generic, Literal, TypeVar, cast
+from functools import cache, lru_cache, partial, wraps
+from typing import Any, Generic, Literal, ParamSpec, TypeVar, cast
 
 import jax
 import numpy as np
@@ -33,6 +33,7 @@ from verifai_jax.core.compute.devices import enable_compile_cache
 
 K = TypeVar("K", bound=Hashable)
 V = TypeVar("V")
+P = ParamSpec("P")
 
 
 @dataclass(frozen=True)
@@ -65,6 +66,35 @@ class ProgramCache:
     def clear(self) -> None:
         """Remove all values, so that their memory can be freed."""
         self._slots.clear()
+
+
+KEPT = 32
+"""Values of static arguments whose programs `jit_each` keeps: those of a few dozen formulas."""
+
+
+def jit_each(static: int = 1, inline: bool = False) -> Callable[[Callable[P, V]], Callable[P, V]]:
+    """Return a decorator like `jax.jit` for functions whose first arguments are static.
+
+    Only the programs of the last `KEPT` static values are kept. `jax.jit` keeps those of all as
+    long as the function lives, so a process that judges ever more formulas would grow without end.
+
+    **Arguments:**
+    - `static`: number of static arguments; they are hashable, and come first.
+    - `inline`: whether the steps become those of a surrounding program.
+    """
+
+    def decorated(function: Callable[P, V]) -> Callable[P, V]:
+        @lru_cache(KEPT)
+        def compiled(*values: Hashable) -> Callable[..., V]:
+            return jax.jit(partial(function, *values), inline=inline)
+
+        @wraps(function)
+        def call(*arguments: Any) -> V:
+            return compiled(*arguments[:static])(*arguments[static:])
+
+        return cast("Callable[P, V]", call)
+
+    return decorated
 
 
 def power_of_two(count: int) -> int:
