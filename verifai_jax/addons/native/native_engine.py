@@ -215,12 +215,12 @@ class NativeEngine:
         **Raises:** `Unavailable` if they differ by more than rounding.
         """
         distance = np.abs(self._program(rows, key, first, temperature).rho)
-        least = np.min(np.where(np.isnan(distance), np.inf, distance), axis=1)
-        at = np.sort(np.argsort(least)[:FIRST])
+        nearest = np.min(np.where(np.isnan(distance), np.inf, distance), axis=1)
+        at = np.sort(np.argsort(nearest)[:FIRST])
         some, begin = at, first
         if self._program.draws:
             # Their random keys are those of their numbers, so they are rows that follow each other.
-            begin = int(np.argmin(least)) // FIRST * FIRST
+            begin = int(np.argmin(nearest)) // FIRST * FIRST
             some, begin = slice(begin, begin + FIRST), first + begin
         near = rows[some], key, begin, _cut(temperature, some)
         met = [*self._met, (near, self._by_xla(*near))]

@@ -39,7 +39,7 @@ ALIKE = 1e-2
 """Relative difference of two derivatives from which on they differ by more than rounding."""
 ROUNDINGS = 10
 """How far native code may be from XLA, in differences of XLA's own results in two roundings."""
-LEAST = 2e-6
+FLOOR = 2e-6
 """What native code may differ by where XLA rounds nothing, relative to 1 or the robustness: the 16
 units in the last place that an elementary function may be off."""
 SHARES = (0.5, 0.75, 0.9, 0.97)
@@ -185,8 +185,8 @@ def _differ_by_rounding(
     mine, rho = ours.rho[proper].astype(float), theirs.rho[proper].astype(float)
     off, rounding = _distance(mine, rho), _distance(exact.rho[proper], rho)
     size = np.max(np.abs(rho), axis=0, where=np.isfinite(rho), initial=1.0)
-    least = np.maximum(LEAST * size, np.where(np.isfinite(slack), slack, 0.0))
-    allowed = ROUNDINGS * _quantiles(rounding) + least
+    floor = np.maximum(FLOOR * size, np.where(np.isfinite(slack), slack, 0.0))
+    allowed = ROUNDINGS * _quantiles(rounding) + floor
     within = _quantiles(off) <= allowed
     # Signs may differ where a verdict is nearer to zero than any rounding, of this row or of most.
     near = np.maximum(np.maximum(ROUNDINGS * rounding, allowed[-1]), slack)
