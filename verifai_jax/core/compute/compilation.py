@@ -23,7 +23,7 @@ from concurrent.futures import CancelledError, Future, ThreadPoolExecutor, wait
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from functools import cache, lru_cache, partial, wraps
-from typing import Any, Generic, Literal, ParamSpec, TypeVar, cast
+from typing import Any, Generic, Literal, TypeVar, cast
 
 import jax
 import numpy as np
@@ -33,7 +33,6 @@ from verifai_jax.core.compute.devices import enable_compile_cache
 
 K = TypeVar("K", bound=Hashable)
 V = TypeVar("V")
-P = ParamSpec("P")
 
 
 @dataclass(frozen=True)
@@ -72,7 +71,9 @@ KEPT = 32
 """Values of static arguments whose programs `jit_each` keeps: those of a few dozen formulas."""
 
 
-def jit_each(static: int = 1, inline: bool = False) -> Callable[[Callable[P, V]], Callable[P, V]]:
+def jit_each(
+    static: int = 1, inline: bool = False
+) -> Callable[[Callable[..., V]], Callable[..., V]]:
     """Return a decorator like `jax.jit` for functions whose first arguments are static.
 
     Only the programs of the last `KEPT` static values are kept. `jax.jit` keeps those of all as
@@ -83,7 +84,7 @@ def jit_each(static: int = 1, inline: bool = False) -> Callable[[Callable[P, V]]
     - `inline`: whether the steps become those of a surrounding program.
     """
 
-    def decorated(function: Callable[P, V]) -> Callable[P, V]:
+    def decorated(function: Callable[..., V]) -> Callable[..., V]:
         @lru_cache(KEPT)
         def compiled(*values: Hashable) -> Callable[..., V]:
             return jax.jit(partial(function, *values), inline=inline)
@@ -92,7 +93,7 @@ def jit_each(static: int = 1, inline: bool = False) -> Callable[[Callable[P, V]]
         def call(*arguments: Any) -> V:
             return compiled(*arguments[:static])(*arguments[static:])
 
-        return cast("Callable[P, V]", call)
+        return call
 
     return decorated
 
