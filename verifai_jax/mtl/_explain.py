@@ -8,7 +8,6 @@ The hard robustness is the value of one predicate at one instant, found by walki
 the operand that decides each minimum or maximum.
 """
 
-import functools
 from dataclasses import dataclass, field
 
 import jax
@@ -16,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from verifai_jax.core.compute.compilation import jit_each
 from verifai_jax.core.display.notebook import InNotebook
 from verifai_jax.core.messages.text import LONG, STAMPS, format_seconds, format_time
 from verifai_jax.core.values.trace import Trace
@@ -182,7 +182,7 @@ def _distinct(formula: Formula) -> tuple[Formula, ...]:
     return tuple(dict.fromkeys(formula.subformulas(valued=True)))
 
 
-@functools.partial(jax.jit, static_argnums=0)
+@jit_each()
 def _all_values(setting: Setting, signals: dict[str, Array]) -> list[Array]:
     """Compute every sub-formula, each to where it settles and at least to the last sample."""
     e = evaluator_of(setting, signals, None, None, 0)
@@ -193,7 +193,7 @@ def _all_values(setting: Setting, signals: dict[str, Array]) -> list[Array]:
     return values
 
 
-@functools.partial(jax.jit, static_argnums=0)
+@jit_each()
 def _influence(
     setting: Setting, signals: dict[str, Array], tau: float | Float[Array, ""]
 ) -> list[Float[Array, " time"]]:

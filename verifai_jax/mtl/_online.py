@@ -24,6 +24,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
+from verifai_jax.core.compute.compilation import jit_each
 from verifai_jax.core.messages.errors import missing_name
 from verifai_jax.core.values.gaps import with_gaps
 from verifai_jax.mtl._parse import parse
@@ -74,7 +75,7 @@ class Online:
 
     def interval(self, state: State) -> tuple[Float[Array, ""], Float[Array, ""]]:
         """Return the minimum and maximum robustness at time 0 that further samples allow."""
-        return _end_with(self, state, -math.inf), _end_with(self, state, math.inf)
+        return _end_with(self, -math.inf, None, state), _end_with(self, math.inf, None, state)
 
     def finish(self, state: State, count: int | None = None) -> Float[Array, ""]:
         """Return the robustness at time 0 if the trace ends here and is held, as computed offline.
@@ -85,7 +86,7 @@ class Online:
         - `count`: number of samples so far, if it is known while JAX traces; the program then skips
           windows that have passed.
         """
-        return _end_with(self, state, None, count)
+        return _end_with(self, None, count, state)
 
     @property
     def memory(self) -> int:
@@ -111,12 +112,12 @@ def online(formula: Formula | str, dt: float, semantics: Semantics = hard) -> On
     return monitor
 
 
-@functools.lru_cache(maxsize=256)
+@functools.lru_cache(maxsize=64)
 def _plan(monitor: Online) -> Plan:
     return streams(monitor.formula, monitor.dt, Semantics(monitor.kind))
 
 
-@functools.partial(jax.jit, static_argnums=0, inline=True)
+@jit_each(inline=True)
 def _step(monitor: Online, state: State, sample: dict[str, Any]) -> State:
     arrays = {name: jnp.asarray(value)[None] for name, value in sample.items()}
     truths = frozenset(name for name, array in arrays.items() if array.dtype == bool)
@@ -129,10 +130,8 @@ def _step(monitor: Online, state: State, sample: dict[str, Any]) -> State:
     return State(state.count + 1, last, cells)
 
 
-@functools.partial(jax.jit, static_argnums=(0, 2, 3), inline=True)
-def _end_with(
-    monitor: Online, state: State, unknown: float | None, count: int | None = None
-) -> Array:
+@jit_each(3, inline=True)
+def _end_with(monitor: Online, unknown: float | None, count: int | None, state: State) -> Array:
     """Compute the value at time 0 if all further margins are `unknown` (the last, if None)."""
     plan, leaves = monitor.plan, state.last
     if unknown is not None:

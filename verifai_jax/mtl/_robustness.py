@@ -20,6 +20,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, PyTree
 
+from verifai_jax.core.compute.compilation import jit_each
 from verifai_jax.core.messages.text import format_seconds
 from verifai_jax.core.values.trace import Trace
 from verifai_jax.mtl import windows
@@ -244,8 +245,8 @@ def _everywhere_backward(
 
 _everywhere.defvjp(_everywhere_forward, _everywhere_backward)
 # Compiled on their own, so that plain calls on arrays are fast too; inlined within a larger `jit`.
-_root_compiled = jax.jit(_root, static_argnums=0, inline=True)
-_everywhere_compiled = jax.jit(_everywhere, static_argnums=0, inline=True)
+_root_compiled = jit_each(inline=True)(_root)
+_everywhere_compiled = jit_each(inline=True)(_everywhere)
 
 
 @runtime_checkable

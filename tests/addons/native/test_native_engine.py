@@ -1,6 +1,7 @@
 """Runs by native code against runs by XLA, and what is done where there is no native code."""
 
 import os
+import re
 import stat
 
 import jax
@@ -285,3 +286,94 @@ def test_double_precision_and_black_boxes_are_not_native(ending):
     )
     assert run.engine == "xla"
     assert any("single precision" in note for note in run.notes)
+
+
+def falling(**more):
+    """A pendulum with constants that are easily found in its code."""
+    return vj.ode(
+        lambda time, state, control, features: {
+            "angle": state["rate"],
+            "rate": -9.81 * jnp.sin(state["angle"]) - 0.37 * state["rate"],
+        },
+        lambda features, key: {"angle": features["x0"], "rate": 0.0 * features["x0"]},
+        dt=0.05,
+        duration=2.0,
+        signals=lambda time, state, control, features: {"angle": state["angle"]},
+        **more,
+    )
+
+
+@pytest.mark.parametrize("number", ["9.81", "0.37", "0.75"])
+def test_a_constant_that_is_off_by_a_ten_thousandth_is_found(monkeypatch, tmp_path, number):
+    monkeypatch.setenv("VERIFAI_JAX_CACHE", str(tmp_path))
+    problem = problem_of(falling(), "always (angle < 0.75)", {"x0": SPACE["x0"]})
+    honest = native_program.translate
+
+    def edited(program):
+        source, times = re.subn(
+            rf"(?<![\d.]){re.escape(number)}\d*f",
+            lambda found: f"{float(found[0][:-1]) * (1 + 1e-4):.9f}f",
+            honest(program),
+        )
+        assert times
+        return source
+
+    monkeypatch.setattr(native_program, "translate", edited)
+    assert "differ from those of XLA by more than rounding" in fallback_note(problem)
+    monkeypatch.setattr(native_program, "translate", honest)
+    monkeypatch.setenv("VERIFAI_JAX_CACHE", str(tmp_path / "other"))
+    problem.programs.clear()
+    assert vj.falsify(problem, "uniform", 700, engine="native", progress=False).engine == "native"
+
+
+def test_a_system_that_draws_is_compared_at_rounding_too(monkeypatch, tmp_path):
+    monkeypatch.setenv("VERIFAI_JAX_CACHE", str(tmp_path))
+
+    def simulate(features, key):
+        noise = jax.random.normal(key, (20,)) * 0.1
+        _, angle = jax.lax.scan(lambda x, n: (0.87 * x + n,) * 2, features["x0"], noise)
+        return vj.Trace({"angle": angle}, dt=0.1)
+
+    problem = problem_of(simulate, "always[0, 1.9] (abs(angle) < 0.3)", {"x0": vj.Box(-1, 1)})
+    honest = native_program.translate
+    edited = lambda program: honest(program).replace("0.87", "0.8701")  # noqa: E731
+    monkeypatch.setattr(native_program, "translate", edited)
+    assert "differ from those of XLA by more than rounding" in fallback_note(problem)
+
+
+def test_a_network_of_convolutions_is_simulated_by_xla():
+    """Products by 1 x 1 convolutions, as in networks of ONNX, by default and natively."""
+    weights = np.random.default_rng(0).normal(size=(3, 2, 1, 1)).astype(np.float32)
+
+    def simulate(features, key):
+        image = jnp.stack([features["x0"], 1.0]).reshape(1, 2, 1, 1)
+        out = jax.lax.conv(image, weights, (1, 1), "VALID").ravel()
+        return vj.Trace({"angle": out[:1]}, dt=0.1)
+
+    problem = problem_of(simulate, "angle > -1.5", {"x0": SPACE["x0"]})
+    assert "the operation conv_general_dilated, which is not translated" in fallback_note(problem)
+
+
+@pytest.mark.parametrize(
+    ("owner", "name"),
+    [
+        (native_program, "translate"),
+        (native_program, "load"),
+        (native_program, "library_name"),
+        (native_program.NativeProgram, "begin"),
+        (native_program.NativeProgram, "__call__"),
+        (native_program.NativeProgram, "compare"),
+        (native_program.NativeProgram, "otherwise_rounded"),
+        (native_engine, "compiler"),
+    ],
+)
+def test_whatever_native_code_raises_xla_goes_on(ending, monkeypatch, tmp_path, owner, name):
+    monkeypatch.setenv("VERIFAI_JAX_CACHE", str(tmp_path))
+    ending.programs.clear()
+
+    def raises(*arguments, **options):
+        raise KeyError("a part that is not there")
+
+    monkeypatch.setattr(owner, name, raises)
+    assert "it failed (KeyError: 'a part that is not there')" in fallback_note(ending)
+    ending.programs.clear()

@@ -9,7 +9,6 @@ and the gradient of the smooth robustness moves them away from the limit and smo
 the two lies the trace that barely satisfies the formula.
 """
 
-import functools
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 
@@ -21,6 +20,7 @@ from jaxtyping import Array, Float
 
 from verifai_jax.addons.monitoring.free_traces import FreeTraces, Signals, states_of
 from verifai_jax.addons.monitoring.recorded import Recordings, named_traces
+from verifai_jax.core.compute.compilation import jit_each
 from verifai_jax.core.display.figure import Drawn
 from verifai_jax.core.display.notebook import InNotebook, picture_html
 from verifai_jax.core.values.trace import Trace
@@ -158,7 +158,7 @@ def _moved(formula: Formula, free: FreeTraces, signals: Signals, sign: int) -> S
     return signals | {name: np.asarray(own, float) * scales[name] for name, own in moved.items()}
 
 
-@functools.partial(jax.jit, static_argnums=(0, 1, 2, 3))
+@jit_each(4)
 def _ascended(
     formula: Formula,
     dt: float,

@@ -22,7 +22,7 @@ from jaxtyping import Float
 from verifai_jax.addons.monitoring.c_monitor import HEAD, HELPERS, monitor_code
 from verifai_jax.addons.monitoring.margins import ALONE, Margins, margins
 from verifai_jax.addons.monitoring.python_machine import PythonMachine
-from verifai_jax.addons.native.native_code.machine_code import Unavailable, compiler, library_file
+from verifai_jax.addons.native.native_code.machine_code import Unavailable, compiler, load_library
 from verifai_jax.core.messages.errors import missing_name
 from verifai_jax.core.values.gaps import has_truths, with_gaps
 from verifai_jax.mtl.formula import Formula
@@ -69,11 +69,8 @@ class CompiledMachine:
         about = tool.stat()
         which = (str(tool), about.st_size, about.st_mtime_ns, platform.machine(), FLAGS, source)
         name = f"monitor-{hashlib.sha256(repr(which).encode()).hexdigest()[:32]}"
-        path = library_file(name, lambda: (source, FLAGS))
-        try:
-            self._library = ctypes.CDLL(str(path))
-        except OSError as error:
-            raise Unavailable(f"{path.name} cannot be loaded: {error}") from error
+        symbols = ("size", "start", "step", "steps")
+        _, self._library = load_library(name, lambda: (source, FLAGS), symbols)
         self._library.size.restype = ctypes.c_long
         size = self._library.size()
         self._state, self._scratch = (ctypes.create_string_buffer(size) for _ in range(2))

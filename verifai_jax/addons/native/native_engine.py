@@ -11,6 +11,8 @@ first rows.
 
 import math
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
@@ -93,7 +95,8 @@ class NativeEngine:
         self._xla.begin_compiling()
         if self._is_worth and self.engine.batch > FIRST:
             # The first round needs it; it is made of what was traced just now.
-            self._program.begin()
+            with self._noting():
+                self._program.begin()
 
     def compile(self) -> None:
         """Compile the programs of the first rows now."""
@@ -114,9 +117,9 @@ class NativeEngine:
         if before:
             some = rows[:before], key, first, _cut(temperature, slice(before))
             parts.append(self._by_xla(*some))
-            if not self._program.approved:
-                self._met.append((some, parts[0]))
-        self._program.begin()
+            self._met.append((some, parts[0]))
+        with self._noting():
+            self._program.begin()
         if before < len(rows):
             rest = _cut(temperature, slice(before, None))
             parts.append(self._by_native(rows[before:], key, first + before, rest))
@@ -131,11 +134,20 @@ class NativeEngine:
             return False
         if not asked and self._budget * self.engine.program.work < WORTH:
             return False
-        try:
+        with self._noting():
             compiler()
+        return not self._why
+
+    @contextmanager
+    def _noting(self) -> Iterator[None]:
+        """Return a context in which any error becomes the reason for which XLA simulates."""
+        try:
+            yield
         except Unavailable as error:
             self._why = str(error)
-        return not self._why
+        except Exception as error:
+            # Native code is not needed for anything, so nothing that it raises ends a run.
+            self._why = f"it failed ({type(error).__name__}: {error})"
 
     @cached_property
     def _xla(self) -> Engine:
@@ -169,22 +181,18 @@ class NativeEngine:
         self, rows: "Rows", key: "RunKey", first: int, temperature: "Temperature"
     ) -> Verdicts:
         started = time.perf_counter()
-        try:
+        with self._noting():
             self._program.ready()
-        except Unavailable as error:
-            self._why = str(error)
         self._waited += time.perf_counter() - started
-        if not self._why and not self._program.approved:
-            if not self._met:
-                some = rows[:FIRST], key, first, _cut(temperature, slice(FIRST))
-                self._met.append((some, self._by_xla(*some)))
-            ours = Verdicts.concatenate([self._program(*some) for some, _ in self._met])
-            theirs = Verdicts.concatenate([verdicts for _, verdicts in self._met])
-            self._program.compare(ours, theirs, self._slack)
-            self._why, self._met = self._program.refused, []
-        if self._why:
+        result = None
+        if not self._why:
+            with self._noting():
+                if not self._program.approved:
+                    self._check(rows, key, first, temperature)
+                result = self._program(rows, key, first, temperature)
+        self._met = []
+        if result is None:
             return self.engine.evaluate(rows, key, first, temperature)
-        result = self._program(rows, key, first, temperature)
         near = np.any(np.abs(result.rho) <= self._slack, axis=1)
         if not np.any(near):
             return result
@@ -200,6 +208,27 @@ class NativeEngine:
             for mine, other in zip(jax.tree.leaves(result), jax.tree.leaves(theirs), strict=True):
                 mine[at] = other[here]
         return result
+
+    def _check(self, rows: "Rows", key: "RunKey", first: int, temperature: "Temperature") -> None:
+        """Compare the native program with XLA's, in the first rows and where verdicts are near.
+
+        **Raises:** `Unavailable` if they differ by more than rounding.
+        """
+        distance = np.abs(self._program(rows, key, first, temperature).rho)
+        nearest = np.min(np.where(np.isnan(distance), np.inf, distance), axis=1)
+        at = np.sort(np.argsort(nearest)[:FIRST])
+        some, begin = at, first
+        if self._program.draws:
+            # Their random keys are those of their numbers, so they are rows that follow each other.
+            begin = int(np.argmin(nearest)) // FIRST * FIRST
+            some, begin = slice(begin, begin + FIRST), first + begin
+        near = rows[some], key, begin, _cut(temperature, some)
+        met = [*self._met, (near, self._by_xla(*near))]
+        other = self._program.otherwise_rounded
+        ours = Verdicts.concatenate([self._program(*each) for each, _ in met])
+        theirs = Verdicts.concatenate([verdicts for _, verdicts in met])
+        exact = Verdicts.concatenate([other(*each) for each, _ in met])
+        self._program.compare(ours, theirs, exact, self._slack)
 
     @cached_property
     def _slack(self) -> Float[np.ndarray, " formulas"]:

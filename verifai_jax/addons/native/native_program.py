@@ -3,7 +3,7 @@
 program = NativeProgram(engine_for(problem, 32768))
 program.begin()                                     # compiles in the background
 program(rows, key, first, temperature)              # Verdicts, as of an `Engine`
-program.compare(ours, theirs, slack)                # sets `approved`, or `refused`
+program.compare(ours, theirs, exact, slack)         # sets `approved`, or raises `Unavailable`
 """
 
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -28,15 +28,23 @@ from verifai_jax.addons.native.native_code.values import Untranslatable
 from verifai_jax.core.compute.keys import IMPLEMENTATION, simulation_key
 from verifai_jax.core.compute.precision import in_precision
 from verifai_jax.core.values.trace import Status
-from verifai_jax.evaluation.engine import Engine
+from verifai_jax.evaluation.engine import FIRST, Engine, engine_for
 from verifai_jax.evaluation.verdicts import Verdicts, violations
 
 Rows: TypeAlias = Float[np.ndarray, "n row"]
 RunKey: TypeAlias = Key[Array, ""]
 Temperature: TypeAlias = Float[np.ndarray, " n"] | float
 """Temperatures of the smooth robustness, or one for all."""
-AGREES = 1e-3
-"""Relative difference of two robustness values from which on they differ by more than rounding."""
+ALIKE = 1e-2
+"""Relative difference of two derivatives from which on they differ by more than rounding."""
+ROUNDINGS = 10
+"""How far native code may be from XLA, in differences of XLA's own results in two roundings."""
+FLOOR = 2e-6
+"""What native code may differ by where XLA rounds nothing, relative to 1 or the robustness: the 16
+units in the last place that an elementary function may be off."""
+SHARES = (0.5, 0.75, 0.9, 0.97)
+"""Shares of simulations that are compared; a few chaotic ones go their own ways."""
+DIFFERS = "its results differ from those of XLA by more than rounding"
 
 
 class NativeProgram:
@@ -46,7 +54,7 @@ class NativeProgram:
         self.engine = engine
         self.approved = False
         self.refused = ""
-        self._future: Future[tuple[str, Library]] | None = None
+        self._future: Future[Library] | None = None
 
     @cached_property
     def draws(self) -> bool:
@@ -93,21 +101,21 @@ class NativeProgram:
             raise Unavailable(self.refused)
         self.begin()
         assert self._future is not None
-        return self._future.result()[1]
+        return self._future.result()
 
-    def _load(self) -> tuple[str, Library]:
+    def _load(self) -> Library:
         try:
             program, computes = self.traced
             name = library_name(computes)
-            agrees = is_approved(name)
-            if agrees is False:
-                raise Unavailable("its results differ from those of XLA by more than rounding")
             (form,) = program.out_avals
             with in_precision(self.engine.precision):
                 source = lambda: translate(program)  # noqa: E731
                 library = load(name, form.shape[0], source, quickly=self.engine.gradient)
+            agrees = is_approved(library.path)
+            if agrees is False:
+                raise Unavailable(DIFFERS)
             self.approved = bool(agrees)
-            return name, library
+            return library
         except Untranslatable as error:
             raise Unavailable(f"it has {error}, which is not translated") from error
 
@@ -124,33 +132,84 @@ class NativeProgram:
         broken = violations(rho, status, lambda: np.ones(rho.shape, bool))
         return Verdicts(rho, status, broken, features, **more)
 
-    def compare(self, ours: Verdicts, theirs: Verdicts, slack: np.ndarray) -> None:
-        """Compare rows with those of XLA, and store whether they agree."""
-        assert self._future is not None
-        name, _ = self._future.result()
-        mine = ours.rho
-        proper = np.repeat((theirs.status == Status.OK)[:, None], mine.shape[1], axis=1)
-        clear = proper & (np.abs(theirs.rho) > slack)
-        far = np.abs(mine - theirs.rho) > AGREES * (1 + np.abs(theirs.rho))
+    def otherwise_rounded(
+        self, rows: Rows, key: RunKey, first: int, temperature: Temperature
+    ) -> Verdicts:
+        """Simulate rows by XLA with other roundings: in double precision, or nudged.
+
+        A system that draws would draw other numbers in double precision; the nudge moves its rows
+        by a unit in the last place.
+        """
+        if self.draws:
+            rows = np.nextafter(rows, np.float32(0.5), dtype=np.float32)
+            engine: Engine = self.engine
+        else:
+            engine = engine_for(
+                self.engine.problem, FIRST, precision="float64",
+                given=getattr(self.engine.inputs, "given", False),
+            )  # fmt: skip
+        size, dtype = min(engine.batch, FIRST), engine.inputs.row_form.dtype
+        parts = [slice(begin, begin + size) for begin in range(0, len(rows), size)]
+        return Verdicts.concatenate([
+            engine.evaluate(rows[each].astype(dtype), key, first + each.start) for each in parts
+        ])  # fmt: skip
+
+    def compare(self, ours: Verdicts, theirs: Verdicts, exact: Verdicts, slack: np.ndarray) -> None:
+        """Compare rows with those of XLA, and store whether they differ by rounding only.
+
+        **Arguments:**
+        - `exact`: the same rows by XLA with other roundings, whose differences are the measure.
+        - `slack`: robustness of each formula below which rounding may decide.
+        **Raises:** `Unavailable` if they differ by more.
+        """
         pairs = ((ours.gradient, theirs.gradient), (ours.clause_gradients, theirs.clause_gradients))
         agrees = bool(
             np.array_equal(ours.status, theirs.status)
             and all(_alike(a, b) for a, b in pairs if a is not None and b is not None)
-            and np.array_equal((mine < 0) & clear, (theirs.rho < 0) & clear)
-            # A simulation may be chaotic, and a few of them go their own ways.
-            and np.sum(far & proper & (theirs.rho >= 0)) <= 0.02 * max(np.sum(proper), 1)
+            and _differ_by_rounding(ours, theirs, exact, slack)
         )
-        approve(name, agrees)
+        approve(self.ready().path, agrees)
         self.approved = agrees
         if not agrees:
-            self.refused = "its results differ from those of XLA by more than rounding"
+            self.refused = DIFFERS
+            raise Unavailable(DIFFERS)
+
+
+def _differ_by_rounding(
+    ours: Verdicts, theirs: Verdicts, exact: Verdicts, slack: np.ndarray
+) -> bool:
+    """Return whether robustness differs from XLA's as XLA's own differs between roundings."""
+    proper = (theirs.status == Status.OK) & (exact.status == Status.OK)
+    if not np.any(proper):
+        return True
+    mine, rho = ours.rho[proper].astype(float), theirs.rho[proper].astype(float)
+    off, rounding = _distance(mine, rho), _distance(exact.rho[proper], rho)
+    size = np.max(np.abs(rho), axis=0, where=np.isfinite(rho), initial=1.0)
+    floor = np.maximum(FLOOR * size, np.where(np.isfinite(slack), slack, 0.0))
+    allowed = ROUNDINGS * _quantiles(rounding) + floor
+    within = _quantiles(off) <= allowed
+    # Signs may differ where a verdict is nearer to zero than any rounding, of this row or of most.
+    near = np.maximum(np.maximum(ROUNDINGS * rounding, allowed[-1]), slack)
+    return bool(np.all(within) and np.all(((mine < 0) == (rho < 0)) | (np.abs(rho) <= near)))
+
+
+def _quantiles(distances: np.ndarray) -> np.ndarray:
+    return np.quantile(distances, SHARES, axis=0, method="higher")
+
+
+def _distance(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Return how far numbers are apart: 0 for equal infinities and NaNs, infinity for others."""
+    with np.errstate(invalid="ignore"):
+        apart = np.abs(a - b)
+    same = (a == b) | (np.isnan(a) & np.isnan(b))
+    return np.where(same, 0.0, np.where(np.isfinite(apart), apart, np.inf))
 
 
 def _alike(ours: np.ndarray, theirs: np.ndarray) -> bool:
     """Return whether derivatives agree, except in a few chaotic simulations."""
     ours, theirs = ours.reshape(len(ours), -1), theirs.reshape(len(theirs), -1)
     size = np.max(np.abs(theirs), axis=1, keepdims=True) + 1e-6
-    same = np.isclose(ours, theirs, rtol=0, atol=10 * AGREES * size, equal_nan=True)
+    same = np.isclose(ours, theirs, rtol=0, atol=ALIKE * size, equal_nan=True)
     return bool(np.mean(np.all(same, axis=1)) >= 0.98)
 
 

@@ -18,6 +18,7 @@ from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
 from verifai_jax.addons.rl.batched_training import StaticTask, numbers_of
 from verifai_jax.addons.rl.task.task import State, Task
+from verifai_jax.core.compute.compilation import jit_each
 from verifai_jax.core.compute.devices import Device, enable_compile_cache, spread_over_devices
 from verifai_jax.core.compute.keys import IMPLEMENTATION
 from verifai_jax.core.display.progress import shows_progress
@@ -89,7 +90,7 @@ def batched_mean_returns(
             yield batch, np.asarray(means, np.float64)[: len(batch)]
 
 
-@partial(jax.jit, static_argnums=(0, 1))
+@jit_each(2)
 def _episode_returns(
     static_task: StaticTask, episodes: int, numbers: list[Array], policy: Policy,
     key: Key[Array, ""],
@@ -100,7 +101,7 @@ def _episode_returns(
     return _returns(task, starts, step_keys, partial(step, policy))
 
 
-@partial(jax.jit, static_argnums=(0, 1, 2))
+@jit_each(3)
 def _mean_returns(
     static_task: StaticTask, episodes: int, devices: tuple[Device, ...], numbers: list[Array],
     policies: PyTree, key: Key[Array, ""],

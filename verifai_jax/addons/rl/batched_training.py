@@ -26,7 +26,7 @@ from jaxtyping import Array, ArrayLike, Float, Int, Integer, PyTree
 
 from verifai_jax.addons.rl.algorithm import Algorithm, AlgorithmState, check_fit
 from verifai_jax.addons.rl.task.task import Task
-from verifai_jax.core.compute.compilation import power_of_two
+from verifai_jax.core.compute.compilation import jit_each, power_of_two
 from verifai_jax.core.compute.devices import (
     Device,
     enable_compile_cache,
@@ -344,7 +344,7 @@ def _over_lanes(layout: _Layout, one: Callable[..., PyTree], shared: int) -> Cal
     return spread
 
 
-@partial(jax.jit, static_argnums=(0, 1, 2))
+@jit_each(3)
 def _start(
     layout: _Layout, static_task: StaticTask, structure: PyTreeDef, tasks: list[Array],
     algorithms: list[Array], seeds: Integer[Array, " lanes"], updates: Int[Array, " lanes"],

@@ -22,7 +22,7 @@ from collections.abc import Callable, Hashable, Iterator, Mapping
 from concurrent.futures import CancelledError, Future, ThreadPoolExecutor, wait
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, lru_cache, partial, wraps
 from typing import Any, Generic, Literal, TypeVar, cast
 
 import jax
@@ -65,6 +65,37 @@ class ProgramCache:
     def clear(self) -> None:
         """Remove all values, so that their memory can be freed."""
         self._slots.clear()
+
+
+KEPT = 32
+"""Values of static arguments whose programs `jit_each` keeps: those of a few dozen formulas."""
+
+
+def jit_each(
+    static: int = 1, inline: bool = False
+) -> Callable[[Callable[..., V]], Callable[..., V]]:
+    """Return a decorator like `jax.jit` for functions whose first arguments are static.
+
+    Only the programs of the last `KEPT` static values are kept. `jax.jit` keeps those of all as
+    long as the function lives, so a process that judges ever more formulas would grow without end.
+
+    **Arguments:**
+    - `static`: number of static arguments; they are hashable, and come first.
+    - `inline`: whether the steps become those of a surrounding program.
+    """
+
+    def decorated(function: Callable[..., V]) -> Callable[..., V]:
+        @lru_cache(KEPT)
+        def compiled(*values: Hashable) -> Callable[..., V]:
+            return jax.jit(partial(function, *values), inline=inline)
+
+        @wraps(function)
+        def call(*arguments: Any) -> V:
+            return compiled(*arguments[:static])(*arguments[static:])
+
+        return call
+
+    return decorated
 
 
 def power_of_two(count: int) -> int:

@@ -4,12 +4,14 @@ XLA runs the small loop bodies of a rollout on one thread, so the batch is split
 device per core (`core.compute.cores`) to use all cores.
 
 Environment variables: `VERIFAI_JAX_CORES` (number of cores to use), `VERIFAI_JAX_CACHE` (a folder
-for compiled programs, or `off`).
+for compiled programs, or `off`), `VERIFAI_JAX_CACHE_MIB` (its size limit, 2048 by default).
 """
 
+import itertools
 import os
 import platform
 import shutil
+import threading
 from collections.abc import Callable, Sequence
 from functools import cache
 from pathlib import Path
@@ -18,6 +20,8 @@ from typing import Any, TypeAlias
 import jax
 import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
+
+from verifai_jax.core.store.eviction import evict
 
 Device: TypeAlias = jax.Device  # pyright: ignore[reportInvalidTypeForm]
 """A device of JAX; its own name of the class is a variable to type checkers."""
@@ -87,21 +91,43 @@ def cache_folder() -> Path | None:
     setting = os.environ.get("VERIFAI_JAX_CACHE", "").strip()
     if setting.lower() in ("off", "0", "no", "false"):
         return None
-    if setting:
-        return Path(setting).expanduser()
     base = os.environ.get("XDG_CACHE_HOME") or "~/.cache"
-    return Path(base).expanduser() / "verifai_jax" / "compiled"
+    folder = Path(setting) if setting else Path(base) / "verifai_jax" / "compiled"
+    # Compilers run in other folders.
+    return folder.expanduser().absolute()
 
 
 CACHE_ROOM = 64 * 2**20
 """Bytes that must be free to keep compiled programs. On a full disk JAX leaves halves of programs,
 which it warns of in each later process and never replaces; a run's programs are a few MiB."""
+EVICTED_EVERY = 256
+"""Programs of a process after which it looks at the size of the cache again, after the first."""
+_compiled = itertools.count()
+
+
+def cache_limit() -> int:
+    """Return how many bytes the persistent compile cache may hold.
+
+    **Raises:** `ValueError` for a `VERIFAI_JAX_CACHE_MIB` that is not a positive integer.
+    """
+    wanted = os.environ.get("VERIFAI_JAX_CACHE_MIB", "").strip() or "2048"
+    if not wanted.isdecimal() or int(wanted) < 1:
+        raise ValueError(f"VERIFAI_JAX_CACHE_MIB must be a positive integer; got {wanted!r}")
+    return int(wanted) * 2**20
 
 
 def enable_compile_cache() -> None:
-    """Store compiled programs on disk, unless the user has configured JAX's cache."""
+    """Store compiled programs on disk, unless the user has configured JAX's cache.
+
+    The oldest programs are removed in the background, as this is called for each program.
+    """
     folder = cache_folder()
-    if folder is None or _setting("jax_compilation_cache_dir") is not None:
+    if folder is None:
+        return
+    limit = cache_limit()
+    if next(_compiled) % EVICTED_EVERY == 0:
+        threading.Thread(target=evict, args=(folder, limit), daemon=True).start()
+    if _setting("jax_compilation_cache_dir") is not None:
         return
     try:
         folder.mkdir(parents=True, exist_ok=True)

@@ -89,19 +89,23 @@ def lower_or_recall(
         # JAX remembers it by the function, so that it is traced once.
         program.trace(*flat)
         try:
-            exported = jax.export.export(program)(*flat)
-            data = bytes(exported.serialize())
+            data = bytes(jax.export.export(program)(*flat).serialize())
         except (ValueError, NotImplementedError, ImportError):
             # Such as calls of libraries that JAX does not promise to keep.
             return jax.jit(function).trace(*arguments).lower()
         if len(data) <= MAX_BYTES:
             _write(path, data)
+        # What export returned holds the function and all that it was traced into, and JAX holds it.
+        exported = jax.export.deserialize(bytearray(data))
 
     def recalled(*arguments: Any) -> Any:
         results = exported.call(*jax.tree.leaves(arguments))
         return results if form is None else jax.tree.unflatten(form, results)
 
-    return jax.jit(recalled, in_shardings=_whole(exported)).lower(*arguments)
+    lowered = jax.jit(recalled, in_shardings=_whole(exported)).lower(*arguments)
+    # JAX keeps the last thousands of exported programs, but what they compute is in `lowered`.
+    object.__setattr__(exported, "mlir_module_serialized", b"")
+    return lowered
 
 
 def _whole(exported: "jax.export.Exported") -> Any:

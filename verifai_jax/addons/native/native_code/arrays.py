@@ -136,11 +136,6 @@ def _iota(t: Translator, step: Equation, inputs: list[Value]) -> list[Value]:
     return [t.constant(np.broadcast_to(along, shape).astype(DTYPES[kind]))]
 
 
-@rule("split_key", "create_token")
-def _unknown(t: Translator, step: Equation, inputs: list[Value]) -> list[Value]:
-    raise Untranslatable(f"the operation {step.primitive.name}")
-
-
 @rule("empty", "empty2")
 def _empty(t: Translator, step: Equation, inputs: list[Value]) -> list[Value]:
     form = step.outvars[0].aval

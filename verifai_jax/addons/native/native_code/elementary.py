@@ -72,6 +72,12 @@ FUNCTIONS = {
 """Functions of the prelude, whose operands are all vectors or all single numbers. Bounds are
 constants: the first operand, or the first and the last."""
 COMPARISONS = {"eq": "==", "ne": "!=", "lt": "<", "le": "<=", "gt": ">", "ge": ">="}
+NAMES = frozenset({
+    *OPERATORS, *FUNCTIONS, *COMPARISONS, "lt_to", "le_to", "div", "rem", "round", "integer_pow",
+    "select_n", "convert_element_type", "bitcast_convert_type", "shift_left",
+    "shift_right_logical", "shift_right_arithmetic",
+})  # fmt: skip
+"""All primitives that compute each element of a result from the same elements of the operands."""
 _FOLDED: dict[str, Callable[..., Any]] = {
     "add": np.add,
     "sub": np.subtract,

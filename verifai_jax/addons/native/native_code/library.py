@@ -5,7 +5,9 @@ library = load(name, lambda: translate(program))    # or `Unavailable`, which sa
 library(rows, key, first, temperatures, numbers)    # [n, count] of bits
 """
 
+import contextlib
 import ctypes
+import hashlib
 import platform
 from collections.abc import Callable
 from functools import cache
@@ -34,15 +36,12 @@ PARTS = 4
 class Library:
     """A loaded library that simulates a batch.
 
+    - `path`: its file.
     - `count`: number of results of a simulation.
     """
 
-    def __init__(self, path: Path, count: int) -> None:
-        try:
-            loaded = ctypes.CDLL(str(path))
-        except OSError as error:
-            raise machine_code.Unavailable(f"{path.name} cannot be loaded: {error}") from error
-        self.count = count
+    def __init__(self, path: Path, loaded: ctypes.CDLL, count: int) -> None:
+        self.path, self.count = path, count
         self._width = int(loaded.width())
         self._run = loaded.run
         pointer, whole = ctypes.c_void_p, ctypes.c_long
@@ -106,26 +105,28 @@ def load(name: str, count: int, translate: Callable[[], str], quickly: bool = Fa
         effort = "-O1" if quickly or source.count("\n") > LONG else "-O2"
         return source, (effort, *FLAGS)
 
-    return Library(machine_code.library_file(name, program), count)
+    return Library(*machine_code.load_library(name, program, ("width", "run")), count)
 
 
-def is_approved(name: str) -> bool | None:
-    """Return whether a library agrees with XLA, as stored by `approve`; None if unknown."""
+def is_approved(path: Path) -> bool | None:
+    """Return whether the library in a file agrees with XLA, as stored by `approve`, or None."""
     try:
-        return {"yes": True, "no": False}.get(
-            (machine_code.library_folder() / f"{name}.agrees").read_text()
-        )
-    except (OSError, machine_code.Unavailable):
+        known = path.with_suffix(".agrees").read_bytes()
+    except OSError:
         return None
+    return next((agrees for agrees in (True, False) if known == _record(path, agrees)), None)
 
 
-def approve(name: str, agrees: bool) -> None:
-    """Store whether a library agrees with XLA, for later processes."""
-    try:
-        with replacing(machine_code.library_folder() / f"{name}.agrees") as partial:
-            partial.write_bytes((b"no", b"yes")[agrees])
-    except (OSError, machine_code.Unavailable):
-        return  # It is compared again.
+def approve(path: Path, agrees: bool) -> None:
+    """Store whether the library in a file agrees with XLA, for later processes."""
+    # If it cannot be stored, it is compared again.
+    with contextlib.suppress(OSError), replacing(path.with_suffix(".agrees")) as partial:
+        partial.write_bytes(_record(path, agrees))
+
+
+def _record(path: Path, agrees: bool) -> bytes:
+    text = f"{path.stem} {'agrees' if agrees else 'differs'}"
+    return f"{text} {hashlib.sha256(text.encode()).hexdigest()}\n".encode()
 
 
 @cache

@@ -1,18 +1,25 @@
 """Libraries of machine code that this machine's own compiler makes, kept on disk.
 
-    path = library_file("monitor-4f2a", lambda: (source, ("-std=c99", "-O2")))
+    path, library = load_library("monitor-4f2a", lambda: (source, ("-std=c99", "-O2")), ["step"])
 
 A file is used only if its content has the checksum in its name, from a folder that nobody
-else can write to.
+else can write to. What does not load is made once more.
 """
 
+import contextlib
+import ctypes
 import hashlib
 import os
+import platform
 import shutil
+import signal
 import stat
 import subprocess
+import sys
 import tempfile
-from collections.abc import Callable
+import time
+import zlib
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from verifai_jax.core.compute.devices import cache_folder
@@ -41,27 +48,43 @@ def _compiler() -> Path:
     found = next(filter(None, map(shutil.which, COMPILERS)), None) if os.name == "posix" else None
     if found is None:
         raise Unavailable("there is no C++ compiler: none of c++, g++, clang++ is in PATH")
-    return Path(found).resolve()
+    # Not through its links: a program such as `ccache` is the compiler whose name it is called by.
+    return Path(found).absolute()
 
 
 Program = tuple[str, tuple[str, ...]]
 """The source of a library, and the flags with which it is compiled."""
 
 
-def library_file(name: str, program: Callable[[], Program]) -> Path:
-    """Return the file of the library with this name, compiling it if there is none.
+def load_library(
+    name: str, program: Callable[[], Program], symbols: Sequence[str]
+) -> tuple[Path, ctypes.CDLL]:
+    """Return the library with this name and its file, compiling it if there is none that is whole.
 
     **Arguments:**
     - `name`: a name that identifies everything the library depends on.
     - `program`: a function that returns the source and the compiler's flags, called if needed.
-    **Raises:** `Unavailable` if it cannot be compiled or stored.
+    - `symbols`: the functions that it must have.
+    **Raises:** `Unavailable` if it cannot be compiled, stored or loaded.
     """
     try:
         folder = library_folder()
-        path = next(filter(_is_whole, sorted(folder.glob(f"{name}-*.so"))), None)
-        return path or compile_library(folder, name, *program())
-    except OSError as error:
+        for path in sorted(folder.glob(f"{name}-*.so")):
+            with contextlib.suppress(OSError, AttributeError):
+                if _is_whole(path):
+                    return path, _loaded(path, symbols)
+            path.unlink(missing_ok=True)
+        path = compile_library(folder, name, *program(), symbols)
+        return path, _loaded(path, symbols)
+    except (OSError, AttributeError) as error:
         raise Unavailable(f"the cache of compiled programs cannot be used: {error}") from error
+
+
+def _loaded(path: Path, symbols: Sequence[str]) -> ctypes.CDLL:
+    library = ctypes.CDLL(str(path))
+    for each in symbols:
+        getattr(library, each)
+    return library
 
 
 def library_folder() -> Path:
@@ -92,27 +115,84 @@ def _checksum(data: bytes) -> str:
     return hashlib.sha256(data).hexdigest()[:32]
 
 
-def compile_library(folder: Path, name: str, source: str, flags: tuple[str, ...]) -> Path:
+def compile_library(
+    folder: Path, name: str, source: str, flags: tuple[str, ...], symbols: Sequence[str] = ()
+) -> Path:
     """Compile a library into a folder, and return its file, whose name ends with a checksum.
 
+    **Arguments:**
+    - `symbols`: the functions that it must have; another process loads it to see them, since a
+      library that a compiler left incomplete may kill the process that loads it.
     **Raises:** `Unavailable` if there is no compiler, or if it fails.
     """
     tool = _compiler()
-    with tempfile.TemporaryDirectory(dir=folder) as cell:
+    _remove_left(folder)
+    with tempfile.TemporaryDirectory(
+        dir=folder, prefix=f"tmp-{os.getpid()}-{_HOST}-", ignore_cleanup_errors=True
+    ) as cell:
         code, made = Path(cell) / "program.cpp", Path(cell) / "program.so"
         code.write_text(source)
         command = [str(tool), "-shared", "-fPIC", "-w", *flags, str(code), "-o", str(made), "-lm"]
-        try:
-            done = subprocess.run(
-                command, capture_output=True, timeout=MAX_SECONDS, check=False, cwd=cell,
-                stdin=subprocess.DEVNULL,
-            )  # fmt: skip
-        except subprocess.TimeoutExpired:
-            raise Unavailable(f"{tool} took more than {MAX_SECONDS:z.0f} s") from None
-        if done.returncode != 0 or not made.is_file():
-            said = done.stderr.decode(errors="replace").strip().splitlines() or ["it said nothing"]
-            raise Unavailable(f"{tool} failed: {said[0][:200]}")
+        status, said = _run(command, cell)
+        if status != 0 or not made.is_file():
+            raise Unavailable(f"{tool} failed: {said or 'it said nothing'}")
+        if symbols:
+            load = [sys.executable, "-I", "-S", "-c", _LOAD, str(made), *symbols]
+            status, said = _run(load, cell)
+            if status != 0:
+                said = said or f"status {status}"
+                raise Unavailable(f"what {tool} made cannot be loaded: {said}")
         path = folder / f"{name}-{_checksum(made.read_bytes())}.so"
         # At once, or not at all: another process may be compiling the same.
         os.replace(made, path)
         return path
+
+
+_LOAD = """import ctypes, sys
+try:
+    library = ctypes.CDLL(sys.argv[1])
+    [getattr(library, each) for each in sys.argv[2:]]
+except (OSError, AttributeError) as error:
+    sys.exit(str(error))
+"""
+_HOST = f"{zlib.crc32(platform.node().encode()):08x}"
+
+
+def _run(command: list[str], cell: str) -> tuple[int, str]:
+    """Run a command, and return its status and the first line of its errors.
+
+    It is ended with all its processes after `MAX_SECONDS`: the compiler may be a script.
+    """
+    with open(Path(cell) / "said", "w+b") as said:
+        process = subprocess.Popen(
+            command, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=said, cwd=cell,
+            start_new_session=True,
+        )  # fmt: skip
+        try:
+            status = process.wait(MAX_SECONDS)
+        except BaseException as error:
+            with contextlib.suppress(OSError):
+                os.killpg(process.pid, signal.SIGKILL)
+            process.wait()
+            if not isinstance(error, subprocess.TimeoutExpired):
+                raise
+            raise Unavailable(f"{command[0]} took more than {MAX_SECONDS:z.0f} s") from None
+        said.seek(0)
+        lines = said.read(10_000).decode(errors="replace").strip().splitlines()
+    return status, lines[0][:200] if lines else ""
+
+
+def _remove_left(folder: Path) -> None:
+    """Remove what processes that were killed while they compiled have left."""
+    for left in folder.glob("tmp*"):
+        _, process, host, *_ = *left.name.split("-"), "", "", ""
+        with contextlib.suppress(OSError):
+            # Whether a process of another machine lives is not known, but none compiles so long.
+            dead = time.time() - left.stat().st_mtime > 10 * MAX_SECONDS
+            if not dead and host == _HOST and process.isdecimal():
+                try:
+                    os.kill(int(process), 0)
+                except ProcessLookupError:
+                    dead = True
+            if dead:
+                shutil.rmtree(left)

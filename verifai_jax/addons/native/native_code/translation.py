@@ -115,12 +115,21 @@ class Translator:
     def step(self, step: Equation, inputs: list[Value]) -> list[Value]:
         """Translate one equation."""
         name = step.primitive.name
-        if (inner := called(step)) is not None:
-            return self.closed(inner, inputs)
-        if name in RULES:
-            return RULES[name](self, step, inputs)
-        out = step.outvars[0].aval
-        return [self.elementwise(name, step.params, inputs, kind_of(out.dtype), out.shape)]
+        try:
+            if (inner := called(step)) is not None:
+                return self.closed(inner, inputs)
+            if name in RULES:
+                return RULES[name](self, step, inputs)
+            if name not in elementary.NAMES:
+                raise Untranslatable(f"the operation {name}")
+            out = step.outvars[0].aval
+            return [self.elementwise(name, step.params, inputs, kind_of(out.dtype), out.shape)]
+        except Untranslatable:
+            raise
+        except Exception as error:
+            # Such as a form of the operation that its rule was not written for.
+            text = f"the operation {name} ({type(error).__name__}: {error})"
+            raise Untranslatable(text) from error
 
     def constant(self, value: ArrayLike, form: Form | None = None) -> Value:
         """Return a constant of a program."""
