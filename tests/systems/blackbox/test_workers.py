@@ -156,12 +156,12 @@ def test_what_has_ended_when_interrupted_is_handed_over(monkeypatch, tmp_path):
     real, calls = workers._Batch, []
 
     class Interrupted(queue.SimpleQueue):
-        def get(self, *args):
+        def get(self, *args, **options):
             if not calls:
                 calls.append(1)
                 until(lambda: self.qsize() == 2)
                 raise KeyboardInterrupt
-            return super().get(*args)
+            return super().get(*args, **options)
 
     def batch(*args):
         made = real(*args)
