@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from verifai_jax.addons.agents.mcp import TOOLS, Server, _messages
+from verifai_jax.addons.agents.mcp import TOOLS, Server, messages
 
 SPEC = """
 import numpy as np
@@ -164,8 +164,8 @@ def test_a_long_line_is_not_read_whole(folder):
     with os.fdopen(os.memfd_create("lines"), "r+b") as lines:
         lines.write(huge + b"\xff\xfe\n" + request(2, "ping").encode())
         lines.seek(0)
-        said = answers(folder, *_messages(lines))
-        assert max(map(len, (lines.seek(0), *_messages(lines))[1:])) <= 1_000_000
+        said = answers(folder, *messages(lines))
+        assert max(map(len, (lines.seek(0), *messages(lines))[1:])) <= 1_000_000
     assert [each["id"] for each in said] == [None, None, 2]
     assert {each["error"]["code"] for each in said[:2]} == {-32700}
 

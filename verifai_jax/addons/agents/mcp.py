@@ -194,7 +194,7 @@ class Server:
         token = about.get("progressToken") if isinstance(about, dict) else None
 
         def report(seconds: float) -> None:
-            done = {"progressToken": token, "progress": seconds, "message": f"{seconds:.0f} s"}
+            done = {"progressToken": token, "progress": seconds, "message": f"{seconds:z.0f} s"}
             say(json.dumps({"jsonrpc": "2.0", "method": "notifications/progress", "params": done}))
 
         call = Call(threading.Event(), *([report] if _is_id(token) else []))
@@ -418,10 +418,10 @@ def mcp(folder: Path, budget: int, total: int, seconds: float) -> None:
             out.write(f"{line}\n")
             out.flush()
 
-        Server(folder.resolve(), budget, total, seconds).serve(_messages(sys.stdin.buffer), send)
+        Server(folder.resolve(), budget, total, seconds).serve(messages(sys.stdin.buffer), send)
 
 
-def _messages(stream: BinaryIO) -> Iterator[bytes]:
+def messages(stream: BinaryIO) -> Iterator[bytes]:
     """Yield lines; of one that is too long only its beginning, which is not JSON."""
     while line := stream.readline(MAX_MESSAGE):
         yield line

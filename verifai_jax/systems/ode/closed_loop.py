@@ -160,7 +160,7 @@ class Ode(System):
 
 
 @contextlib.contextmanager
-def _told_without_control(
+def _explaining_no_control(
     role: str, function: Callable[..., Any] | None, control: object
 ) -> Iterator[None]:
     try:
@@ -377,7 +377,7 @@ class _Rollout:
                     "controller must return the control; it returned None, as without a return "
                     f"statement{defined_at(loop.controller)}"
                 )
-        with _told_without_control("dynamics", loop.dynamics, control):
+        with _explaining_no_control("dynamics", loop.dynamics, control):
             derivative = jax.eval_shape(
                 lambda control: loop.dynamics(time, state, control, self.features), control
             )
@@ -413,7 +413,7 @@ class _Rollout:
                 finite.extend(n for n, v in signals.items() if any(v is part for part in parts))
             return signals
 
-        with _told_without_control("signals", loop.signals, control):
+        with _explaining_no_control("signals", loop.signals, control):
             sampled = jax.eval_shape(sample_signals, control)
         check_signals(sampled)
         if loop.terminate is not None:
