@@ -62,8 +62,9 @@ def read(
     cell, `-` or `n/a` is a gap (NaN), and words such as `true` or `ON` are truth values. In a CSV
     file commas, semicolons or tabs separate the columns, as the first line shows; numbers may have
     a decimal comma if all of them do. Comment lines (`#`) before the names are skipped, and a row
-    of units may follow the names. A last line that was cut, messages that cannot be decoded and
-    topics of an unknown kind are left out, with a note.
+    of units may follow the names. Left out, with a note, are a last line that was cut, rows with
+    another number of cells, less than a tenth of the rows if their times are missing or go back,
+    messages that cannot be decoded, topics of an unknown kind, and columns of another length.
 
     Data with several clocks, such as the topics of an MCAP file, the groups of an HDF5 file or
     several files, become one trace with the instants of all clocks; a signal has a gap where only
