@@ -503,6 +503,21 @@ def test_list_where_problems_are_elsewhere(call, tmp_path, monkeypatch):
     assert "ramp.py:calm" in call("list", ".", code=2)
 
 
+def test_list_runs_no_file_outside_of_its_folder_and_no_name_steers_the_terminal(call, tmp_path):
+    (tmp_path / "outside.py").write_text("raise SystemExit('it ran')")
+    (tmp_path / "specs" / "link.py").symlink_to(tmp_path / "outside.py")
+    turned = PROBLEM.replace('"calm"', '"ca\u202elm\x1b[2J"').replace("a ramp", "a \u2066ramp")
+    (tmp_path / "specs" / "ramp.py").write_text(turned)
+    (tmp_path / "specs" / "wi\u202ede.py").write_text(PROBLEM)
+    output = call("list")
+    assert "specs/link.py leads out of specs/, and is not run" in output
+    assert r"specs/ramp.py:ca\u202elm_[2J" in output
+    assert r"a \u2066ramp" in output
+    assert r"specs/wi\u202ede.py:ramp" in output
+    assert not {"\u202e", "\u2066", "\x1b"} & {*output}
+    assert "it ran" in call("list", "specs/link.py", code=2)
+
+
 def test_a_missing_extra_is_one_line(call, tmp_path):
     (tmp_path / "specs" / "robot.py").write_text(
         "from verifai_jax.core.messages.errors import require\n"

@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from checked_types import unchecked
 
 import verifai_jax as vj
 from verifai_jax.core.compute.purity import watch
@@ -153,5 +154,19 @@ def test_a_control_that_is_none_is_said():
         problem(lambda t, s, f: None).check()
     with pytest.raises(ProblemError, match="a control, which is None without controller="):
         problem(None, lambda t, s, u, f: {"x": -u}).check()
+    unsteered = vj.ode(
+        lambda t, s, u, f: -s, lambda f, key: f["a"], dt=0.1, steps=3,
+        signals=lambda t, s, u, f: {"x": u[0]},
+    )  # fmt: skip
+    with pytest.raises(ProblemError, match="signals computes with a control, which is None with"):
+        vj.Problem("p", {"a": vj.Box(0, 1)}, unsteered, "always x < 1").check()
+    counting = vj.ode(
+        lambda t, s, u, f: sum(s for _ in range(s)), lambda f, key: f["a"], dt=0.1, steps=3
+    )
+    with pytest.raises(ProblemError, match=r"counts by a value, as range.* fori_loop"):
+        vj.Problem("p", {"a": vj.Box(0, 1)}, counting, "always state < 1").check()
+    order = r"the order is Problem\(name, space, system, spec\)"
+    with unchecked(), pytest.raises(ProblemError, match=order):
+        vj.Problem("p", unsteered, {"a": vj.Box(0, 1)}, "always x < 1")
     with pytest.raises(ValueError, match="a function from a policy to its problem, and a list of"):
         vj.certify([1.0], lambda policy: problem())

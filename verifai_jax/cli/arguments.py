@@ -13,6 +13,7 @@ from click.core import ParameterSource
 
 import verifai_jax as vj
 from verifai_jax.cli.exit_codes import BROKEN, CommandError
+from verifai_jax.cli.json_output import say
 
 if TYPE_CHECKING:
     from verifai_jax.core.compute.executors import Executor
@@ -190,14 +191,12 @@ def load_run(folder: Path, target: str | None) -> "vj.Run":
 
 def read_run(folder: Path, problem: "vj.Problem | None" = None) -> "vj.Run":
     """Read the run in a folder; without one, the error describes the folder."""
-    from verifai_jax.core.messages.text import printable
-
     read_record(folder)
     run = vj.load(folder, problem)
     if run.table.damage:
         # Once, in place of a warning from each part that reads the table.
         warnings.filterwarnings("ignore", "the error table is damaged", UserWarning)
-        click.echo(f"note: {printable(run.table.damage)}", err=True)
+        say(f"note: {run.table.damage}", err=True)
     return run
 
 

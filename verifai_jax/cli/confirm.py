@@ -2,13 +2,11 @@
 
 from pathlib import Path
 
-import click
-
 import verifai_jax as vj
 from verifai_jax.cli.arguments import EVEN_IF_CHANGED, PROBLEM, ROW, RUN, load_judged_run, option
 from verifai_jax.cli.exit_codes import check_again
 from verifai_jax.cli.gates import Gate, check_gate, fail_on
-from verifai_jax.cli.json_output import as_plain, command, give_result
+from verifai_jax.cli.json_output import as_plain, command, give_result, say
 
 
 @command()
@@ -26,11 +24,9 @@ def confirm(
     even_if_changed: bool, fail_on: Gate | None,
 ) -> None:  # fmt: skip
     """Replay the counterexamples of the run in RUN, or its ROW, at a finer step."""
-    from verifai_jax.core.messages.text import printable
-
     run = load_judged_run(folder, target)
     result = vj.confirm(run, row, engines=engines or None)
-    click.echo(printable(str(result)))
+    say(result)
     if isinstance(result, vj.Confirmation):
         confirmed, examined = int(result.confirmed), 1
     else:

@@ -11,10 +11,8 @@ import sys
 from collections.abc import Mapping
 from typing import NamedTuple
 
-import click
-
 from verifai_jax._version import __version__
-from verifai_jax.cli.json_output import command, give_result
+from verifai_jax.cli.json_output import command, give_result, say
 from verifai_jax.core.compute.cores import available_cores
 
 PACKAGES = ("jax", "jaxlib", "numpy", "optax", "lark", "pandas", "pyarrow", "matplotlib", "rich")
@@ -79,7 +77,7 @@ for a defect. Of each, what goes wrong, its effect on verdicts, and the remedy."
 def doctor() -> None:
     """Report versions and known bad pairs of them, devices, cores, cache and rendering."""
     text = report()
-    click.echo(text)
+    say(text)
     give_result(packages=_installed(), python=platform.python_version(), cores=available_cores())
     give_result(tested=[each._asdict() for each in TESTED], report=text.splitlines())
 

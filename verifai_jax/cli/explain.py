@@ -2,12 +2,10 @@
 
 from pathlib import Path
 
-import click
-
 import verifai_jax as vj
 from verifai_jax.cli import arguments
 from verifai_jax.cli.exit_codes import check_again
-from verifai_jax.cli.json_output import command, draw, give_result
+from verifai_jax.cli.json_output import command, draw, give_result, say
 
 
 @command()
@@ -29,7 +27,7 @@ def explain(
     run = arguments.load_judged_run(folder, target)
     why = vj.explain(run, row)
     for line in printable(str(why)).splitlines():
-        click.echo(textwrap.fill(line, 88, break_on_hyphens=False))
+        say(textwrap.fill(line, 88, break_on_hyphens=False))
     give_result(row=why.row, formula=why.formula, robustness=why.rho, text=str(why))
     give_result(effects={one.name: why.effect(one) for one in why.influences})
     again = why.replay

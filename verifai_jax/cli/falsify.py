@@ -14,7 +14,7 @@ from verifai_jax.cli import arguments
 from verifai_jax.cli.arguments import PATH, option
 from verifai_jax.cli.exit_codes import BROKEN, INTERRUPTED, CommandError
 from verifai_jax.cli.gates import RATE, Gate, check_gate, exceeds, fail_on
-from verifai_jax.cli.json_output import command, describe_run, give_result
+from verifai_jax.cli.json_output import command, describe_run, give_result, say
 from verifai_jax.cli.next_folder import given_or_next
 
 _RESUMES = (
@@ -152,24 +152,24 @@ def print_run(
     - `options`: the options that the record does not hold and that must be given again on resuming.
     **Raises:** `CommandError` if no simulation has a verdict.
     """
-    click.echo(run.summary())
+    say(run.summary())
     give_result(**describe_run(run))
     assert run.folder is not None
     if run.stopped == "interrupted":
         again = arguments.resuming("falsify", run.folder, run.target, options)
-        click.echo(f"  resume       {again}")
-    click.echo(f"  table        {run.table_path}")
+        say(f"  resume       {again}")
+    say(f"  table        {run.table_path}")
     if pictures and run.simulations:
         from verifai_jax.pictures import write_run_pictures
 
         for path in write_run_pictures(run, run.folder):
-            click.echo(f"  picture      {path}")
+            say(f"  picture      {path}")
     failed = run.table.failed
     if len(failed) < run.simulations:
         words = ["verifai-jax", "replay", str(run.folder), str(run.best.name)]
         apart = arguments.target_apart(run.folder, run.target)
         words += [] if apart is None else ["--problem", apart]
-        click.echo(f"  replay       {shlex.join(words)}")
+        say(f"  replay       {shlex.join(words)}")
         return
     if not run.simulations and run.stopped == "interrupted":
         raise CommandError("interrupted before the first batch was finished", INTERRUPTED)

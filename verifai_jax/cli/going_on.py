@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from verifai_jax.cli.json_output import as_plain
+from verifai_jax.cli.json_output import as_plain, say
 
 if TYPE_CHECKING:
     from verifai_jax.evaluation.unfinished import Unfinished
@@ -45,7 +45,7 @@ class Kept:
             return
         self._work.done = why not in EARLY
         if not self._work.done:
-            click.echo(f"  resume       {command_line()}")
+            say(f"  resume       {command_line()}")
 
 
 @contextlib.contextmanager
@@ -73,7 +73,7 @@ def kept_until_done() -> Iterator[Kept]:
                 yield Kept(kept)
             except KeyboardInterrupt:
                 if kept is not None and not kept.empty:
-                    click.echo(f"  resume       {command_line()}", err=True)
+                    say(f"  resume       {command_line()}", err=True)
                 raise
     finally:
         for parent in (FOLDER, FOLDER.parent):

@@ -10,6 +10,7 @@ processes write to descriptor 1, goes to the standard error stream. Numbers that
 null.
 """
 
+import atexit
 import contextlib
 import ctypes
 import functools
@@ -20,7 +21,7 @@ import sys
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, fields, is_dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TextIO
 
 import click
 
@@ -41,35 +42,58 @@ class ReportingCommand(click.Command):
         """Run the command, and print its result as JSON if requested."""
         if not ctx.params.pop("as_json"):
             return super().invoke(ctx)
-        try:
-            with contextlib.redirect_stdout(sys.stderr), _descriptor_to_errors():
+        with output_to_errors() as out:
+            try:
                 return super().invoke(ctx)
-        finally:
-            # A gate that failed, or no verdict at all, has a result too.
-            if _RESULT in ctx.meta:
-                about = {"command": ctx.info_name, "version": __version__}
-                click.echo(json.dumps(about | ctx.meta[_RESULT], indent=2, allow_nan=False))
+            finally:
+                # A gate that failed, or no verdict at all, has a result too.
+                if _RESULT in ctx.meta:
+                    about = {"command": ctx.info_name, "version": __version__}
+                    text = json.dumps(about | ctx.meta[_RESULT], indent=2, allow_nan=False)
+                    click.echo(text, file=out)
 
 
 @contextlib.contextmanager
-def _descriptor_to_errors() -> Iterator[None]:
-    """Let what is written to descriptor 1, past Python, go to the error stream."""
+def output_to_errors() -> Iterator[TextIO]:
+    """Yield the standard output, and let what others write to it go to the error stream.
+
+    Others are Python, and what writes to descriptor 1 past it: C, and processes that it starts.
+    """
     try:
         sys.stdout.flush()
         kept = os.dup(1)
     except OSError:  # It is closed.
-        yield
+        yield sys.stdout
         return
+    try:
+        own = sys.stdout.fileno() == 1
+    except (OSError, ValueError):
+        own = False
+    coding = {"encoding": sys.stdout.encoding, "errors": sys.stdout.errors}
+    out = os.fdopen(os.dup(1), "w", **coding) if own else sys.stdout
     try:
         with contextlib.suppress(OSError):
             os.dup2(2, 1)
-        yield
+        with contextlib.redirect_stdout(sys.stderr):
+            yield out
     finally:
         # What C has buffered would come out at its end, after the result.
         with contextlib.suppress(AttributeError, OSError, TypeError):
             ctypes.CDLL(None).fflush(None)
         os.dup2(kept, 1)
         os.close(kept)
+        if own:
+            # A library may print something more while the process ends.
+            atexit.register(os.dup2, 2, 1)
+            with contextlib.suppress(OSError):
+                out.close()
+
+
+def say(text: object, *, err: bool = False) -> None:
+    """Print a text for people; characters that control a terminal are escaped."""
+    from verifai_jax.core.messages.text import printable
+
+    click.echo(printable(str(text)), err=err)
 
 
 command = functools.partial(click.command, cls=ReportingCommand)
@@ -90,9 +114,7 @@ def show_result(found: Any, plot: Path | None, *names: str) -> None:
     - `plot`: the file of its picture, whose folder is made; None for no picture.
     - `names`: attributes to include; by default all fields in its `repr`.
     """
-    from verifai_jax.core.messages.text import printable
-
-    click.echo(printable(str(found)))
+    say(found)
     give_result(**({name: getattr(found, name) for name in names} or as_plain(found)))
     if plot is not None:
         draw(found, plot)

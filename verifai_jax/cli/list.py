@@ -8,7 +8,7 @@ import click
 
 import verifai_jax as vj
 from verifai_jax.cli.exit_codes import WRONG_USAGE
-from verifai_jax.cli.json_output import command, give_result
+from verifai_jax.cli.json_output import command, give_result, say
 
 TARGETS = "verifai_jax.targets"
 """Entry points of classes whose objects are targets of commands, as problems are."""
@@ -35,28 +35,31 @@ def list_targets(location: str | None) -> None:
     broken = shown = 0
     listed: list[dict[str, object]] = []
     for file in files:
+        if path.is_dir() and not file.resolve().is_relative_to(path.resolve()):
+            say(f"{file} leads out of {path}/, and is not run: list it by its name", err=True)
+            continue
         try:
             targets = definitions(str(file), vj.Problem, *studies)
         except MissingExtra as error:
-            click.echo(f"{file}: {error}")
+            say(f"{file}: {error}")
             continue
         except TargetError as error:
             if not path.is_dir():
                 raise
             if not isinstance(error, NothingDefined):  # A folder may hold other modules too.
-                click.echo(str(error), err=True)
+                say(error, err=True)
                 broken += 1
             continue
         for name, target in targets.items():
-            click.echo(f"{file}:{name}  {target.description}")
+            say(f"{file}:{name}  {target.description}")
             _print_target(target)
             listed.append(_describe_target(f"{file}:{name}", target))
             shown += 1
     if path.is_dir() and not (shown or broken or inner):
         raise TargetError(f"{path}/ has no Python file with problems")
     for folder in inner:
-        click.echo(f"more in {folder}/: verifai-jax list {shlex.quote(str(folder))}")
-    click.echo(f"searches: {', '.join(names())}")
+        say(f"more in {folder}/: verifai-jax list {shlex.quote(str(folder))}")
+    say(f"searches: {', '.join(names())}")
     give_result(targets=listed, searches=names(), broken=broken)
     if broken:
         raise click.exceptions.Exit(WRONG_USAGE)
@@ -78,7 +81,7 @@ def _print_target(target: "vj.Problem | Any") -> None:
     formulas = getattr(target, "formulas", None)
     study = [f"a study of training runs, for sweep, {over}"]
     for line in study if formulas is None else [*formulas.values(), over]:
-        click.echo(f"    {line}")
+        say(f"    {line}")
 
 
 def _no_specs() -> str:

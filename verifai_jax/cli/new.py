@@ -8,7 +8,7 @@ from pathlib import Path
 import click
 
 from verifai_jax.cli.arguments import PATH
-from verifai_jax.cli.json_output import command, give_result
+from verifai_jax.cli.json_output import command, give_result, say
 from verifai_jax.core.store.atomic_files import replacing
 
 FILES = ("README.md", "pendulum.py", "spec.py", "test_spec.py", ".gitignore")
@@ -34,8 +34,8 @@ def new(folder: Path) -> None:
         with replacing(folder / name) as partial:
             partial.write_text(text, encoding="utf-8")
     give_result(folder=folder, files=list(FILES))
-    click.echo(f"  written      {folder}")
-    click.echo(f"  next         cd {folder} && verifai-jax falsify spec.py:upright")
+    say(f"  written      {folder}")
+    say(f"  next         cd {folder} && verifai-jax falsify spec.py:upright")
 
 
 def _package() -> str:

@@ -8,7 +8,7 @@ from verifai_jax.cli import arguments
 from verifai_jax.cli.arguments import option
 from verifai_jax.cli.exit_codes import check_again
 from verifai_jax.cli.gates import Gate, check_gate, fail_on
-from verifai_jax.cli.json_output import command, give_result
+from verifai_jax.cli.json_output import command, give_result, say
 
 
 @command()
@@ -39,20 +39,20 @@ def replay(
     again = run.replay(number, precision)
     stored = run.table.row(number)
     for text in again.warnings:
-        click.echo(printable(text))
-    click.echo(printable(f"{run.name}, row {number}, {precision}"))
+        say(text)
+    say(f"{run.name}, row {number}, {precision}")
     for name in run.table.features:
         value = stored[name]
         number_like = isinstance(value, (int, float)) or hasattr(value, "dtype")
         text = f"{value:z.6g}" if number_like else one_line(str(value))
-        click.echo(f"  {printable(name):<12} {text}")
+        say(f"  {printable(name):<12} {text}")
     for name, rho in again.rho.items():
-        click.echo(f"  {printable(run.formulas[name])}")
+        say(f"  {run.formulas[name]}")
         # With several formulas `rho` is the least, and each has a column of its own.
         before = stored.get(f"rho.{name}", stored["rho"])
-        click.echo(f"    robustness {rho:z.6g} in {precision}, {before:z.6g} in the table")
+        say(f"    robustness {rho:z.6g} in {precision}, {before:z.6g} in the table")
     status = again.status.name.lower()
-    click.echo(f"  status {status}; {'violated' if again.violated else 'satisfied'}")
+    say(f"  status {status}; {'violated' if again.violated else 'satisfied'}")
     features = {name: stored[name] for name in run.table.features}
     give_result(row=number, precision=precision, features=features, robustness=again.rho)
     give_result(stored_robustness=stored["rho"], status=status, violated=again.violated)
@@ -60,6 +60,6 @@ def replay(
     give_result(changed=changed, finding=again.finding)
     if pictures:
         for path in write_replay_pictures(again, into or folder):
-            click.echo(f"  picture      {path}")
+            say(f"  picture      {path}")
     check_gate(fail_on, {"counterexample": again.violated or again.status.name != "OK"})
     check_again(again.finding, even_if_changed)

@@ -26,7 +26,7 @@ from verifai_jax.core.display.lazy import lazy_import
 from verifai_jax.core.display.notebook import InNotebook, text_html
 from verifai_jax.core.messages.checks import check_name
 from verifai_jax.core.messages.errors import missing_name
-from verifai_jax.core.messages.text import is_control, printable
+from verifai_jax.core.messages.text import is_control, printable, shorten
 from verifai_jax.core.user_code.source_collection import made_here, sources_of
 from verifai_jax.core.user_code.sources import Maker, Sources
 from verifai_jax.core.user_code.user_errors import (
@@ -47,6 +47,8 @@ from verifai_jax.problem.guide import Guide, Term
 from verifai_jax.problem.rulebook import Rulebook
 from verifai_jax.problem.tracing import fingerprint_of, traced_by_default, why_not_batched
 from verifai_jax.systems.base import System, as_system
+
+ORDER = "; the order is Problem(name, space, system, spec)"
 
 
 class ProblemError(ValueError):
@@ -126,7 +128,7 @@ class Problem(InNotebook):
         made_in: Sequence[Maker] | None = None,
     ) -> None:
         if not isinstance(name, str) or not name.strip():
-            raise ProblemError(f"a problem needs a name; got {name!r}")
+            raise ProblemError(f"a problem needs a name; got {shorten(repr(name))}{ORDER}")
         check_name("the name of a problem", name, lines=True, error=ProblemError)
         # It is for people, and no part of the model refers to it.
         name = "".join("_" if is_control(character) else character for character in name)
@@ -134,11 +136,12 @@ class Problem(InNotebook):
             space = FeatureSpace(space)
         if not isinstance(space, FeatureSpace):
             raise ProblemError(
-                f"space must be a FeatureSpace or a dictionary of domains; got {space!r}"
+                "space must be a FeatureSpace or a dictionary of domains; got "
+                f"{shorten(repr(space))}{ORDER}"
             )
         if not callable(system):
             raise ProblemError(
-                f"system must be a function (features, key) -> Trace; got {system!r}"
+                f"system must be a function (features, key) -> Trace; got {system!r}{ORDER}"
             )
         named = spec if isinstance(spec, Mapping) else {"spec": spec}
         if not named:

@@ -1,13 +1,18 @@
 """An agent over pipes: a whole study, and what the server refuses."""
 
+import contextlib
 import json
+import os
+import random
 import subprocess
 import sys
+import threading
+import time
 from pathlib import Path
 
 import pytest
 
-from verifai_jax.addons.agents.mcp import TOOLS, Server
+from verifai_jax.addons.agents.mcp import TOOLS, Server, messages
 
 SPEC = """
 import numpy as np
@@ -39,8 +44,19 @@ def request(number, method, **params):
     return json.dumps({"jsonrpc": "2.0", "id": number, "method": method, "params": params}) + "\n"
 
 
+def plain(name):
+    raise AssertionError(f"{name} is not JSON")
+
+
+def serve(serving, lines):
+    """Return the answers: the calls of tools last, since other messages do not wait for them."""
+    said = []
+    serving.serve(lines, lambda line: said.append(json.loads(line, parse_constant=plain)))
+    return sorted(said, key=lambda answer: "content" in answer.get("result", {}))
+
+
 def answers(folder, *lines):
-    return [json.loads(line) for line in server(folder).answers(lines)]
+    return serve(server(folder), lines)
 
 
 def test_messages(folder):
@@ -85,14 +101,139 @@ HOSTILE = [
 
 @pytest.mark.parametrize("line", HOSTILE, ids=lambda line: line[:60])
 def test_no_message_ends_the_server(folder, line):
-    def plain(name):
-        raise AssertionError(f"{name} is not JSON")
-
     (folder / "loop").symlink_to(folder / "loop")
-    lines = server(folder).answers([line, request(2, "ping")])
-    first, second = (json.loads(each, parse_constant=plain) for each in lines)
+    both = answers(folder, line, request(2, "ping"))
+    assert {"jsonrpc": "2.0", "id": 2, "result": {}} in both
+    (first,) = (each for each in both if each["id"] != 2)
     assert first.get("error") or first["result"]["isError"]
-    assert second == {"jsonrpc": "2.0", "id": 2, "result": {}}
+
+
+class FakeRuns(Server):
+    """A server whose commands do nothing, at once."""
+
+    def _run(self, words, call):
+        subprocess.list2cmdline(words).encode()
+        return 0, b"{}", b""
+
+
+def random_value(rng, depth=3):
+    names = ("id", "method", "params", "name", "arguments", "_meta", "progressToken", "requestId")
+    methods = ("tools/call", "ping", "notifications/cancelled")
+    given = ("problem", "specs/brake.py:brake", "formula", "x > 0", "location", "..")
+    words = (*names, *TOOLS, *methods, *given, "\0", "\ud800", "\u202e", "")
+    kinds = ("word", "number", "constant", *(("list", "object") if depth else ()))
+    match rng.choice(kinds):
+        case "word":
+            return rng.choice(words)
+        case "number":
+            return rng.choice((0, -1, 1, 2, 1.5, 1e308, 10**400, -0.0))
+        case "constant":
+            return rng.choice((None, True, False, float("nan"), float("inf")))
+        case "list":
+            return [random_value(rng, depth - 1) for _ in range(rng.randrange(4))]
+    return {rng.choice(words): random_value(rng, depth - 1) for _ in range(rng.randrange(6))}
+
+
+def random_message(rng):
+    params = random_value(rng)
+    if rng.random() < 0.5:
+        params = {"name": rng.choice([*TOOLS, []]), "arguments": random_value(rng)}
+    message = {"jsonrpc": "2.0", "id": rng.choice((1, 2, "a", random_value(rng))), "params": params,
+               "method": rng.choice(("tools/call", "ping", "tools/list", "initialize", "nothing",
+                                     "notifications/cancelled", random_value(rng)))}  # fmt: skip
+    for name in rng.sample(sorted(message), rng.randrange(3)):
+        message[name] = random_value(rng)
+    line = bytearray(json.dumps(message).encode())
+    for _ in range(rng.choice((0, 0, 1, 8))):
+        line[rng.randrange(len(line))] = rng.randrange(256)
+    return bytes(line).replace(b"\n", b" ").replace(b"\r", b" ") + b"\n"
+
+
+@pytest.mark.parametrize("count", [50, pytest.param(500, marks=pytest.mark.slow)])
+def test_random_messages(folder, count):
+    rng = random.Random(7)
+    serving = FakeRuns(folder.resolve(), budget=500, total=600, seconds=100.0)
+    said = serve(serving, [*(random_message(rng) for _ in range(count)), request("last", "ping")])
+    assert {"jsonrpc": "2.0", "id": "last", "result": {}} in said
+    assert not [each for each in said if each.get("error", {}).get("code") == -32603]
+    assert not serving.calls
+
+
+def test_a_long_line_is_not_read_whole(folder):
+    huge = 40 * b"x" * 1_000_000 + b"\n"
+    with os.fdopen(os.memfd_create("lines"), "r+b") as lines:
+        lines.write(huge + b"\xff\xfe\n" + request(2, "ping").encode())
+        lines.seek(0)
+        said = answers(folder, *messages(lines))
+        assert max(map(len, (lines.seek(0), *messages(lines))[1:])) <= 1_000_000
+    assert [each["id"] for each in said] == [None, None, 2]
+    assert {each["error"]["code"] for each in said[:2]} == {-32700}
+
+
+WAITS = """
+import os, subprocess, sys, time
+child = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(600)"])
+open("started.part", "w").write(str(child.pid))
+os.rename("started.part", "started")
+time.sleep(600)
+"""
+
+
+def is_alive(process):
+    with contextlib.suppress(OSError):
+        return Path(f"/proc/{process}/stat").read_text().split()[2] != "Z"
+    return False
+
+
+@pytest.mark.slow
+def test_a_call_is_cancelled_with_what_it_started_and_pings_are_answered_meanwhile(folder):
+    (folder / "specs" / "brake.py").write_text(WAITS)
+    heard = []
+
+    def lines():
+        yield json.dumps({"id": 1, "method": "tools/call", "params": {
+            "name": "list", "arguments": {}, "_meta": {"progressToken": "p"}}})  # fmt: skip
+        while not (folder / "started").exists() or len(heard) < 2:
+            time.sleep(0.05)
+        yield request(1, "tools/call", name="list", arguments={})
+        yield request(2, "ping")
+        assert heard[-1]["id"] == 2
+        yield json.dumps({"method": "notifications/cancelled", "params": {"requestId": 1}})
+
+    server(folder).serve(lines(), lambda line: heard.append(json.loads(line)))
+    *reports, twice, ping = heard
+    assert {each["method"] for each in reports} == {"notifications/progress"}
+    seconds = [each["params"]["progress"] for each in reports]
+    assert seconds == sorted(set(seconds))
+    assert "a call with the id 1 is running" in twice["error"]["message"]
+    assert ping == {"jsonrpc": "2.0", "id": 2, "result": {}}
+    child = (folder / "started").read_text()
+    deadline = time.monotonic() + 10
+    while is_alive(child) and time.monotonic() < deadline:
+        time.sleep(0.05)
+    assert not is_alive(child)
+
+
+def test_a_call_that_waits_is_cancelled_and_costs_nothing(folder):
+    begun, go = threading.Event(), threading.Event()
+
+    class Slow(FakeRuns):
+        def _run(self, words, call):
+            begun.set()
+            assert go.wait(10)
+            return super()._run(words, call)
+
+    def lines():
+        given = {"problem": "specs/brake.py:brake", "budget": 100}
+        yield request(1, "tools/call", name="falsify", arguments=given)
+        yield request(2, "tools/call", name="falsify", arguments=given)
+        assert begun.wait(10)
+        yield json.dumps({"method": "notifications/cancelled", "params": {"requestId": 2}})
+        go.set()
+
+    serving = Slow(folder.resolve(), budget=500, total=600, seconds=100.0)
+    assert [each["id"] for each in serve(serving, lines())] == [1]
+    assert serving.spent == 100
 
 
 @pytest.mark.slow
@@ -102,7 +243,11 @@ def test_only_files_of_the_folder_are_run_and_only_the_result_is_on_descriptor_1
     (folder / "tests").mkdir()
     for place in ("specs/link.py", "tests/test_link.py"):
         (folder / place).symlink_to(outside)
-    noise = "import ctypes, os\nctypes.CDLL(None).printf(b'from C')\nos.write(1, b'raw')\n"
+    noise = (
+        "import atexit, ctypes, os, subprocess\nctypes.CDLL(None).printf(b'from C')\n"
+        "os.write(1, b'raw')\nsubprocess.run(['echo', 'from a process'])\n"
+        "atexit.register(os.write, 1, b'at the end')\n"
+    )
     (folder / "specs" / "brake.py").write_text(noise + SPEC)
     serving = server(folder)
     listed = serving.call("list", {})
@@ -137,7 +282,7 @@ def test_each_tool_has_a_schema(folder):
         ("falsify", {"problem": "specs/notes.txt:x"}, "must be FILE.py:NAME"),
         ("falsify", {"problem": "specs/link.py:x"}, "does not exist in the folder of this server"),
         ("falsify", {"problem": "--help"}, "does not exist in the folder of this server"),
-        ("falsify", {"problem": "specs/a\0.py:x"}, "does not exist in the folder of this server"),
+        ("falsify", {"problem": "specs/a\0.py:x"}, "a character that no argument can have"),
         ("falsify", {"problem": "specs/brake.py:brake", "budget": 501}, "500 are left"),
         (
             "falsify",

@@ -150,6 +150,7 @@ def test_data_sets_of_hdf5_have_the_times_of_their_group(tmp_path, double):
     class Set(SimpleNamespace):
         ndim = property(lambda self: self.values.ndim)
         dtype = property(lambda self: self.values.dtype)
+        shape = property(lambda self: self.values.shape)
 
         def __getitem__(self, key):
             return self.values

@@ -173,5 +173,6 @@ def test_columns_and_encodings_of_recordings(tmp_path):
     (tmp_path / "odd.csv").write_text("time,p[²],p[0]\n0,1,2\n1,3,4\n")
     assert read(tmp_path / "odd.csv")["p[²]"].tolist() == [1, 3]
     (tmp_path / "latin.csv").write_bytes("time,größe\n0,1\n1,2\n".encode("latin-1"))
-    with pytest.raises(ValueError, match=r"latin\.csv cannot be read: .*UTF-8"):
-        read(tmp_path / "latin.csv")
+    latin = read(tmp_path / "latin.csv")
+    assert latin["größe"].tolist() == [1, 2]
+    assert any("latin.csv is not UTF-8, and is read as Windows-1252" in n for n in latin.notes)

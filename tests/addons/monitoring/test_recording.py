@@ -282,5 +282,5 @@ def test_arrays_of_numpy(tmp_path):
     assert trace["p"].shape == (3, 2)
     assert robustness("(G (norm(p) > 1)) & (F (x > 1))", trace) > 0
     np.savez(file, time=np.arange(2.0), x=np.ones((2, 2, 2)))
-    with pytest.raises(ValueError, match=r"array 'x' of .* must have shape .* got \[2, 2, 2\]"):
+    with pytest.raises(ValueError, match=r"npz .*column 'x' must have .* got \[2, 2, 2\]"):
         read(file)

@@ -182,6 +182,34 @@ def test_a_name_that_c_does_not_know_is_refused(name):
         mtl.export_c("x > 0", 0.1, name)
 
 
+TAKEN = (
+    "int class exp expf NAN INFINITY EOF m x out low scratch a0 v12 i int32_t uint8_t isnan j0 y1 "
+    "vj_best true bool signbit fabs pow log2 M typeof noexcept"
+)
+FREE = ("monitor", "gap", "mm", "exp_monitor", "a", "v", "signals", "j2", "scan", "logs")
+
+
+@pytest.mark.parametrize("name", TAKEN.split())
+def test_a_name_that_c_or_the_code_uses_is_refused(name):
+    with pytest.raises(ValueError, match=f"must be free in C.* {name.lower()}_monitor"):
+        mtl.export_c("x > 0", 0.1, name)
+
+
+@pytest.mark.thorough
+@pytest.mark.skipif(shutil.which("gcc") is None, reason="needs gcc")
+def test_headers_of_free_names_and_of_odd_signals_compile_without_a_warning(tmp_path):
+    formula = "always[0, 0.3] (exp(x) > 0 & max(y, 1) < 3)"
+    odd = ("a*/b", "a/*b", "a??/b", "a\\", "a\u202eb", "a**//b")
+    texts = [mtl.export_c(formula, 0.1, name) for name in FREE]
+    texts += [mtl.export_c({name: formula}, 0.1) for name in odd]
+    for text in texts:
+        (tmp_path / "all.c").write_text(f"{text}\nint main(void) {{ return 0; }}\n")
+        for language in ("c", "c++"):
+            command = ["gcc", "-x", language, "-Wall", "-Wextra", "-Werror", "-trigraphs"]
+            command += ["-Wno-unused-function", "-fsyntax-only", tmp_path / "all.c"]
+            subprocess.run(command, check=True)
+
+
 MAIN = r"""
 #include <stdio.h>
 int main(void) {

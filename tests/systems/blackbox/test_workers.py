@@ -68,6 +68,18 @@ def test_each_trouble_is_a_row_and_stops_no_other():
     np.testing.assert_array_equal(found[8].trace["x"], host_systems.decay({"a": 9.5})["x"])
 
 
+@pytest.mark.thorough
+def test_at_the_end_of_all_time_what_runs_is_ended_and_nothing_begins(troublesome):
+    outcomes(troublesome, [{"a": 0}] * 2)
+    features, began = [{"a": a} for a in (0, 4, 4, 4, 0)], time.monotonic()
+    found = dict(troublesome.pool.outcomes(features, [0] * 5, began + 2.0))
+    assert time.monotonic() - began < 10
+    assert found[0].status == Status.OK
+    assert {found[i].status for i in (1, 2, 3, 4)} == {Status.TIMEOUT}
+    ended = "the simulation was ended, as all time was over"
+    assert [found[i].message for i in (1, 2, 3, 4)] == [ended, ended, "", ""]
+
+
 def test_one_simulation_raises_what_went_wrong(troublesome):
     assert troublesome({"a": np.float32(0.5)}).length == 5
     with pytest.raises(RuntimeError, match="KeyError: 'no such road'"):
@@ -144,12 +156,12 @@ def test_what_has_ended_when_interrupted_is_handed_over(monkeypatch, tmp_path):
     real, calls = workers._Batch, []
 
     class Interrupted(queue.SimpleQueue):
-        def get(self, *args):
+        def get(self, *args, **options):
             if not calls:
                 calls.append(1)
                 until(lambda: self.qsize() == 2)
                 raise KeyboardInterrupt
-            return super().get(*args)
+            return super().get(*args, **options)
 
     def batch(*args):
         made = real(*args)

@@ -5,7 +5,7 @@ from pathlib import Path
 import click
 
 from verifai_jax.cli.arguments import FOLDER, ODD, PROBLEM, RUN, load_judged_run, option
-from verifai_jax.cli.json_output import command, give_result
+from verifai_jax.cli.json_output import command, give_result, say
 
 
 @command()
@@ -31,27 +31,25 @@ def analyze(
     count: int,
 ) -> None:
     """Report rules, importance, kinds of failures and coverage of the run in RUN."""
-    from verifai_jax.core.messages.text import printable
-
     run = load_judged_run(folder, target)
     analysis = run.analyze()
-    click.echo(str(analysis))
+    say(analysis)
     path = analysis.save((into or folder) / "analysis")
-    click.echo(f"  written      {path}")
+    say(f"  written      {path}")
     if boundary is not None:
         from verifai_jax import boundary as learn
 
         found = learn(run)
-        click.echo(printable(str(found)))
+        say(found)
         points = found.next_points(boundary)
-        click.echo(printable(points.to_string(index=False)))
+        say(points.to_string(index=False))
         give_result(boundary=found.calibration, brier=found.brier, next_points=points)
     if odd is not None:
         from verifai_jax import read_odd
 
         covered = read_odd(odd).coverage(run)
-        click.echo(printable(str(covered)))
+        say(covered)
         points = covered.next_points(count)
-        click.echo(printable(points.to_string(index=False)) if len(points) else "  all is covered")
+        say(points.to_string(index=False) if len(points) else "  all is covered")
         give_result(attributes=covered.table, uncovered=points)
     give_result(text=str(analysis), report=path)

@@ -8,7 +8,7 @@ import verifai_jax as vj
 from verifai_jax.cli import arguments
 from verifai_jax.cli.arguments import PATH, option
 from verifai_jax.cli.gates import Gate, check_gate, fail_on
-from verifai_jax.cli.json_output import command, give_result
+from verifai_jax.cli.json_output import command, give_result, say
 
 CORPUS = Path("counterexamples")
 """Usual folder of a corpus."""
@@ -29,7 +29,7 @@ def save_counterexamples(
     paths = run.save_counterexamples(into, max_count=max_count, shrink=shrink, budget=budget)
     give_result(problem=run.name, files=paths)
     for path in paths:
-        click.echo(str(path))
+        say(path)
 
 
 @command("replay-counterexamples")
@@ -41,10 +41,8 @@ def replay_counterexamples(
     target: str, folder: Path, rename: tuple[str, ...], fail_on: Gate | None
 ) -> None:
     """Simulate the saved counterexamples in FOLDER (or one file) again, on TARGET as it is now."""
-    from verifai_jax.core.messages.text import printable
-
     names = dict(arguments.split_pairs("--rename", rename))
     result = vj.replay_counterexamples(arguments.load_problem(target), folder, rename=names)
-    click.echo(printable(str(result)))
+    say(result)
     give_result(problem=result.problem, passed=result.passed, counterexamples=result.table)
     check_gate(fail_on, {"counterexample": not result.passed})

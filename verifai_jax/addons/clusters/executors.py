@@ -94,10 +94,12 @@ def gather(
     futures: Sequence[Future],
     ended: Callable[[int, Any], None],
     further: Callable[[], Sequence[Future]] = tuple,
+    check: Callable[[], None] = lambda: None,
 ) -> None:
     """Wait for all futures, and call `ended(index, result)` when each has ended.
 
-    `further()` returns more futures whenever some have ended; indices continue.
+    `further()` returns more futures whenever some have ended; indices continue. `check()` is called
+    once a second or more often, and may raise, so that a call that hangs ends the waiting.
 
     If one fails, or the user interrupts, queued calls are cancelled; results that exist by then are
     still reported.
@@ -110,6 +112,7 @@ def gather(
         while waiting:
             finished = [index for index, future in waiting.items() if future.done()]
             if not finished:
+                check()
                 _wait(list(waiting.values()))
                 continue
             failure = None

@@ -3,11 +3,9 @@
 from pathlib import Path
 from typing import Any
 
-import click
-
 from verifai_jax.cli import arguments
 from verifai_jax.cli.arguments import PATH, option
-from verifai_jax.cli.json_output import command, draw, give_result
+from verifai_jax.cli.json_output import command, draw, give_result, say
 
 
 @command()
@@ -27,17 +25,16 @@ from verifai_jax.cli.json_output import command, draw, give_result
 def fmea(target: str, folder: Path | None, plot: Path | None, **options: Any) -> None:
     """Tabulate the effect and the probability of each fault of TARGET (FILE.py:NAME)."""
     from verifai_jax import fmea as run
-    from verifai_jax.core.messages.text import printable
 
     problem = arguments.load_problem(target)
     into = folder or Path("runs") / f"fmea-{target.rpartition(':')[2]}"
     found = run(problem, folder=into, target=target, **options)
-    click.echo(printable(str(found)))
+    say(found)
     found.to_csv(into / "fmea.csv")
-    click.echo(f"  table        {into / 'fmea.csv'}")
+    say(f"  table        {into / 'fmea.csv'}")
     for effect in found:
         if effect.row is not None:
-            click.echo(f"  {effect.name}: {effect.command}")
+            say(f"  {effect.name}: {effect.command}")
     give_result(name=found.name, effects=found.effects, healthy=found.healthy)
     if plot is not None:
         draw(found, plot)

@@ -11,6 +11,7 @@ import re
 from collections.abc import Mapping, Sequence
 
 from verifai_jax.addons.monitoring.margins import Margins, Step, margins
+from verifai_jax.core.messages.text import printable
 from verifai_jax.mtl.formula import Formula
 from verifai_jax.mtl.semantics import Semantics, hard
 from verifai_jax.mtl.streams import Count, Op, Plan, streams
@@ -18,6 +19,25 @@ from verifai_jax.mtl.tree import missing_case
 from verifai_jax.mtl.words import number_text
 
 HEAD = "#include <math.h>\n#include <stdbool.h>\n#include <stdint.h>\n"
+TAKEN = re.compile(
+    # Words of C and C++, in which a header may be included, ...
+    "alignas|alignof|and|and_eq|asm|auto|bitand|bitor|bool|break|case|catch|char\\w*|class|compl|"
+    "concept|const\\w*|continue|co_\\w+|decltype|default|delete|do|double\\w*|dynamic_cast|else|enum|"
+    "explicit|export|extern|false|float\\w*|for|friend|goto|if|inline|int|linux|long|mutable|namespace|"
+    "new|noexcept|not|not_eq|nullptr|operator|or|or_eq|private|protected|public|register|"
+    "reinterpret_cast|requires|restrict|return|short|signed|sizeof|static\\w*|struct|switch|template|"
+    "this|thread_local|throw|true|try|type\\w+|union|unix|unsigned|using|virtual|void|volatile|wchar_t|"
+    "while|xor|xor_eq|"
+    # ... names of the headers ...
+    "[A-Z][A-Z0-9_]*|u?int\\w*_t|(?:a?(?:cos|sin|tan)h?|atan2|cbrt|ceil|copysign|erfc?|exp2?|expm1|fabs|"
+    "fdim|floor|fma|fmax|fmin|fmod|frexp|hypot|ilogb|ldexp|lgamma|l?l?rint|l?l?round|log|log10|log1p|"
+    "log2|logb|modf|nan|nearbyint|nextafter|nexttoward|pow|remainder|remquo|scalbl?n|sqrt|tgamma|trunc|"
+    "gamma|drem|significand|scalb|finite|pow10|exp10|isnan|isinf|signgam|[jy](?:0|1|n))[fl]?|"
+    "is\\w+|signbit|fpclassify|"
+    # ... and variables of the code.
+    "vj_\\w+|m|x|i|k|out|low|high|scratch|held|leaf|waits|[avyn]\\d+"
+)
+"""Names that no monitor in C can have."""
 HELPERS = r"""
 #ifndef VJ_MONITOR_HELPERS
 #define VJ_MONITOR_HELPERS
@@ -236,11 +256,17 @@ def export_c(
     - `every`: whether each formula is evaluated at every instant, not only at time 0.
     - `sizes`: number of components of each signal whose norm the formulas use.
     **Returns:** the text of the header.
-    **Raises:** the errors of `watch`; `ValueError` for a name that is not a C identifier.
+    **Raises:** the errors of `watch`; `ValueError` for a name that is not a C identifier, or that C
+    or the code itself uses.
     """
     if not re.fullmatch(r"[A-Za-z]\w*", name, re.ASCII):
         raise ValueError(
             f"the name of a monitor in C is a letter, then letters, digits and _; got {name!r}"
+        )
+    if TAKEN.fullmatch(name):
+        raise ValueError(
+            f"the name of a monitor must be free in C, where {name!r} means something else or may; "
+            f"such as {name.lower()}_monitor"
         )
     plan = streams(formulas, dt, semantics, every)
     front = margins(plan, sizes or {})
@@ -251,7 +277,9 @@ def export_c(
         f"out[{k}] {key}{': ' * bool(key)}{f}" for k, (key, f) in enumerate(plan.formulas.items())
     ]
     about = "\n".join(["", *outputs, *columns, f"a sample every {number_text(dt)} s"])
-    comment = about.replace("*/", "* /").replace("\n", "\n * ")
+    # Nothing in it ends the comment, begins another, joins lines or is a trigraph.
+    apart = re.sub(r"(?<=\*)(?=/)|(?<=/)(?=\*)|(?<=\?)(?=\?)", " ", printable(about))
+    comment = re.sub(r"\\(?=\n)", "\\\\|", apart).replace("\n", "\n * ")
     guard = f"VJ_MONITOR_{name.upper()}_H"
     body = monitor_code(plan, front, name)
     return f"/*{comment}\n */\n#ifndef {guard}\n#define {guard}\n\n{HEAD}{HELPERS}{body}\n#endif\n"

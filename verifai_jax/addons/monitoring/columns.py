@@ -74,14 +74,15 @@ def _fault(column: Any) -> str:
     given = [c for c in cells if not (c is None or (isinstance(c, str) and c in GAPS))]
     if not given:
         return "is empty"
-    texts = [cell for cell in given if not _reads_as_number(cell)]
+    texts = [cell for cell in given if not reads_as_number(cell)]
     if texts and len(texts) < len(given):
         row = cells.index(texts[0]) + 1
         return f"holds {texts[0]!r} in row {row}, where other rows hold numbers"
     return f"holds no numbers; it starts with {given[0]!r}"
 
 
-def _reads_as_number(cell: object) -> bool:
+def reads_as_number(cell: object) -> bool:
+    """Return whether a cell is a text of a number."""
     if not isinstance(cell, str):
         return False
     try:

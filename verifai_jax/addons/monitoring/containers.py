@@ -15,6 +15,7 @@ from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 
+from verifai_jax.addons.monitoring.columns import LeftOut
 from verifai_jax.addons.monitoring.stamps import find_clock, unit_in_name
 from verifai_jax.core.messages.errors import MissingExtra, require
 from verifai_jax.core.messages.text import counted, one_line
@@ -54,9 +55,40 @@ def matrix_column(array: np.ndarray) -> Any:
     """Return an array `[time]` or `[time, k]` as a column of numbers or of lists."""
     import pyarrow
 
-    flat = pyarrow.array(np.ascontiguousarray(array, array.dtype.newbyteorder("=")).reshape(-1))
+    long = array.dtype.kind == "f" and array.dtype.itemsize > 8
+    native = np.dtype(float) if long else array.dtype.newbyteorder("=")
+    flat = pyarrow.array(np.ascontiguousarray(array, native).reshape(-1))
     wide = array.ndim == 2
     return pyarrow.FixedSizeListArray.from_arrays(flat, array.shape[1]) if wide else flat
+
+
+def table_of_arrays(
+    arrays: Mapping[str, np.ndarray],
+    clock: str | None,
+    notes: dict[str, int],
+    units: Mapping[str, str] | None = None,
+) -> Table:
+    """Return arrays as a table, without those that are no signals, of which there is a note.
+
+    **Arguments:**
+    - `clock`: the array of the sample times, as long as all signals.
+    """
+    lengths = [len(array) for array in arrays.values() if array.ndim]
+    usual = max(lengths, key=lengths.count, default=0)
+    length = usual if clock is None else len(arrays[clock])
+    columns = {}
+    for name, array in arrays.items():
+        if array.ndim not in (1, 2):
+            why = f"must have shape [time] or [time, k]; got {list(array.shape)}"
+        elif len(array) != length:
+            why = f"has {len(array)} rows, where others have {length}"
+        elif array.dtype.kind not in "biufSUMm":
+            why = f"holds {array.dtype}, and no numbers"
+        else:
+            columns[name] = matrix_column(array)
+            continue
+        notes[LeftOut(f"column {name!r} {why}: it is left out", name)] = 1
+    return table_of(columns, units)
 
 
 def bag_files(folder: Path) -> list[Path]:
@@ -202,11 +234,11 @@ def _cells(cells: list[Any]) -> Any:
 
     try:
         return pyarrow.array(cells)
-    except (pyarrow.ArrowInvalid, pyarrow.ArrowTypeError):
+    except (pyarrow.ArrowInvalid, pyarrow.ArrowTypeError, OverflowError):
         return pyarrow.array([None if cell is None else str(cell) for cell in cells])
 
 
-def read_dataset(path: Path, time: str) -> list[Table]:
+def read_dataset(path: Path, time: str, notes: dict[str, int]) -> list[Table]:
     """Read the variables of a NetCDF file or a Zarr store as one table for each first dimension.
 
     **Raises:** `MissingExtra`; `ValueError` for a file that cannot be read.
@@ -217,13 +249,13 @@ def read_dataset(path: Path, time: str) -> list[Table]:
         # Versions of xarray differ in the units of the times that they make.
         opened = xarray.open_zarr if store else xarray.open_dataset
         with opened(path, decode_times=False) as dataset:
-            return list(_dimensions(dataset, time))
+            return list(_dimensions(dataset, time, notes))
     except (ImportError, ValueError) as error:
         require("netCDF4", EXTRA)
         raise ValueError(f"{path} cannot be read: {error}") from None
 
 
-def _dimensions(dataset: Any, time: str) -> Iterator[Table]:
+def _dimensions(dataset: Any, time: str, notes: dict[str, int]) -> Iterator[Table]:
     tables: dict[str, dict[str, np.ndarray]] = {}
     units: dict[str, str] = {}
     for name, variable in dataset.data_vars.items():
@@ -233,13 +265,13 @@ def _dimensions(dataset: Any, time: str) -> Iterator[Table]:
     for dimension, columns in tables.items():
         known = {str(n): v for n, v in dataset.variables.items() if v.dims == (dimension,)}
         name = find_clock(known, time) or (str(dimension) if dimension in known else None)
-        own = {each: matrix_column(array) for each, array in columns.items() if each != name}
-        clock = {} if name is None else {time: matrix_column(known[name].values)}
+        own = {each: array for each, array in columns.items() if each != name}
+        clock = {} if name is None else {time: known[name].values}
         said = {} if name is None else {time: known[name].attrs.get("units") or unit_in_name(name)}
-        yield table_of({**clock, **own}, {**units, **said})
+        yield table_of_arrays({**clock, **own}, time if clock else None, notes, {**units, **said})
 
 
-def read_hdf5(path: Path, time: str) -> list[Table]:
+def read_hdf5(path: Path, time: str, notes: dict[str, int]) -> list[Table]:
     """Read the data sets of an HDF5 file, each with the times of the nearest enclosing group.
 
     Group names become part of the name: `imu/gyro` becomes `imu.gyro`.
@@ -250,8 +282,10 @@ def read_hdf5(path: Path, time: str) -> list[Table]:
     units: dict[str, str] = {}
 
     def visit(name: str, item: Any) -> None:
-        if getattr(item, "ndim", 0) in (1, 2) and item.dtype.kind in "biuf":
-            found[name] = item[()]
+        if getattr(item, "ndim", 0):
+            # What is no signal is left out by its form, unread.
+            form = np.broadcast_to(np.empty((), item.dtype), item.shape)
+            found[name] = item[()] if item.ndim < 3 and item.dtype.kind in "biufS" else form
             said = item.attrs.get("units", item.attrs.get("unit", ""))
             units[name] = said.decode() if isinstance(said, bytes) else str(said)
 
@@ -262,7 +296,7 @@ def read_hdf5(path: Path, time: str) -> list[Table]:
         group, _, last = name.rpartition("/")
         groups.setdefault(group, []).append(last)
     clocks = {group: find_clock(names, time) for group, names in groups.items()}
-    tables: dict[str, tuple[dict[str, Any], dict[str, str]]] = {}
+    tables: dict[str, tuple[dict[str, np.ndarray], dict[str, str]]] = {}
     for name, array in found.items():
         group, _, last = name.rpartition("/")
         own = last == clocks[group]
@@ -270,8 +304,11 @@ def read_hdf5(path: Path, time: str) -> list[Table]:
             group = group.rpartition("/")[0]
         columns, said = tables.setdefault(group, ({}, {}))
         column = last if own else name.replace("/", ".")
-        columns[column], said[column] = matrix_column(array), units[name]
-    return [table_of(columns, said) for columns, said in tables.values()]
+        columns[column], said[column] = array, units[name]
+    return [
+        table_of_arrays(columns, clocks.get(group), notes, said)
+        for group, (columns, said) in tables.items()
+    ]
 
 
 def lerobot_files(folder: Path) -> list[Path]:

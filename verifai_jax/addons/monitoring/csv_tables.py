@@ -12,6 +12,8 @@ from typing import Any
 from verifai_jax.addons.monitoring.columns import GAPS, TRUTHS, is_numeric
 from verifai_jax.addons.monitoring.containers import UNIT, Table
 from verifai_jax.addons.monitoring.units import NONE
+from verifai_jax.core.messages.text import counted, shorten
+from verifai_jax.core.store.foreign_files import decoded
 
 NUMBER = re.compile(r'^\s*"?[-+]?[.,]?\d')
 """The beginning of a number, or of a date."""
@@ -26,8 +28,10 @@ def read_csv(path: Path, notes: dict[str, int]) -> Table:
     from pyarrow import csv
 
     data = path.read_bytes()
-    if data[:2] in (b"\xff\xfe", b"\xfe\xff"):
-        data = data.decode("utf-16").encode()
+    if not data.isascii() or b"\0" in data[:2]:
+        text, note = decoded(path, data, cut=True)
+        data = text.encode()
+        notes |= {note: 1} if note else {}
     with io.TextIOWrapper(io.BytesIO(data), encoding="utf-8-sig", errors="replace") as file:
         comments, first = 0, file.readline()
         while first.startswith("#"):
@@ -37,7 +41,10 @@ def read_csv(path: Path, notes: dict[str, int]) -> Table:
     below = [line.rstrip("\n").split(separator) for line in (second, third)]
     units = _are_units(*below)
     data = _without_cut_line(data, first.count(separator), separator, notes)
-    parsed = csv.ParseOptions(delimiter=separator)
+    odd: list[Any] = []
+    parsed = csv.ParseOptions(
+        delimiter=separator, invalid_row_handler=lambda row: odd.append(row) or "skip"
+    )
     skipped = csv.ReadOptions(skip_rows=comments, skip_rows_after_names=int(units))
     words: dict[str, Any] = {
         "null_values": GAPS,
@@ -47,9 +54,18 @@ def read_csv(path: Path, notes: dict[str, int]) -> Table:
 
     def table_with(point: str) -> Table:
         converted = csv.ConvertOptions(decimal_point=point, **words)
-        return csv.read_csv(io.BytesIO(data), skipped, parsed, converted)
+        odd.clear()
+        table = csv.read_csv(io.BytesIO(data), skipped, parsed, converted)
+        if len(odd) > table.num_rows:
+            raise ValueError(
+                f"{path} cannot be read: {_said_of(odd)}. Decimal commas need semicolons between "
+                "the columns"
+            )
+        return table
 
     table = table_with(".")
+    if odd:
+        notes[f"{_said_of(odd)}, and left out"] = len(odd)
     named = list(zip(table.column_names, table.columns, strict=True))
     commas = [name for name, column in named if _all_match(column, DECIMAL_COMMAS)]
     if not commas:
@@ -71,6 +87,13 @@ def read_csv(path: Path, notes: dict[str, int]) -> Table:
                 f"{name!r}: use the same for all numbers"
             )
     return _with_units(again, below[0]) if units else again
+
+
+def _said_of(odd: Sequence[Any]) -> str:
+    """Say which rows have more or fewer cells than the first line has names."""
+    cells, names = odd[0].actual_columns, odd[0].expected_columns
+    rows = f"{counted(len(odd), 'row')} such as {shorten(odd[0].text)!r}"
+    return f"{rows}: {counted(cells, 'cell')} where there are {counted(names, 'name')}"
 
 
 def _without_cut_line(data: bytes, separators: int, separator: str, notes: dict[str, int]) -> bytes:

@@ -17,8 +17,9 @@ from verifai_jax.addons.monitoring import containers, resampling
 from verifai_jax.addons.monitoring.columns import LeftOut, numbers_of
 from verifai_jax.addons.monitoring.containers import UNIT, Episode, Table
 from verifai_jax.addons.monitoring.csv_tables import read_csv
-from verifai_jax.addons.monitoring.stamps import apart, find_clock, seconds_of
-from verifai_jax.core.messages.errors import missing_name
+from verifai_jax.addons.monitoring.stamps import apart, find_clock, in_order, seconds_of
+from verifai_jax.core.messages.errors import MissingExtra, missing_name
+from verifai_jax.core.messages.text import format_error, one_line
 from verifai_jax.core.values.trace import Trace
 
 if TYPE_CHECKING:
@@ -61,8 +62,9 @@ def read(
     cell, `-` or `n/a` is a gap (NaN), and words such as `true` or `ON` are truth values. In a CSV
     file commas, semicolons or tabs separate the columns, as the first line shows; numbers may have
     a decimal comma if all of them do. Comment lines (`#`) before the names are skipped, and a row
-    of units may follow the names. A last line that was cut, messages that cannot be decoded and
-    topics of an unknown kind are left out, with a note.
+    of units may follow the names. Left out, with a note, are a last line that was cut, rows with
+    another number of cells, less than a tenth of the rows if their times are missing or go back,
+    messages that cannot be decoded, topics of an unknown kind, and columns of another length.
 
     Data with several clocks, such as the topics of an MCAP file, the groups of an HDF5 file or
     several files, become one trace with the instants of all clocks; a signal has a gap where only
@@ -103,24 +105,40 @@ def read(
     if isinstance(time, Mapping):
         tables = [_of_clock(name, tables, clock, own) for clock, own in time.items()]
     units = _units(tables)
-    parts, stamps = [], []
+    parts, stamps, unclocked = [], [], []
     for (table, said), each in zip(tables, wanted, strict=True):
         clock = find_clock(table, each)
         if clock is None and dt is None:
-            raise TimeColumnError(f"{name} has no column {each!r} of sample times", list(table))
+            fault = TimeColumnError(f"{name} has no column {each!r} of sample times", list(table))
+            if isinstance(source, str | Path | Episode) and len(tables) > 1:
+                unclocked.append(fault)
+                continue
+            raise fault
         column = None if clock is None else table.pop(clock)
+        values = _values(name, table, columns, notes)
         if clock is not None and dt is None:
             unit = said.get(clock, "")
             seconds, origin, note = seconds_of(name, clock, column, unit, time_unit)
             notes |= {note: 1} if note else {}
-            stamps.append((apart(seconds, notes), origin))
-        parts.append(_values(name, table, columns, notes))
+            rows = in_order(seconds, notes)
+            values = {each: cells[rows] for each, cells in values.items()}
+            stamps.append((apart(seconds[rows], notes), origin))
+        parts.append(values)
+    for fault in unclocked:
+        if not parts:
+            raise fault
+        for column in fault.columns:
+            notes[LeftOut(f"column {column!r} has no sample times: it is left out", column)] = 1
     if columns is None and not any(parts):
-        raise ValueError(f"{name} has no column of numbers")
+        said = "".join(f"; {note}" for note in notes if isinstance(note, LeftOut))
+        raise ValueError(f"{name} has no column of numbers{said}")
     if dt is not None and len(parts) > 1:
         raise ValueError(f"{name} has {len(parts)} clocks, so one period dt is not enough")
-    for seconds, _ in stamps:
-        resampling.check_increasing(seconds)
+    try:
+        for seconds, _ in stamps:
+            resampling.check_increasing(seconds)
+    except ValueError as error:
+        raise ValueError(f"{name}: {error}") from None
     times = stamps[0][0] if stamps else None
     times, values = resampling.joined(stamps, parts) if len(parts) > 1 else (times, parts[0])
     signals = _signals(name, values, columns)
@@ -241,15 +259,13 @@ def _refuse_repeated(source: str, names: Sequence[str]) -> None:
 
 def _file_tables(path: Path, time: str, episode: int | None, notes: dict[str, int]) -> list[Table]:
     """Read the Arrow tables of a file, one for each of its clocks."""
-    import pyarrow
-
     readers = {
         ".csv": lambda: [read_csv(path, notes)],
         ".parquet": lambda: containers.read_parquet(path, time, episode),
-        ".npz": lambda: [_read_arrays(path)],
+        ".npz": lambda: [_read_arrays(path, time, notes)],
         ".mcap": lambda: containers.read_mcap([path], time, notes),
-        **dict.fromkeys((".nc", ".zarr"), lambda: containers.read_dataset(path, time)),
-        **dict.fromkeys((".h5", ".hdf5"), lambda: containers.read_hdf5(path, time)),
+        **dict.fromkeys((".nc", ".zarr"), lambda: containers.read_dataset(path, time, notes)),
+        **dict.fromkeys((".h5", ".hdf5"), lambda: containers.read_hdf5(path, time, notes)),
     }
     ending = path.suffix.lower()
     if bag := containers.bag_files(path):
@@ -261,31 +277,24 @@ def _file_tables(path: Path, time: str, episode: int | None, notes: dict[str, in
         raise ValueError(f"episodes are those of a LeRobot data set; {path.name} has none")
     try:
         return readers[ending]()
-    except UnicodeDecodeError as error:
-        raise ValueError(
-            f"{path} cannot be read: the names of its columns are not UTF-8 ({error}); save it as "
-            "UTF-8"
-        ) from None
-    except (pyarrow.ArrowInvalid, OSError) as error:
-        # A row with more cells than the first line has names is often one of decimal commas.
-        advice = ". Decimal commas need semicolons between the columns"
-        advice = advice if "Expected" in str(error) else ""
-        raise ValueError(f"{path} cannot be read: {error}{advice}") from None
+    except (MissingExtra, FileNotFoundError):
+        raise
+    except Exception as error:  # The readers of other packages raise what they like.
+        if type(error) is ValueError and str(path) in str(error):
+            raise
+        raise ValueError(f"{path} cannot be read: {format_error(error)}") from None
 
 
-def _read_arrays(path: Path) -> Any:
+def _read_arrays(path: Path, time: str, notes: dict[str, int]) -> Table:
     """Read the arrays of an `.npz` file as an Arrow table; nothing in it is unpickled."""
-    import pyarrow
-
-    columns = {}
-    with np.load(path, allow_pickle=False) as arrays:
-        for name in arrays.files:
-            array = arrays[name]
-            if array.ndim not in (1, 2):
-                shape = f"must have shape [time] or [time, k]; got {list(array.shape)}"
-                raise ValueError(f"array {name!r} of {path} {shape}")
-            columns[name] = containers.matrix_column(array)
-    return pyarrow.table(columns)
+    arrays = {}
+    with open(path, "rb") as file, np.load(file, allow_pickle=False) as stored:
+        for name in stored.files:
+            try:
+                arrays[name] = stored[name]
+            except ValueError as error:
+                notes[LeftOut(f"column {name!r}: {one_line(str(error))}: left out", name)] = 1
+    return containers.table_of_arrays(arrays, find_clock(arrays, time), notes)
 
 
 def _values(

@@ -4,6 +4,8 @@ seconds_of("flight.csv", "time_ms", column)     # in seconds, and when they bega
 find_clock(["Time [ms]", "x"], "time")          # "Time [ms]"
 """
 
+import bisect
+import contextlib
 import datetime
 import re
 from collections.abc import Iterable, Sequence
@@ -12,9 +14,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from verifai_jax.addons.monitoring.columns import numbers_of
+from verifai_jax.addons.monitoring.columns import numbers_of, reads_as_number
 from verifai_jax.addons.monitoring.units import NONE
-from verifai_jax.core.messages.text import format_seconds
+from verifai_jax.core.messages.text import counted, format_seconds
 from verifai_jax.mtl.setting import resolution_of
 
 WORDS = {
@@ -36,6 +38,8 @@ CALENDARS = {"utc", "gmt", "unix", "epoch", "posix", "local", "boot", "start", "
 WRITTEN = re.compile(r"^([\d.]+(?:e[-+]?\d+)?)?\s*([a-zµμ]+)\.?(?:\s+since\s+(.+))?$")
 BRACKETS = re.compile(r"[(\[]\s*([^()\[\]]*[^()\[\]\d\s][^()\[\]]*?)\s*[)\]]\s*$")
 SUFFIX = re.compile(r"(?:[_\s./-]|(?<=[a-z])(?=[A-Z]))([A-Za-zµμ]+)$")
+FEW = 0.1
+"""Share of a recording's rows below which those that cannot be read are left out."""
 CALENDAR = 10**8
 """Seconds, three years, beyond which sample times count from the first."""
 
@@ -119,7 +123,10 @@ def seconds_of(
         first = int(whole[known][0]) if known.any() else 0
         seconds = np.where(known, (whole - first) / int(1 / scale), np.nan)
         return seconds, first * scale, ""
-    values = numbers_of(source, name, column)
+    if is_text and sum(map(reads_as_number, texts := column.to_pylist())) > (1 - FEW) * len(column):
+        values = np.array([float(text) if reads_as_number(text) else np.nan for text in texts])
+    else:
+        values = numbers_of(source, name, column)
     if values.ndim > 1:
         raise ValueError(
             f"column {name!r} of {source} holds lists of {values.shape[1]} numbers, where each row "
@@ -211,14 +218,52 @@ def _since_1970(moment: datetime.datetime) -> Fraction:
 
 
 def _moments(texts: list[str | None]) -> tuple[np.ndarray, Fraction] | None:
-    """Return the seconds from the first ISO 8601 text to each; None if a text is no moment."""
+    """Return the seconds from the first ISO 8601 text to each; None if several are no moments."""
+    moments = [_moment_or_none(text) for text in texts]
+    odd = sum(moment is None and bool(text) for moment, text in zip(moments, texts, strict=True))
     try:
-        moments = [moment_of(text.strip()) if text else None for text in texts]
         first = next(moment for moment in moments if moment is not None)
         seconds = [np.nan if m is None else (m - first).total_seconds() for m in moments]
-    except (ValueError, StopIteration, TypeError):  # Some may have a time zone and others none.
+    except (StopIteration, TypeError):  # Some may have a time zone and others none.
         return None
-    return np.array(seconds), _since_1970(first)
+    return None if odd and odd >= FEW * len(texts) else (np.array(seconds), _since_1970(first))
+
+
+def _moment_or_none(text: str | None) -> datetime.datetime | None:
+    with contextlib.suppress(ValueError):
+        return moment_of(text.strip()) if text else None
+    return None
+
+
+def in_order(times: np.ndarray, notes: dict[str, int]) -> np.ndarray:
+    """Return the rows that have a sample time, without the fewest whose times go back.
+
+    There is a note on the others. If they are not few, all rows are returned.
+    """
+    known = np.flatnonzero(np.isfinite(times))
+    own = times[known]
+    if not np.all(own[1:] >= own[:-1]):
+        # The longest part that never goes back: of each length, the least last time.
+        ends: list[float] = []
+        rows: list[int] = []
+        before: list[int] = []
+        for row, time in enumerate(own.tolist()):
+            length = bisect.bisect_right(ends, time)
+            ends[length : length + 1], rows[length : length + 1] = [time], [row]
+            before.append(rows[length - 1] if length else -1)
+        kept, row = [], rows[-1]
+        while row >= 0:
+            kept.append(row)
+            row = before[row]
+        known = known[kept[::-1]]
+    out = np.setdiff1d(np.arange(len(times)), known)
+    if len(out) >= FEW * len(times):
+        return np.arange(len(times))
+    if len(out):
+        which = ", ".join(map(str, out[:3] + 1)) + ", ..." * (len(out) > 3)
+        said = "left out: their times are missing, or go back"
+        notes[f"{counted(len(out), 'row')} (row {which}): {said}"] = len(out)
+    return known
 
 
 def apart(times: np.ndarray, notes: dict[str, int]) -> np.ndarray:

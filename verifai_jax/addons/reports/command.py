@@ -7,7 +7,7 @@ import click
 
 from verifai_jax.cli import arguments
 from verifai_jax.cli.arguments import PATH, option
-from verifai_jax.cli.json_output import command, give_result
+from verifai_jax.cli.json_output import command, give_result, say
 
 
 @command()
@@ -101,5 +101,5 @@ def report(
         **options,
     )
     give_result(report=path, claims=claims_path(path))
-    click.echo(f"  report       {path}")
-    click.echo(f"  claims       {claims_path(path)}")
+    say(f"  report       {path}")
+    say(f"  claims       {claims_path(path)}")

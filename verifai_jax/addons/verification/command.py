@@ -3,12 +3,10 @@
 from pathlib import Path
 from typing import Any
 
-import click
-
 from verifai_jax.cli import arguments
 from verifai_jax.cli.arguments import PATH, option
 from verifai_jax.cli.gates import Gate, check_gate, fail_on
-from verifai_jax.cli.json_output import command, give_result, show_result
+from verifai_jax.cli.json_output import command, give_result, say, show_result
 
 
 @command()
@@ -49,8 +47,8 @@ def verify(
     parts = {name: getattr(found, name)._asdict() for name in ("proved", "broken", "undecided")}
     give_result(**parts, failing_at_least=low, failing_at_most=high, formulas=found.formulas)
     if into is not None:
-        click.echo(f"  result       {found.save(into)}")
+        say(f"  result       {found.save(into)}")
     if report is not None:
-        click.echo(f"  report       {found.report(report, problem=problem)}")
+        say(f"  report       {found.report(report, problem=problem)}")
     failed = {"counterexample": found.broken.mass > 0, "undecided": found.proved.mass < 1}
     check_gate(fail_on, failed)

@@ -1,6 +1,8 @@
 """Texts, XML and YAML of files that may come from anywhere."""
 
 import codecs
+import contextlib
+import warnings
 from pathlib import Path
 from xml.etree import ElementTree
 from xml.etree.ElementTree import Element
@@ -19,21 +21,45 @@ MARKS = (
 it begins as that of UTF-16 does."""
 
 
+UNMARKED = "utf-8-sig"
+CUT = ("unexpected end of data", "truncated data")
+"""What is said of a text whose last character is not whole."""
+
+
 def read_text(path: Path) -> str:
-    """Read a text in UTF-8, or in what the mark at its beginning says, with ends of lines as in C.
+    """Read a text, see `decoded`, with ends of lines as in C; Windows-1252 gives a warning.
 
     **Raises:** `ValueError` for another encoding, which cannot be known.
     """
-    data = path.read_bytes()
-    encoding = next(name for mark, name in MARKS if data.startswith(mark))
-    try:
-        text = data.decode(encoding)
-    except UnicodeDecodeError as error:
-        where = f"byte {error.start + 1} is 0x{data[error.start]:02x}"
-    else:
-        if "\0" not in text:
-            return text.replace("\r\n", "\n").replace("\r", "\n")
+    text, note = decoded(path, path.read_bytes())
+    if "\0" in text:
         where = f"character {text.index(chr(0)) + 1} is 0"
+        raise ValueError(f"{path} is not a text ({where}): save it as UTF-8")
+    if note:
+        warnings.warn(note, stacklevel=3)
+    return text.replace("\r\n", "\n").replace("\r", "\n")
+
+
+def decoded(path: Path, data: bytes, cut: bool = False) -> tuple[str, str]:
+    """Decode the content of a file: as its mark or its zeros say, as UTF-8, or Windows-1252.
+
+    **Arguments:**
+    - `cut`: whether the last character may be cut, as by a loss of power.
+    **Returns:** the text, and a note for Windows-1252, which nothing in a file says.
+    **Raises:** `ValueError` for another encoding.
+    """
+    encoding = next(name for mark, name in MARKS if data.startswith(mark))
+    if encoding == UNMARKED and data[:2].count(0) == 1:
+        encoding = "utf-16-be" if data[0] == 0 else "utf-16-le"
+    try:
+        return data.decode(encoding), ""
+    except UnicodeDecodeError as error:
+        if cut and error.reason in CUT:
+            return data.decode(encoding, "replace"), ""
+        where = f"byte {error.start + 1} is 0x{data[error.start]:02x}"
+    with contextlib.suppress(UnicodeDecodeError):
+        if encoding == UNMARKED:
+            return data.decode("cp1252"), f"{path} is not UTF-8, and is read as Windows-1252"
     raise ValueError(
         f"{path} is not a text in {encoding.removesuffix('-sig').upper()} ({where}): save it as "
         "UTF-8, in Excel as CSV UTF-8"

@@ -92,6 +92,10 @@ TRACING_BY_WORDS = {
         f"it slices with values as ends, and {ONCE_FOR_ALL}. Use jax.lax.dynamic_slice for a slice "
         "of fixed length, or jnp.where over all entries"
     ),
+    "Only integer scalar arrays can be converted to a scalar index": (
+        f"it counts by a value, as range(value) and list[value] do, and {ONCE_FOR_ALL}. Count by "
+        "jax.lax.fori_loop, and index jnp.array(the_list) by an integer"
+    ),
     r"Tracer\.__format__": (
         f"it writes a value into a text, and {ONCE_FOR_ALL}. Use jax.debug.print to see values"
     ),

@@ -180,7 +180,7 @@ class PooledBlackBox(_RowByRow):
 
     def _with(self, simulation: Simulation) -> System:
         pool = self.pool
-        options = (pool.workers, pool.timeout, pool.retries, pool.fresh)
+        options = (pool.workers, pool.timeout, pool.retries)
         return PooledBlackBox(simulation, Pool(simulation, simulation.function, *options))
 
     def renewed(self) -> "PooledBlackBox":

@@ -17,10 +17,12 @@ from multiprocessing import spawn
 from multiprocessing.connection import Connection
 from pathlib import Path
 
+from verifai_jax.core.user_code.forks import returning_once
 from verifai_jax.core.user_code.user_errors import format_user_error
 from verifai_jax.core.values.trace import Status, Trace
 from verifai_jax.systems.base import Features, Outcome
 
+# True in a worker that still imports the simulator.
 preparing = False
 # What a worker runs. Its path is that of this process, whatever was added since it started.
 START = (
@@ -111,7 +113,9 @@ def _answer(pipe: Connection, simulation: Callable[[Features, int], Trace]) -> N
     while True:
         number, features, seed = pipe.recv()
         try:
-            reply = pickle.dumps((number, Outcome(simulation(features, seed))))
+            with returning_once():
+                made = simulation(features, seed)
+            reply = pickle.dumps((number, Outcome(made)))
         except BaseException as error:  # sys.exit() in a simulator is its failure, not our end.
             failed = Outcome(None, Status.ERROR, format_user_error(error))
             reply = pickle.dumps((number, failed))

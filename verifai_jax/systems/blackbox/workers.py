@@ -43,11 +43,13 @@ POLL_SECONDS = 0.5
 """Time between two checks that a silent worker is alive."""
 SLOW_IMPORT_SECONDS = 30.0
 """Time until the log says that a worker is still importing."""
+MAX_IMPORT_SECONDS = 1800.0
+"""Time until a worker that is still importing is ended."""
+STILL_IMPORTS = "a worker process has not imported the simulator"
 DROPPED = "an answer of a worker belonged to another simulation and was dropped"
 """The note of a simulation before whose answer there came one to another question."""
 REMEMBERED = 1 << 16
 """Simulations whose workers a pool remembers."""
-# True in a worker that still imports the simulator.
 _numbers = itertools.count()
 
 
@@ -62,7 +64,6 @@ class Pool:
     - `simulation(features, seed) -> Trace`: picklable, like `function`.
     - `function`: the user's function, which errors name.
     - `workers`, `timeout` (in seconds), `retries`: see `blackbox`.
-    - `fresh`: whether each simulation gets its own process.
     **Raises:** `ValueError` for numbers out of range, and a function that a new process cannot
     import.
     """
@@ -74,7 +75,6 @@ class Pool:
         workers: int,
         timeout: float | None,
         retries: int,
-        fresh: bool = False,
     ) -> None:
         check_count("workers", workers)
         if timeout is not None and not (isinstance(timeout, int | float) and timeout > 0):
@@ -85,7 +85,6 @@ class Pool:
                 "workers need Linux or macOS; leave them out, or use a remote simulator"
             )
         self._begin(workers, timeout, retries, pickled_setup(simulation, function))
-        self.fresh = fresh
 
     def __reduce__(self) -> tuple[Any, ...]:
         # Elsewhere it is a pool of its own, which finds the function by its name too.
@@ -93,7 +92,6 @@ class Pool:
 
     def _begin(self, workers: int, timeout: float | None, retries: int, setup: bytes) -> None:
         self.workers, self.timeout, self.retries = workers, timeout, retries
-        self.fresh = False
         self._setup = setup
         self._slots = threading.Semaphore(workers)
         # Its own operations are all the locking that it needs.
@@ -103,7 +101,7 @@ class Pool:
         weakref.finalize(self, _end, self._idle)
 
     def outcomes(
-        self, features: Sequence[Features], seeds: Sequence[int]
+        self, features: Sequence[Features], seeds: Sequence[int], until: float = math.inf
     ) -> Iterator[tuple[int, Outcome]]:
         """Simulate all rows, and yield each index with its outcome as soon as that is known.
 
@@ -111,11 +109,14 @@ class Pool:
         Workers continue while the caller processes an outcome. If the caller stops, or is
         interrupted, running simulations are ended.
 
+        **Arguments:**
+        - `until`: instant of `time.monotonic` at which all are ended, with the status `TIMEOUT`,
+          and without a message those that had not begun.
         **Raises:** `StartError` if no worker can start.
         """
         if worker_process.preparing:
             raise StartError(main_guard())
-        batch, finished = _Batch(features, seeds), not len(features)
+        batch, waiting = _Batch(features, seeds), set(range(len(features)))
         threads = [
             threading.Thread(target=self._work, args=(batch,), daemon=True)
             for _ in range(min(self.workers, len(batch.tasks)))
@@ -123,13 +124,14 @@ class Pool:
         try:
             for thread in threads:
                 thread.start()
-            for left in reversed(range(len(features))):
-                result = batch.results.get()
+            while waiting:
+                left = None if until == math.inf else max(0.0, until - time.monotonic())
+                result = batch.results.get(timeout=left)
                 if isinstance(result, BaseException):
                     raise result
-                finished = left == 0
+                waiting.remove(result[0])
                 yield result
-        except KeyboardInterrupt:
+        except (KeyboardInterrupt, queue.Empty) as end:
             # What has ended by now is not lost: the caller has it before the interruption goes on.
             batch.stop()
             for thread in threads:
@@ -137,10 +139,17 @@ class Pool:
             while not batch.results.empty():
                 result = batch.results.get()
                 if not isinstance(result, BaseException):
+                    waiting.remove(result[0])
                     yield result
-            raise
+            if isinstance(end, KeyboardInterrupt):
+                raise
+            ended, unbegun = "the simulation was ended, as all time was over", ""
+            later = {index for index, *_ in batch.tasks}
+            for index in sorted(waiting):
+                message = unbegun if index in later else ended
+                yield index, Outcome(None, Status.TIMEOUT, message)
         finally:
-            if not finished:
+            if waiting:
                 batch.stop()
             for thread in threads:
                 thread.join()
@@ -185,10 +194,6 @@ class Pool:
                         message = f"{end} (attempt {deaths} of {self.retries + 1})"
                         outcome = Outcome(None, Status.ERROR, message)
                         break
-                if self.fresh and worker is not None:
-                    batch.leave(worker)
-                    worker.end()
-                    worker = None
                 if outcome is not None:
                     batch.results.put((index, outcome))
         except BaseException as error:  # A thread must not die silently: its batch would wait.
@@ -354,7 +359,7 @@ class _Worker:
 
         **Raises:** `StartError` with what the import raised.
         """
-        said = time.monotonic()
+        begun = said = time.monotonic()
         try:
             self.pipe.send_bytes(self._setup)
             while not self.pipe.poll(POLL_SECONDS):
@@ -363,6 +368,8 @@ class _Worker:
                 if time.monotonic() - said > SLOW_IMPORT_SECONDS:
                     said = time.monotonic()
                     log.warning("worker process %d is still importing", self.process.pid)
+                if time.monotonic() - begun > MAX_IMPORT_SECONDS:
+                    raise StartError(f"{STILL_IMPORTS} after {MAX_IMPORT_SECONDS:zg} s")
             problem = self.pipe.recv()
         except (EOFError, OSError):
             return False
@@ -382,7 +389,7 @@ class _Worker:
                 if self.pipe.poll(min(max(left, 0.0), POLL_SECONDS)):
                     number, outcome = self.pipe.recv()
                     if number == self.asked:
-                        if not self.dropped or outcome.trace is None:
+                        if not self.dropped or not isinstance(outcome.trace, Trace):
                             return outcome
                         notes = {**outcome.trace.notes, DROPPED: self.dropped}
                         self.dropped = 0

@@ -1,6 +1,7 @@
 """The closed loop that `ode` makes: its simulation step by step."""
 
-from collections.abc import Callable, Mapping
+import contextlib
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar
 
@@ -156,6 +157,21 @@ class Ode(System):
         features = set_durations(features, self.duration)
         rollout = _Rollout(self, features, key)
         return rollout.fold(as_floating(self.initial(features, key), "initial"), carry, update)
+
+
+@contextlib.contextmanager
+def _explaining_no_control(
+    role: str, function: Callable[..., Any] | None, control: object
+) -> Iterator[None]:
+    try:
+        yield
+    except TypeError as error:
+        if control is None and "NoneType" in str(error):
+            raise ValueError(
+                f"{role} computes with a control, which is None without controller=: "
+                f"{error}{defined_at(function)}"
+            ) from error
+        raise
 
 
 @dataclass(frozen=True, eq=False)
@@ -361,17 +377,10 @@ class _Rollout:
                     "controller must return the control; it returned None, as without a return "
                     f"statement{defined_at(loop.controller)}"
                 )
-        try:
+        with _explaining_no_control("dynamics", loop.dynamics, control):
             derivative = jax.eval_shape(
                 lambda control: loop.dynamics(time, state, control, self.features), control
             )
-        except TypeError as error:
-            if control is None and "NoneType" in str(error):
-                raise ValueError(
-                    "dynamics computes with a control, which is None without controller=: "
-                    f"{error}{defined_at(loop.dynamics)}"
-                ) from error
-            raise
         role, note = "the state's derivative, in the form of the state", defined_at(loop.dynamics)
         check_like(derivative, state, "dynamics", role, note, same_precision=False)
         role = "a state, in the form of the state"
@@ -404,7 +413,9 @@ class _Rollout:
                 finite.extend(n for n, v in signals.items() if any(v is part for part in parts))
             return signals
 
-        check_signals(jax.eval_shape(sample_signals, control))
+        with _explaining_no_control("signals", loop.signals, control):
+            sampled = jax.eval_shape(sample_signals, control)
+        check_signals(sampled)
         if loop.terminate is not None:
             ended = jax.eval_shape(loop.terminate, state, self.features)
             if getattr(ended, "shape", None) != () or ended.dtype != jnp.bool_:

@@ -83,6 +83,13 @@ def traces():
     return in_c, in_jax
 
 
+def test_a_system_is_written_in_a_line():
+    written = repr(loop())
+    assert written.startswith("MuJoCo(")
+    assert "2 coordinates, 1 actuators, 1 s, backend=" in written
+    assert len(written) < 100
+
+
 @pytest.mark.thorough
 @pytest.mark.parametrize("name", SIGNALS)
 def test_backends_agree(traces, name):

@@ -3,13 +3,15 @@
 import os
 import subprocess
 import sys
+import time
 from pathlib import Path
 from types import SimpleNamespace
 
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from drifting import Point
+from drifting import Point, closed_loop
+from misbehaving_training import train_badly
 from numpy_training import study, sweep, train, train_anew
 
 import verifai_jax as vj
@@ -51,7 +53,7 @@ def test_a_policy_of_another_form_than_the_examples():
     for size, words in ((2, None), (3, "actions of shape [2], and example= of the trainer, with")):
         trainer = vj.Trainer(train, steps=8, example=lambda o, size=size: jnp.zeros(size))
         why = FunctionRuns._why_not_of_the_form(SimpleNamespace(_trainer=trainer), trained)
-        assert why is None if words is None else words in why
+        assert not why if words is None else words in why
 
 
 @pytest.mark.slow
@@ -88,3 +90,44 @@ def test_one_that_cannot_resume_trains_anew_and_one_that_raises_is_a_row(caplog)
     wrong = found.table[found.table["rate"] == 0.5]
     assert all("the rate is too great" in status for status in wrong["status"])
     assert (found.table.loc[found.table["rate"] < 0.5, "status"] == "trained").all()
+
+
+@pytest.mark.slow
+def test_whatever_a_training_function_does_is_a_row(tmp_path):
+    ends = {
+        "good": "trained", "print": "trained", "fork": "trained", "child": "trained",
+        "hang": "error: the training took longer than 15 s",
+        "crash": "error: the worker process was killed by SIGSEGV",
+        "exit": "error: the worker process ended with exit code 0",
+        "leave": "error: SystemExit: bye", "none": "error: PolicyError: a policy is a file",
+        "two": "error: the trained policy returns actions of shape [2], and example= of the",
+        "three": "error: ValueError", "nan": "nonfinite",
+    }  # fmt: skip
+
+    def found(kinds, **options):
+        times = {n: options.pop(n) for n in ("timeout",) if n in options}
+        trainer = vj.Trainer(
+            train_badly, steps=8, example=lambda o: o[:1], observation=np.zeros(2), **times
+        )
+        space = {"kind": vj.Categorical(*kinds), "file": vj.Categorical(str(tmp_path / "pids"))}
+        swept = vj.sweep(
+            vj.Study("odd", space, trainer, closed_loop), "grid", len(kinds), samples=16,
+            attack_simulations=0, progress=False, **options,
+        )  # fmt: skip
+        return swept, dict(zip(swept.table["kind"], swept.table["status"], strict=True))
+
+    swept, statuses = found(ends, timeout=15.0)
+    assert swept.record.complete
+    assert {*statuses} == {*ends}
+    for kind, status in statuses.items():
+        assert status.startswith(ends[kind]), (kind, status)
+    # Only what hung, crashed or exited cost a process.
+    processes = {*(tmp_path / "pids").read_text().split()}
+    assert len(processes) <= 3 + (os.cpu_count() or 1)
+    began = time.monotonic()
+    swept, statuses = found(["hang", "good"], max_seconds=45.0)
+    assert time.monotonic() - began < 60
+    assert statuses == {
+        "good": "trained", "hang": "error: the training was ended, as all time was over"
+    }  # fmt: skip
+    assert not swept.record.complete

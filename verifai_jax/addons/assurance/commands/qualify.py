@@ -6,7 +6,7 @@ import click
 
 from verifai_jax.cli.arguments import PATH, option
 from verifai_jax.cli.exit_codes import BROKEN
-from verifai_jax.cli.json_output import command, give_result
+from verifai_jax.cli.json_output import command, give_result, say
 
 
 @command()
@@ -24,12 +24,11 @@ def qualify(folder: Path, only: tuple[str, ...]) -> None:
     replays bit for bit. It ends with code 3 if one falls.
     """
     from verifai_jax import qualify as run
-    from verifai_jax.core.messages.text import printable
 
     found = run(only)
     path = found.save(folder)
-    click.echo(printable(str(found)))
-    click.echo(f"  written      {path}")
+    say(found)
+    say(f"  written      {path}")
     give_result(passed=found.passed, complete=found.complete, outcomes=found.outcomes, report=path)
     if not found.passed:
         raise click.exceptions.Exit(BROKEN)

@@ -6,7 +6,7 @@ import click
 
 from verifai_jax.cli.arguments import PATH, option
 from verifai_jax.cli.gates import Gate, check_gate, fail_on
-from verifai_jax.cli.json_output import command, give_result
+from verifai_jax.cli.json_output import command, give_result, say
 
 FOLDER = PATH
 
@@ -58,7 +58,6 @@ def trace(
     Files of problems, and of tests, are run for that. pyproject.toml's vj_specs are tests too.
     """
     from verifai_jax import trace_matrix
-    from verifai_jax.core.messages.text import printable
 
     asked = {
         "tests": [*(tests or _usual("tests")), *_tested_files()],
@@ -71,10 +70,10 @@ def trace(
         results=results or [each for each in [Path("junit.xml")] if each.is_file()],
         **{name: None if name in without else given for name, given in asked.items()},
     )
-    click.echo(printable(str(found)))
+    say(found)
     for name, path, write in (("table", csv, found.to_csv), ("report", report, found.report)):
         if path is not None:
-            click.echo(f"  {name:<12} {write(path)}")
+            say(f"  {name:<12} {write(path)}")
     give_result(
         complete=found.complete,
         gaps=[gap._asdict() for gap in found.gaps],

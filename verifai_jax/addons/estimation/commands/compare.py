@@ -8,7 +8,7 @@ import click
 from verifai_jax.cli.arguments import CLUSTER, ERRORS, MAX_SECONDS, REPORT, SEED, TARGET, on_cluster
 from verifai_jax.cli.gates import Gate, check_gate, fail_on
 from verifai_jax.cli.going_on import kept_until_done
-from verifai_jax.cli.json_output import as_plain, command, give_result
+from verifai_jax.cli.json_output import as_plain, command, give_result, say
 
 
 @command()
@@ -51,12 +51,11 @@ def compare(
     from verifai_jax import Problem
     from verifai_jax import compare as run_compare
     from verifai_jax.addons.estimation.revisions import load_at_revision
-    from verifai_jax.core.messages.text import printable
 
     with kept_until_done() as kept, on_cluster(cluster) as executor:
         named = {name: name for name in candidates}
         result = run_compare(target, named, executor=executor, **options)
-        click.echo(printable(str(result)))
+        say(result)
         kept.stopped(result.stopped)
     if errors is not None:
         from verifai_jax import error_budget
@@ -65,12 +64,12 @@ def compare(
             for one in result.candidates:
                 with load_at_revision(one.name, Problem) as candidate:
                     found = error_budget(candidate, one, baseline=baseline, pairs=errors)
-                click.echo(printable(str(found)))
+                say(found)
                 give_result(**{f"errors of {one.name}": found.table})
     if report is not None:
         with load_at_revision(target, Problem) as baseline:
             path = result.report(report, problem=baseline)
-        click.echo(f"  report       {path}")
+        say(f"  report       {path}")
     give_result(
         baseline=result.baseline,
         verdict=result.verdict,

@@ -10,7 +10,7 @@ from verifai_jax.cli.arguments import option
 from verifai_jax.cli.exit_codes import BROKEN, INTERRUPTED, CommandError
 from verifai_jax.cli.gates import RATE, Gate, check_gate, fail_on
 from verifai_jax.cli.going_on import kept_until_done
-from verifai_jax.cli.json_output import command, give_result, show_result
+from verifai_jax.cli.json_output import command, give_result, say, show_result
 
 if TYPE_CHECKING:
     from verifai_jax import Estimate
@@ -62,7 +62,6 @@ def estimate(
 ) -> None:
     """Estimate the probability that TARGET (FILE.py:NAME) fails, with an interval and a bound."""
     from verifai_jax import estimate as run
-    from verifai_jax.core.messages.text import printable
 
     if fail_on is not None and fail_on.name == "p0" and p0 is None:
         raise click.UsageError("--fail-on p0 goes with --p0")
@@ -78,11 +77,11 @@ def estimate(
         from verifai_jax import error_budget
 
         budget = error_budget(problem, found, pairs=errors)
-        click.echo(printable(str(budget)))
+        say(budget)
         give_result(errors=budget.table, error_low=budget.low, error_high=budget.high)
     if report is not None:
         path = found.report(report, problem=problem, errors=budget)
-        click.echo(f"  report       {path}")
+        say(f"  report       {path}")
     if not found.simulations:
         raise CommandError("interrupted before the first batch was finished", INTERRUPTED)
     if found.rest and found.prior_no_verdict == found.prior_simulations and not found.failures:

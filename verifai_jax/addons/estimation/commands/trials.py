@@ -8,7 +8,7 @@ import click
 from verifai_jax.cli import arguments
 from verifai_jax.cli.arguments import PATH, option
 from verifai_jax.cli.going_on import kept_until_done
-from verifai_jax.cli.json_output import as_plain, command, give_result
+from verifai_jax.cli.json_output import as_plain, command, give_result, say
 
 
 @command()
@@ -51,17 +51,17 @@ def trials(
         if sheet is None:
             raise click.UsageError("give a file of trials, or --sheet HTML to plan the first ones")
         trial_protocol(problem, sheet, count or 20, seed=seed)
-        click.echo(f"sheet {sheet}, to fill in {sheet.with_suffix('.csv')}")
+        say(f"sheet {sheet}, to fill in {sheet.with_suffix('.csv')}")
         return
     with kept_until_done(), arguments.on_cluster(cluster) as executor:
         found = real_trials(problem, trials, seed=seed, executor=executor, **options)
-    click.echo(str(found))
+    say(found)
     chosen = found.next_trials(count or 10, seed=seed) if count or sheet else None
     if chosen is not None:
-        click.echo(chosen.to_string(index=False))
+        say(chosen.to_string(index=False))
     if sheet is not None:
         trial_protocol(problem, sheet, trials=chosen, seed=seed)
-        click.echo(f"sheet {sheet}, to fill in {sheet.with_suffix('.csv')}")
+        say(f"sheet {sheet}, to fill in {sheet.with_suffix('.csv')}")
     give_result(
         rate=as_plain(found.rate),
         simulated=as_plain(found.simulated),

@@ -10,7 +10,7 @@ from verifai_jax.addons.monitoring.commands.monitor_fleet import load_requiremen
 from verifai_jax.cli import arguments
 from verifai_jax.cli.arguments import PATH, option
 from verifai_jax.cli.gates import Gate, check_gate, fail_on
-from verifai_jax.cli.json_output import command, give_result, show_result
+from verifai_jax.cli.json_output import command, give_result, say, show_result
 
 End = Literal["hold", "truncate"]
 FILES = click.argument("recordings", metavar="[RECORDING]...", nargs=-1, type=PATH)
@@ -119,7 +119,7 @@ def examples(
 def templates(words: tuple[str, ...], domain: str | None) -> None:
     """Print the requirements of the library that have all WORDS, with their sources and units."""
     found = vj.mtl.templates(" ".join(words), domain)
-    click.echo("\n\n".join(map(str, found)) or "no template has all of these words")
+    say("\n\n".join(map(str, found)) or "no template has all of these words")
     give_result(templates=found)
 
 

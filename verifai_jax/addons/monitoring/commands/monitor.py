@@ -27,9 +27,9 @@ from verifai_jax.addons.monitoring.commands.monitor_fleet import (
 from verifai_jax.cli.arguments import NAMES, PATH, PLOT, option, read_names
 from verifai_jax.cli.exit_codes import BROKEN, CommandError
 from verifai_jax.cli.gates import Gate, check_gate, fail_on
-from verifai_jax.cli.json_output import command, give_result
+from verifai_jax.cli.json_output import command, give_result, say
 from verifai_jax.core.messages.errors import missing_name, nearest_names
-from verifai_jax.core.messages.text import format_time, printable
+from verifai_jax.core.messages.text import format_time
 from verifai_jax.core.store.atomic_files import replacing
 
 if TYPE_CHECKING:
@@ -100,7 +100,7 @@ def monitor(
             text = vj.mtl.export_c(parsed, dt, re.sub(r"\W", "_", header.stem))
             with replacing(header) as partial:
                 partial.write_text(text, encoding="utf-8")
-        click.echo(f"monitor {header}")
+        say(f"monitor {header}")
         give_result(formula=formula, header=str(header))
         return
     if not recording:
@@ -153,10 +153,10 @@ def monitor(
             if str(error).startswith("no verdict"):
                 raise CommandError(str(error), BROKEN) from None
             raise
-        click.echo(f"{'holds' if holds else 'fails'} with robustness {rho:z.10g}")
+        say(f"{'holds' if holds else 'fails'} with robustness {rho:z.10g}")
         for note in filter(None, (*trace.notes, off)):
             if not isinstance(note, LeftOut) or note.column in parsed.signals():
-                click.echo(f"note: {printable(note)}")
+                say(f"note: {note}")
         try:
             why = vj.mtl.explain(parsed, even, end=end) if explain or plot is not None else None
         except vj.mtl.SamplingError as error:
@@ -165,10 +165,10 @@ def monitor(
             why = None
         if explain:
             # Recorded times decide where there is a method, and a picture is of an even clock.
-            click.echo(str(why) if why is not None and method is None else because)
+            say(str(why) if why is not None and method is None else because)
         if plot is not None and why is not None:
             vj.mtl.draw(why, plot)
-            click.echo(f"picture {plot}")
+            say(f"picture {plot}")
     give_result(formula=str(parsed), holds=holds, robustness=rho)
     check_gate(fail_on, {"violation": not holds, "incomplete": not holds})
 

@@ -12,8 +12,7 @@ import click
 import verifai_jax as vj
 from verifai_jax.cli.arguments import option
 from verifai_jax.cli.exit_codes import BROKEN, CommandError
-from verifai_jax.cli.json_output import give_result
-from verifai_jax.core.messages.text import printable
+from verifai_jax.cli.json_output import give_result, say
 
 if TYPE_CHECKING:
     from verifai_jax.addons.monitoring import Judgement, Requirement
@@ -60,10 +59,10 @@ def monitor_fleet(
             pool = concurrent.futures.ProcessPoolExecutor(jobs, mp_context=spawned)
             executor = stack.enter_context(pool)
         found = vj.mtl.judge(requirements, recordings, executor=executor, **options)
-    click.echo(printable(str(found)))
+    say(found)
     for name, path, write in (("report", report, found.report), ("junit", junit, found.junit)):
         if path is not None:
-            click.echo(f"{name} {write(path)}")
+            say(f"{name} {write(path)}")
     give_result(failing=len(found.failing), without_verdict=len(found.without_verdict))
     give_result(verdicts=[row._asdict() for row in found.rows])
     if len(found.without_verdict) == len(found.rows):

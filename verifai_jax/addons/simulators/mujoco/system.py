@@ -61,6 +61,12 @@ class MuJoCo(System):
     # Of the native backend; another loop has its own, but the same at every step of the physics.
     programs: dict[Any, Any] = field(default_factory=dict, repr=False, init=False)
 
+    def __repr__(self) -> str:
+        compiled = self.loop.compiled
+        name = compiled.names.split(b"\0")[0].decode(errors="replace") or "a model"
+        sizes = f"{compiled.nq} coordinates, {compiled.nu} actuators"
+        return f"MuJoCo({name}, {sizes}, {self.duration:zg} s, backend={self.backend!r})"
+
     def __getstate__(self) -> dict[str, Any]:
         # Another process makes its own programs, and its own batches of MuJoCo.
         kept = {name: value for name, value in self.__dict__.items() if name != "_native"}

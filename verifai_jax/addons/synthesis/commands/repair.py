@@ -3,13 +3,11 @@
 from pathlib import Path
 from typing import Any
 
-import click
-
 from verifai_jax.cli import arguments
 from verifai_jax.cli.arguments import PATH, option
 from verifai_jax.cli.gates import Gate, check_gate, fail_on
 from verifai_jax.cli.going_on import kept_until_done
-from verifai_jax.cli.json_output import command, draw, give_result, show_result
+from verifai_jax.cli.json_output import command, draw, give_result, say, show_result
 
 
 @command()
@@ -45,7 +43,6 @@ def repair(
 ) -> None:
     """Remove the failures of TARGET (specs/FILE.py:NAME) by a small change of its parameters."""
     from verifai_jax import repair as run_repair
-    from verifai_jax.core.messages.text import printable
 
     problem = arguments.load_problem(target)
     with kept_until_done() as kept:
@@ -63,7 +60,7 @@ def repair(
         )  # fmt: skip
         if estimate is not None:
             estimates = result.estimate(budget=estimate, seed=result.seed)
-            click.echo(printable(str(estimates)))
+            say(estimates)
             give_result(estimate_before=estimates.before, estimate_after=estimates.after)
         kept.stopped(result.stopped)
     if plot is not None:

@@ -3,12 +3,10 @@
 from pathlib import Path
 from typing import Any
 
-import click
-
 from verifai_jax.cli.arguments import PARAMETER_CHOICE, PATH, TARGET, load_problem, option
 from verifai_jax.cli.gates import Gate, check_gate, fail_on
 from verifai_jax.cli.going_on import kept_until_done
-from verifai_jax.cli.json_output import command, show_result
+from verifai_jax.cli.json_output import command, say, show_result
 
 
 @command()
@@ -42,5 +40,5 @@ def synthesize(
 
         with replacing(table) as partial:
             result.candidates.to_csv(partial, index=False)
-        click.echo(f"  candidates   {table}")
+        say(f"  candidates   {table}")
     check_gate(fail_on, {"unsafe": not result.holds})

@@ -3,12 +3,10 @@
 from pathlib import Path
 from typing import Any
 
-import click
-
 from verifai_jax.cli import arguments
 from verifai_jax.cli.arguments import PATH, option
 from verifai_jax.cli.gates import Gate, check_gate, fail_on
-from verifai_jax.cli.json_output import command, draw, give_result
+from verifai_jax.cli.json_output import command, draw, give_result, say
 
 
 @command()
@@ -38,15 +36,14 @@ def harden(
     """Train a policy of the study TARGET (FILE.py:NAME), train it on its failures, certify it."""
     from verifai_jax import Study
     from verifai_jax import harden as run
-    from verifai_jax.core.messages.text import printable
     from verifai_jax.core.user_code.targets import load_target
     from verifai_jax.statistics.confidence_sequences import safe_at
 
     study = load_target(target, Study)
     into = folder or Path("runs") / f"harden-{target.rpartition(':')[2]}"
     result = run(study, folder=into, **options)
-    click.echo(printable(str(result)))
-    click.echo(f"  policy       {into}")
+    say(result)
+    say(f"  policy       {into}")
     verdict = result.after.verdict
     give_result(
         problem=result.problem, table=result.table, verdict=verdict, stopped=result.stopped,

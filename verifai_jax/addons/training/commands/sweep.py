@@ -12,7 +12,7 @@ from verifai_jax.cli import arguments
 from verifai_jax.cli.arguments import PATH, option
 from verifai_jax.cli.exit_codes import BROKEN, CommandError
 from verifai_jax.cli.gates import Gate, check_gate, fail_on
-from verifai_jax.cli.json_output import command, draw, give_result
+from verifai_jax.cli.json_output import command, draw, give_result, say
 from verifai_jax.cli.next_folder import given_or_next
 
 if TYPE_CHECKING:
@@ -79,7 +79,6 @@ def sweep(
     """Train configurations of the study TARGET (specs/FILE.py:NAME), certify their policies."""
     from verifai_jax import Study
     from verifai_jax.addons.training.sweeps._sweep import sweep as run_sweep
-    from verifai_jax.core.messages.text import printable
     from verifai_jax.core.store.cache import cache_file
     from verifai_jax.core.user_code.targets import load_target, target_of_project
 
@@ -132,15 +131,15 @@ def sweep(
             )
             record = replace(result.record, options={**result.record.options, "target": target})
             result = replace(result, record=record)
-            click.echo(printable(str(result)))
+            say(result)
             if len(result.table):
-                click.echo(_format_table(result))
+                say(_format_table(result))
             result.save(folder)
     except KeyboardInterrupt:
         if folder is not None and cache_file(folder if cache is None else cache).exists():
-            click.echo(f"  resume       {_resuming(folder, target, cache, max_seconds, cluster)}")
+            say(f"  resume       {_resuming(folder, target, cache, max_seconds, cluster)}")
         raise
-    click.echo(f"  table        {folder / 'table.parquet'}")
+    say(f"  table        {folder / 'table.parquet'}")
     give_result(
         study=study.name,
         target=target,
@@ -153,7 +152,7 @@ def sweep(
     if pictures and record.certified:
         draw(result, folder / "sweep.png")
     if not record.complete:
-        click.echo(f"  resume       {_resuming(folder, target, cache, max_seconds, cluster)}")
+        say(f"  resume       {_resuming(folder, target, cache, max_seconds, cluster)}")
     elif all(status not in ("trained", "stopped") for status in result.table["status"]):
         raise CommandError("no configuration was trained, so nothing is known of any", BROKEN)
     check_gate(fail_on, {"unsafe": not len(result.safe)})

@@ -76,7 +76,8 @@ def sweep(
     - `batch`: configurations in a round of a search that learns.
     - `episodes`: number of episodes over which the nominal return is averaged.
     - `folder`: the folder that caches finished work; passing it again resumes an interrupted sweep.
-    - `max_seconds`: wall-clock limit; no training begins after two thirds of it.
+    - `max_seconds`: wall-clock limit; no training begins after two thirds of it, and the call of a
+      training function that has not ended by then is ended, as an error of its row.
     - `progress`: True draws bars, False none; None draws them on a terminal and in a notebook.
     - `note`: plain data that is stored in the folder next to the work.
     - `callbacks`: functions called for each policy when its return is known, and again when its

@@ -7,6 +7,7 @@ clock.seconds["training"]
 """
 
 import contextlib
+import math
 import time
 from collections import defaultdict
 from collections.abc import Iterator
@@ -24,7 +25,8 @@ class OutOfTime(Exception):
 class Clock:
     """Times the stages of a sweep, as a context manager.
 
-    `seconds` are the seconds spent in each stage; compilation is not counted in training.
+    `seconds` are the seconds spent in each stage; compilation is not counted in training. `limit`
+    is the instant of `time.monotonic` at which the present stage is out of time.
 
     **Arguments:**
     - `name`: the name of the sweep, shown before the progress bar.
@@ -35,9 +37,9 @@ class Clock:
     def __init__(self, name: str, max_seconds: float | None, show: bool | None) -> None:
         self.name, self._bar = name, ProgressBar(show)
         self.seconds: dict[str, float] = defaultdict(float)
-        self._began = time.perf_counter()
-        self._until = None if max_seconds is None else self._began + max_seconds
-        self._limit = self._until
+        self._began = time.monotonic()
+        self._until = math.inf if max_seconds is None else self._began + max_seconds
+        self.limit = self._until
 
     def __enter__(self) -> "Clock":
         self._bar.__enter__()
@@ -55,15 +57,14 @@ class Clock:
         - `total`: number of units of work in it, and `unit`, their name.
         - `share`: the share of `max_seconds` after which the stage is out of time.
         """
-        began, compiling = time.perf_counter(), self.seconds[COMPILING]
-        if self._until is not None:
-            self._limit = self._began + share * (self._until - self._began)
+        began, compiling = time.monotonic(), self.seconds[COMPILING]
+        self.limit = self._began + share * (self._until - self._began)
         self._bar.begin(f"{self.name}: {name}", total, unit)
         try:
             yield
         finally:
             compiled = self.seconds[COMPILING] - compiling
-            self.seconds[name] += time.perf_counter() - began - compiled
+            self.seconds[name] += time.monotonic() - began - compiled
             self._bar.end()
 
     def advance(self, amount: float, figures: str = "") -> None:
@@ -80,5 +81,5 @@ class Clock:
 
     def check(self) -> None:
         """Raise `OutOfTime` if the time of this stage is over."""
-        if self._limit is not None and time.perf_counter() >= self._limit:
+        if time.monotonic() >= self.limit:
             raise OutOfTime

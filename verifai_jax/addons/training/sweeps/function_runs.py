@@ -1,11 +1,13 @@
-"""Trainings by a user's function, with each call in a separate process.
+"""Trainings by a user's function, each call in one of the processes of a pool.
 
     runs = FunctionRuns(study, cache, clock)
     runs.train([runs.add(values, seed=0)], rung=0)
 
-Each process is new and its global random numbers are seeded, so a policy depends only on the
-arguments of the call. A function with an argument `resume` gets a folder with a copy of the files
-that it left at the previous checkpoint; the original stays until the call has ended and is stored.
+Global random numbers are seeded before each call, so a policy depends only on the arguments of the
+call, unless the function keeps something else for the next. A call that hangs, crashes or exits is
+a row, as a simulation is. A function with an argument `resume` gets a folder with a copy of the
+files that it left at the previous checkpoint; the original stays until the call has ended and is
+stored.
 """
 
 import json
@@ -16,7 +18,7 @@ import sys
 import tempfile
 import time
 import weakref
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any, cast
@@ -59,7 +61,12 @@ class FunctionRuns(TrainingRuns):
         if executor is not None:
             check_executor(executor)
         self._trainer = cast(FunctionTrainer, study.trainer)
-        self._workers = executor
+        self._submit = None if executor is None else executor.submit
+        trainer = self._trainer
+        self._train = partial(train_once, trainer.train, trainer.observation)
+        workers = trainer.workers or available_cores()
+        self._pool = Pool(self._train, trainer.train, workers, trainer.timeout, retries=0)
+        self._faults: dict[Hashable, str] = {}
         self.starts: dict[int, Any] = {}
         """For a function with an argument `starts`, what it gets of a training, by its number."""
         if cache.path is None:
@@ -90,7 +97,7 @@ class FunctionRuns(TrainingRuns):
                 self._recall(number, at)
                 if (number, at) in self._checkpoints:
                     self._advanced(number, at)
-                else:
+                elif number not in self.errors:
                     waiting.append(number)
             if waiting:
                 self._call(waiting, at)
@@ -111,7 +118,6 @@ class FunctionRuns(TrainingRuns):
             if number in self.starts:
                 calls[-1]["starts"] = self.starts[number]
         seeds = [self.runs[number].seed for number in numbers]
-        train = partial(train_once, self._trainer.train, self._trainer.observation)
 
         def ended(index: int, result: "Arrays | str") -> None:
             number = numbers[index]
@@ -119,18 +125,18 @@ class FunctionRuns(TrainingRuns):
                 self.errors[number] = one_line(result)
             else:
                 self._end(number, at, result)
-            self.clock.check()
 
-        if self._workers is not None:
-            submit = self._workers.submit
+        if self._submit is not None:
             pairs = zip(calls, seeds, strict=True)
-            gather([submit(attempt, train, call, seed) for call, seed in pairs], ended)
-            return
-        workers = min(self._trainer.workers or available_cores(), len(calls))
-        pool = Pool(train, self._trainer.train, workers, None, retries=0, fresh=True)
-        for index, outcome in pool.outcomes(calls, seeds):
-            made = cast("Arrays", outcome.trace)
-            ended(index, made if outcome.status == Status.OK else outcome.message)
+            futures = [self._submit(attempt, self._train, call, seed) for call, seed in pairs]
+            gather(futures, ended, check=self.clock.check)
+        else:
+            for index, outcome in self._pool.outcomes(calls, seeds, self.clock.limit):
+                if outcome.status == Status.OK:
+                    ended(index, cast("Arrays", outcome.trace))
+                elif outcome.message:  # Others had not begun when the time was over.
+                    ended(index, outcome.message.replace("the simulation", "the training"))
+        self.clock.check()
 
     def _begin(self, number: int, at: int) -> Path:
         """Make the folder of a call, with what the call before it left."""
@@ -168,13 +174,15 @@ class FunctionRuns(TrainingRuns):
         plain = {name: np.nan_to_num(array) for name, array in held.items()}
         graph, weights, start = read_graph(json.loads(bytes(arrays["graph"])), plain, what)
         policy = Policy(jax.device_get(weights), graph, jax.device_get(start))
-        if (why := self._why_not_of_the_form(policy)) is not None:
+        why = self._why_not_of_the_form(policy) or self._why_not_simulated(policy)
+        if why:
             self.errors.setdefault(number, why)
+            return
         curve = Curve(arrays["steps"], arrays["mean_return"])
         seconds = float(arrays["seconds"])
         self._checkpoints[number, rung] = RunCheckpoint(policy, finite, curve, seconds)
 
-    def _why_not_of_the_form(self, policy: Policy) -> str | None:
+    def _why_not_of_the_form(self, policy: Policy) -> str:
         """Say that actions have another shape than those of the example, which fits the problem."""
         example = self._trainer.untrained_policy("")
         seen = policy.compute.example(policy.weights)  # pyright: ignore[reportFunctionMemberAccess]
@@ -183,13 +191,25 @@ class FunctionRuns(TrainingRuns):
                 jax.eval_shape(partial(_first_action, each), seen) for each in (policy, example)
             )
         except Exception:  # The example may be of other observations.
-            return None
+            return ""
         if made.shape == wanted.shape:
-            return None
+            return ""
         return (
             f"the trained policy returns actions of shape {list(made.shape)}, and example= of the "
             f"trainer, with which the problem was checked, of shape {list(wanted.shape)}"
         )
+
+    def _why_not_simulated(self, policy: Policy) -> str:
+        """Say that the problem cannot be simulated with a policy; asked once for each form."""
+        leaves, form = jax.tree.flatten(policy)
+        key = form, tuple((np.shape(leaf), np.asarray(leaf).dtype) for leaf in leaves)
+        if key not in self._faults:
+            self._faults[key] = ""
+            try:
+                self.study.problem(cast(Any, policy)).check()
+            except Exception as error:
+                self._faults[key] = one_line(str(error))
+        return self._faults[key]
 
 
 ARRAY = "array/"

@@ -26,7 +26,7 @@ from verifai_jax.addons.rl.policies import policy as load
 from verifai_jax.addons.rl.ppo import PPO
 from verifai_jax.addons.rl.task.task import Task
 from verifai_jax.addons.training.sweeps.hyperparameters import companions, probe_values
-from verifai_jax.core.messages.checks import check_count, is_number
+from verifai_jax.core.messages.checks import check_count, check_positive, is_number
 from verifai_jax.core.messages.errors import unknown_name
 from verifai_jax.features import FeatureSpace
 from verifai_jax.systems.policy import Policy
@@ -54,8 +54,10 @@ class Trainer:
     receives the random key of the training seed, a dictionary of plain values, and the total number
     of environment steps. `resume` is a folder, empty at first: files written there at one
     checkpoint are there again when the function is called for the next. A function without this
-    argument trains from the start up to each checkpoint. It returns anything that `vj.policy`
-    accepts, or `(policy, {"steps": [...], "mean_return": [...]})` with its learning curve.
+    argument trains from the start up to each checkpoint. Processes are used again for other calls,
+    so nothing that a call leaves in global variables may matter. It returns anything that
+    `vj.policy` accepts, or `(policy, {"steps": [...], "mean_return": [...]})` with its learning
+    curve.
 
     **Arguments:**
     - `task`: the task to learn, see `rl.Task`; if it is a dataclass its fields may be swept. Or a
@@ -71,6 +73,8 @@ class Trainer:
     - `observation`: for a training function, an example observation if its policies do not define
       their input, such as functions and flax modules.
     - `workers`: for a training function, number of processes; by default the number of cores.
+    - `timeout`: for a training function, maximum seconds of a call; a longer one is an error of its
+      row.
     **Raises:** `StudyError` if there is no algorithm, for anything that is not an algorithm or
     task, a number of steps that is not positive, or a nominal task with other actions or
     observations.
@@ -83,6 +87,7 @@ class Trainer:
     example: Any = None
     observation: Any = None
     workers: int | None = None
+    timeout: float | None = None
 
     def __new__(cls, task: object = None, *arguments: object, **options: object) -> "Trainer":
         """Make the trainer of a function where `task` is one."""
@@ -90,7 +95,7 @@ class Trainer:
         return object.__new__(FunctionTrainer if cls is Trainer and is_function else cls)
 
     def __post_init__(self) -> None:
-        for name in ("example", "observation", "workers"):
+        for name in ("example", "observation", "workers", "timeout"):
             if getattr(self, name) is not None:
                 raise StudyError(f"{name} belongs to a function that trains, not to a task")
         given = self.algorithms
@@ -310,6 +315,8 @@ class FunctionTrainer(Trainer):
             raise StudyError(f"nominal must be a task; got {type(self.nominal).__name__}")
         if self.workers is not None:
             check_count("workers", self.workers, error=StudyError)
+        if self.timeout is not None:
+            check_positive("timeout", self.timeout)
         names = inspect.signature(self.train).parameters
         anything = any(p.kind is p.VAR_KEYWORD for p in names.values())
         if "steps" not in names and not anything:
