@@ -24,8 +24,9 @@ from verifai_jax.core.display.extensions import extension
 from verifai_jax.core.messages.text import one_line
 from verifai_jax.core.store import files
 from verifai_jax.core.store.files import DamagedError
-from verifai_jax.core.store.locks import write_lock
+from verifai_jax.core.store.locks import settled, write_lock
 from verifai_jax.core.store.log import Log, write_log
+from verifai_jax.core.store.replacements import replacing_all
 from verifai_jax.core.user_code.sources import Sources
 from verifai_jax.falsification.derived import as_simulated
 from verifai_jax.falsification.run import Run
@@ -76,7 +77,7 @@ def save_run(run: Run, folder: Path) -> Path:
             _write(run, folder)
         else:
             names = (TAIL, SEGMENTS, FAILURES, FINISHED, STATE, RECORD)
-            with files.replacing_all(folder, names) as made:
+            with replacing_all(folder, names) as made:
                 _write(run, made)
     return folder
 
@@ -243,7 +244,7 @@ def read_record(folder: Path) -> dict[str, Any]:
     **Raises:** `FileNotFoundError` if there is none; `DamagedError` for one that is damaged. Both
     errors name the files of the rows, which are not affected.
     """
-    file = folder / RECORD
+    file = settled(folder) / RECORD
     if not file.is_file():
         raise FileNotFoundError(f"no run in {folder}: {RECORD} is missing{_rows_alongside(folder)}")
     try:

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from verifai_jax.core.store.files import write_complete
+from verifai_jax.core.store.locks import settled
 from verifai_jax.core.store.log import Log, write_log
 from verifai_jax.falsification import segments
 from verifai_jax.falsification.columns import (
@@ -157,7 +158,7 @@ class ErrorTable(TableView):
         **Raises:** `FileNotFoundError` if there is none; `TableError` for a `table.parquet` that is
         damaged, or a column that is missing or holds values of a wrong type.
         """
-        if not cls.exists(folder):
+        if not cls.exists(settled(folder)):
             raise FileNotFoundError(
                 f"no error table in {folder}: neither {FINISHED} nor {SEGMENTS}/ nor {TAIL}"
             )

@@ -5,17 +5,14 @@ write_record(path, {"seed": 0})
 read_record(path)                               # DamagedError, where it has changed since
 """
 
-import contextlib
 import json
-import shutil
-import tempfile
 import zlib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from verifai_jax.core.messages.text import one_line
-from verifai_jax.core.store.atomic_files import replacing, unwritable
+from verifai_jax.core.store.atomic_files import replacing
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -46,35 +43,6 @@ def write_complete(path: Path, content: "pa.Buffer | bytes", locked: bool = True
     with replacing(path, locked=locked) as partial:
         partial.write_bytes(content)
     return path
-
-
-@contextlib.contextmanager
-def replacing_all(folder: Path, names: Sequence[str]) -> Iterator[Path]:
-    """Yield a folder for files that replace those in `folder` together when all are complete.
-
-    If the disk is full, the old files stay and no new one remains.
-
-    **Arguments:**
-    - `folder`: an existing folder without another writer.
-    - `names`: the names of all files and folders that belong together, including optional ones. The
-      last is the one without which the others are useless: it is removed first and written last.
-    **Raises:** `OSError` that names `folder`, if the file system refuses.
-    """
-    *others, last = names
-    try:
-        with tempfile.TemporaryDirectory(prefix=".part-", dir=folder) as made:
-            yield Path(made)
-            for name in (last, *others):
-                old = folder / name
-                if old.is_dir() and not old.is_symlink():
-                    shutil.rmtree(old)
-                else:
-                    old.unlink(missing_ok=True)
-            for name in (*others, last):
-                if (new := Path(made) / name).exists():
-                    new.replace(folder / name)
-    except OSError as error:
-        raise unwritable(folder, error, "The results are still in memory") from error
 
 
 def write_record(path: Path, record: Mapping[str, Any], locked: bool = True) -> dict[str, Any]:

@@ -23,7 +23,8 @@ from verifai_jax.addons.training.sweeps.record import Curve, SweepRecord, Traine
 from verifai_jax.core.messages.text import one_line
 from verifai_jax.core.store import files
 from verifai_jax.core.store.files import DamagedError, checksum, plain
-from verifai_jax.core.store.locks import write_lock
+from verifai_jax.core.store.locks import settled, write_lock
+from verifai_jax.core.store.replacements import replacing_all
 from verifai_jax.core.user_code.sources import Sources
 from verifai_jax.features import FeatureSpace
 from verifai_jax.systems.policy import Policy, save_policy
@@ -72,9 +73,8 @@ def write_sweep(stored: StoredSweep, table: "pd.DataFrame", folder: Path) -> Pat
     **Raises:** `FolderInUse` if another process writes there; `OSError` if the file system refuses,
     in which case the old content stays.
     """
-    # The record comes last: a folder without it holds no sweep.
     names = (TABLE, FAILING, CURVES, POLICIES, RECORD)
-    with write_lock(folder), files.replacing_all(folder, names) as made:
+    with write_lock(folder), replacing_all(folder, names) as made:
         _write_files(stored, table, made)
     return folder
 
@@ -128,7 +128,7 @@ def read_description(folder: Path) -> dict[str, Any]:
 
     **Raises:** `FileNotFoundError` for a folder without one; `SweepFileError` for a damaged file.
     """
-    file = folder / RECORD
+    file = settled(folder) / RECORD
     if not file.exists():
         raise FileNotFoundError(f"no sweep in {folder}: {RECORD} is missing")
     try:
