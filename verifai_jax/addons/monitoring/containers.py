@@ -18,6 +18,9 @@ import numpy as np
 from verifai_jax.addons.monitoring.stamps import find_clock, unit_in_name
 from verifai_jax.core.messages.errors import MissingExtra, require
 from verifai_jax.core.messages.text import counted, one_line
+from verifai_jax.core.store.foreign_archives import check_values
+from verifai_jax.core.store.foreign_archives import read_parquet as read_parquet_file
+from verifai_jax.core.store.foreign_files import open_file
 
 Table: TypeAlias = Any
 """An Arrow table, whose package has no types."""
@@ -78,7 +81,7 @@ def _follow_each_other(files: Sequence[Path]) -> bool:
     reader, spans = require("mcap.reader", EXTRA), []
     for each in files:
         try:
-            with open(each, "rb") as file:
+            with open_file(each) as file:
                 about = reader.make_reader(file).get_summary().statistics
                 spans.append((about.message_start_time, about.message_end_time))
         except (require("mcap.exceptions", EXTRA).McapError, AttributeError):
@@ -91,7 +94,7 @@ def _messages(path: Path, notes: dict[str, int]) -> Iterator[tuple[Any, Any, Any
     reader = require("mcap.reader", EXTRA)
     fault, count = require("mcap.exceptions", EXTRA).McapError, 0
     try:
-        with open(path, "rb") as file:
+        with open_file(path) as file:
             for each in reader.make_reader(file).iter_messages():
                 count += 1
                 yield each
@@ -101,7 +104,7 @@ def _messages(path: Path, notes: dict[str, int]) -> Iterator[tuple[Any, Any, Any
             raise ValueError(f"{path} cannot be read: {error}") from None
         damage = error
     try:
-        with open(path, "rb") as file:
+        with open_file(path) as file:
             for each in reader.NonSeekingReader(file).iter_messages(log_time_order=False):
                 count += 1
                 yield each
@@ -216,7 +219,11 @@ def read_dataset(path: Path, time: str) -> list[Table]:
     try:
         # Versions of xarray differ in the units of the times that they make.
         opened = xarray.open_zarr if store else xarray.open_dataset
+        if not store:
+            open_file(path).close()
         with opened(path, decode_times=False) as dataset:
+            for name, variable in dataset.variables.items():
+                check_values(variable.size, f"{name} of {path}")
             return list(_dimensions(dataset, time))
     except (ImportError, ValueError) as error:
         require("netCDF4", EXTRA)
@@ -251,11 +258,12 @@ def read_hdf5(path: Path, time: str) -> list[Table]:
 
     def visit(name: str, item: Any) -> None:
         if getattr(item, "ndim", 0) in (1, 2) and item.dtype.kind in "biuf":
+            check_values(item.size, f"{name} of {path}")
             found[name] = item[()]
             said = item.attrs.get("units", item.attrs.get("unit", ""))
             units[name] = said.decode() if isinstance(said, bytes) else str(said)
 
-    with require("h5py", EXTRA).File(path, "r") as file:
+    with open_file(path) as opened, require("h5py", EXTRA).File(opened, "r") as file:
         file.visititems(visit)
     groups: dict[str, list[str]] = {}
     for name in found:
@@ -283,10 +291,8 @@ def lerobot_files(folder: Path) -> list[Path]:
 
 def episodes_of(files: Sequence[Path]) -> Iterator[Episode]:
     """Yield the episodes in data files of a LeRobot data set."""
-    from pyarrow import parquet
-
     for file in files:
-        numbers = parquet.read_table(file, columns=[EPISODE]).column(EPISODE).unique()
+        numbers = read_parquet_file(file, [EPISODE]).column(EPISODE).unique()
         yield from (Episode(file, number) for number in sorted(numbers.to_pylist()))
 
 
@@ -296,9 +302,9 @@ def read_parquet(path: Path, time: str, episode: int | None) -> list[Table]:
     **Raises:** `ValueError` for a file of several episodes if none is named, and for an episode
     that it does not contain.
     """
-    from pyarrow import compute, parquet
+    from pyarrow import compute
 
-    table = parquet.read_table(path)
+    table = read_parquet_file(path)
     if not {EPISODE, FRAME, STAMP} <= set(table.column_names):
         if episode is not None:
             raise ValueError(f"{path} has no episodes: it lacks the columns of a LeRobot data set")

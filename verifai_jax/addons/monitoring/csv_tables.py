@@ -11,6 +11,7 @@ from typing import Any
 
 from verifai_jax.addons.monitoring.columns import GAPS, TRUTHS, is_numeric
 from verifai_jax.addons.monitoring.containers import UNIT, Table
+from verifai_jax.core.store.foreign_files import read_bytes
 from verifai_jax.mtl.units import NONE
 
 NUMBER = re.compile(r'^\s*"?[-+]?[.,]?\d')
@@ -25,7 +26,7 @@ def read_csv(path: Path, notes: dict[str, int]) -> Table:
     """Read a CSV file as an Arrow table with any separator of columns and decimals."""
     from pyarrow import csv
 
-    data = path.read_bytes()
+    data = read_bytes(path)
     if data[:2] in (b"\xff\xfe", b"\xfe\xff"):
         data = data.decode("utf-16").encode()
     with io.TextIOWrapper(io.BytesIO(data), encoding="utf-8-sig", errors="replace") as file:

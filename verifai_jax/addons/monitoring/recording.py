@@ -19,6 +19,7 @@ from verifai_jax.addons.monitoring.containers import UNIT, Episode, Table
 from verifai_jax.addons.monitoring.csv_tables import read_csv
 from verifai_jax.addons.monitoring.stamps import apart, find_clock, seconds_of
 from verifai_jax.core.messages.errors import missing_name
+from verifai_jax.core.store.foreign_archives import read_arrays
 from verifai_jax.core.values.trace import Trace
 
 if TYPE_CHECKING:
@@ -278,13 +279,11 @@ def _read_arrays(path: Path) -> Any:
     import pyarrow
 
     columns = {}
-    with np.load(path, allow_pickle=False) as arrays:
-        for name in arrays.files:
-            array = arrays[name]
-            if array.ndim not in (1, 2):
-                shape = f"must have shape [time] or [time, k]; got {list(array.shape)}"
-                raise ValueError(f"array {name!r} of {path} {shape}")
-            columns[name] = containers.matrix_column(array)
+    for name, array in read_arrays(path, str(path)).items():
+        if array.ndim not in (1, 2):
+            shape = f"must have shape [time] or [time, k]; got {list(array.shape)}"
+            raise ValueError(f"array {name!r} of {path} {shape}")
+        columns[name] = containers.matrix_column(array)
     return pyarrow.table(columns)
 
 

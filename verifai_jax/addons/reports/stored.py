@@ -3,7 +3,6 @@
 result = read_result(Path("estimate.json"))     # an Estimate, a Comparison or a Verification
 """
 
-import json
 from collections.abc import Collection, Mapping
 from dataclasses import MISSING, fields
 from pathlib import Path
@@ -11,6 +10,7 @@ from typing import Any
 
 from verifai_jax.core.display.extensions import extension, extensions
 from verifai_jax.core.messages.text import one_line
+from verifai_jax.core.store.foreign_files import ForeignFileError, read_json
 from verifai_jax.core.user_code.sources import Sources
 from verifai_jax.features import FeatureSpace
 
@@ -25,8 +25,10 @@ def read_result(file: Path, space: FeatureSpace | None = None) -> Any:
     **Raises:** `FileNotFoundError` if there is no such file; `ValueError` for other content.
     """
     try:
-        data = json.loads(file.read_text(encoding="utf-8"))
-    except (ValueError, RecursionError):
+        data = read_json(file)
+    except ForeignFileError:
+        raise
+    except ValueError:
         data = None
     kind = data.get("kind", data.get("command")) if isinstance(data, dict) else None
     if not isinstance(kind, str) or kind not in extensions(READERS):

@@ -100,7 +100,9 @@ def _open(path: str, flags: int) -> int:
 
 def _remove_leftovers(folder: Path) -> None:
     """Remove the temporary files in a folder that nobody has locked."""
-    for name in filter(_PARTIAL.fullmatch, os.listdir(folder) if fcntl is not None else ()):
+    if fcntl is None:
+        return
+    for name in filter(_PARTIAL.fullmatch, os.listdir(folder)):
         with contextlib.suppress(OSError), io.FileIO(folder / name, "r+", opener=_open) as file:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
             (folder / name).unlink()

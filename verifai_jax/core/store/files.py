@@ -11,8 +11,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from verifai_jax.core.messages.text import one_line
 from verifai_jax.core.store.atomic_files import replacing
+from verifai_jax.core.store.foreign_files import read_json
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -64,12 +64,12 @@ def read_record(path: Path) -> dict[str, Any]:
     record, or whose content has changed.
     """
     try:
-        record = json.loads(path.read_text())
+        record = read_json(path, within=path.parent)
     except FileNotFoundError:
         raise
-    except (ValueError, RecursionError, OSError) as error:
-        why = f"it cannot be read as JSON ({one_line(str(error))})"
-        raise DamagedError(f"{path} is damaged, or of another program: {why}") from error
+    except (ValueError, OSError) as error:
+        why = str(error).removeprefix(f"{path} ")
+        raise DamagedError(f"{path} is damaged, or of another program: it {why}") from error
     if not isinstance(record, dict) or _CHECKSUM not in record:
         raise DamagedError(f"{path} is damaged, or of another program: it has no checksum")
     own = record.pop(_CHECKSUM)

@@ -96,7 +96,8 @@ def _acquire(folder: Path) -> FileIO | None:
     try:
         file = held(folder / LOCK)
     except BlockingIOError:
-        with FileIO(folder / LOCK) as other:
+        owner = ""
+        with contextlib.suppress(OSError), FileIO(folder / LOCK) as other:
             owner = other.read(200).decode(errors="replace")
         raise FolderInUse(_in_use(folder, owner)) from None
     if file is not None:

@@ -77,7 +77,7 @@ def test_an_archive_that_unpacks_to_gigabytes(tmp_path):
         with archive.open("data", "w", force_zip64=True) as file:
             for _ in range(200):
                 file.write(bytes(1_000_000))
-    with pytest.raises(PolicyError, match="unpacks to 200 MB, and a policy may have 150 MB"):
+    with pytest.raises(PolicyError, match="unpacks to 200 MB; at most 150 MB are read"):
         policy(tmp_path / "bomb.zip")
 
 
@@ -162,10 +162,11 @@ def test_tensors_are_read_from_the_folder_of_the_model_only(tmp_path):
         file = graph([helper.make_node("Add", ["x", "w"], ["y"])], tmp_path / "far.onnx", [tensor])
         with pytest.raises(PolicyError, match=message):
             policy(file)
-    (tmp_path / "apart").mkdir()
-    (tmp_path / "weights.bin").rename(tmp_path / "apart" / "weights.bin")
-    (tmp_path / "weights.bin").symlink_to(tmp_path / "apart" / "weights.bin")
-    with pytest.raises(PolicyError, match=r"weights\.bin is a link to another folder"):
+    apart = tmp_path.with_name(f"{tmp_path.name}.apart")
+    apart.mkdir()
+    (tmp_path / "weights.bin").rename(apart / "weights.bin")
+    (tmp_path / "weights.bin").symlink_to(apart / "weights.bin")
+    with pytest.raises(PolicyError, match=r"weights\.bin is a link out of"):
         policy(file)
     (tmp_path / "weights.bin").unlink()
     (tmp_path / "weights.bin").write_bytes(np.float32([1, 2]).tobytes())

@@ -18,6 +18,7 @@ from verifai_jax.addons.native.native_code import machine_code
 from verifai_jax.addons.native.native_code.source import OTHERS, PRELUDE
 from verifai_jax.core.compute.remembered import remembered_as
 from verifai_jax.core.store.atomic_files import replacing
+from verifai_jax.core.store.foreign_files import read_bytes
 
 FLAGS = (
     "-std=c++11", "-march=native", "-ffp-contract=fast",
@@ -112,8 +113,8 @@ def load(name: str, count: int, translate: Callable[[], str], quickly: bool = Fa
 def is_approved(name: str) -> bool | None:
     """Return whether a library agrees with XLA, as stored by `approve`; None if unknown."""
     try:
-        return {"yes": True, "no": False}.get(
-            (machine_code.library_folder() / f"{name}.agrees").read_text()
+        return {b"yes": True, b"no": False}.get(
+            read_bytes(machine_code.library_folder() / f"{name}.agrees")
         )
     except (OSError, machine_code.Unavailable):
         return None

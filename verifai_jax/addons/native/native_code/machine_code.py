@@ -16,6 +16,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from verifai_jax.core.compute.devices import cache_folder
+from verifai_jax.core.store.foreign_files import read_bytes
 
 COMPILERS = ("c++", "g++", "clang++")
 """Names under which a compiler is looked for."""
@@ -83,7 +84,7 @@ def library_folder() -> Path:
 def _is_whole(path: Path) -> bool:
     """Return whether a library has the content that its name says."""
     try:
-        return path.stem.endswith(f"-{_checksum(path.read_bytes())}")
+        return path.stem.endswith(f"-{_checksum(read_bytes(path))}")
     except OSError:
         return False
 
@@ -112,7 +113,7 @@ def compile_library(folder: Path, name: str, source: str, flags: tuple[str, ...]
         if done.returncode != 0 or not made.is_file():
             said = done.stderr.decode(errors="replace").strip().splitlines() or ["it said nothing"]
             raise Unavailable(f"{tool} failed: {said[0][:200]}")
-        path = folder / f"{name}-{_checksum(made.read_bytes())}.so"
+        path = folder / f"{name}-{_checksum(read_bytes(made))}.so"
         # At once, or not at all: another process may be compiling the same.
         os.replace(made, path)
         return path

@@ -11,7 +11,6 @@ The files never name code: pass the study to `load_sweep(folder, study)`.
 """
 
 import json
-import zipfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -23,6 +22,8 @@ from verifai_jax.addons.training.sweeps.record import Curve, SweepRecord, Traine
 from verifai_jax.core.messages.text import one_line
 from verifai_jax.core.store import files
 from verifai_jax.core.store.files import DamagedError, checksum, plain
+from verifai_jax.core.store.foreign_archives import read_arrays, read_parquet
+from verifai_jax.core.store.foreign_files import read_bytes
 from verifai_jax.core.store.locks import settled, write_lock
 from verifai_jax.core.store.replacements import replacing_all
 from verifai_jax.core.user_code.sources import Sources
@@ -110,7 +111,7 @@ def _write_files(stored: StoredSweep, table: "pd.DataFrame", folder: Path) -> No
         "worst": record.worst,
         "space": _space_to_json(stored.space),
         "checksums": {
-            file.relative_to(folder).as_posix(): checksum(file.read_bytes())
+            file.relative_to(folder).as_posix(): checksum(read_bytes(file))
             for file in _files(folder, record.rows)
         },
     }
@@ -162,16 +163,14 @@ def read_sweep(description: Mapping[str, Any], folder: Path) -> StoredSweep:
     - `description`: the description of the folder, from `read_description`.
     **Raises:** `SweepFileError` if a file is missing or damaged.
     """
-    import pandas as pd
-
     try:
         _check_files(folder, description["checksums"])
         used = {name: tuple(names) for name, names in description["used"].items()}
         record, space = _read_record(folder, description), _space_from_json(description["space"])
-        return StoredSweep(record, space, used, pd.read_parquet(folder / FAILING))
+        return StoredSweep(record, space, used, read_parquet(folder / FAILING).to_pandas())
     except FileNotFoundError as error:
         raise SweepFileError(f"the sweep in {folder} is incomplete: {error}") from error
-    except (KeyError, TypeError, ValueError, OSError, zipfile.BadZipFile) as error:
+    except (KeyError, TypeError, ValueError, OSError) as error:
         reason = one_line(str(error))
         raise SweepFileError(f"the sweep in {folder} is damaged: {reason}") from error
 
@@ -181,7 +180,9 @@ def _check_files(folder: Path, checksums: Mapping[str, int]) -> None:
     for name, own in checksums.items():
         file = folder / name
         optional = name.startswith(f"{POLICIES}/")
-        if not (optional and not file.exists()) and checksum(file.read_bytes()) != own:
+        if optional and not file.exists():
+            continue
+        if checksum(read_bytes(file, within=folder)) != own:
             hint = "; the rest can be read without this file" if optional else ""
             raise SweepFileError(f"{name} has changed since it was written{hint}")
 
@@ -189,7 +190,7 @@ def _check_files(folder: Path, checksums: Mapping[str, int]) -> None:
 def _read_record(folder: Path, description: Mapping[str, Any]) -> SweepRecord:
     import pandas as pd
 
-    table = pd.read_parquet(folder / TABLE)
+    table = read_parquet(folder / TABLE).to_pandas()
     rows = description["rows"]
     if len(table) != rows or len(description["worst"]) != rows:
         raise SweepFileError(
@@ -198,12 +199,12 @@ def _read_record(folder: Path, description: Mapping[str, Any]) -> SweepRecord:
     for name in description["mixed"]:
         table[name] = pd.Series([json.loads(v) for v in table[name]], table.index, dtype=object)
     curves: dict[tuple[int, int], Curve] = {}
-    with np.load(folder / CURVES, allow_pickle=False) as arrays:
-        for name in arrays.files:
-            configuration, seed, part = name.split("/")
-            if part == "steps":
-                returns = arrays[f"{configuration}/{seed}/mean_return"]
-                curves[int(configuration), int(seed)] = Curve(arrays[name], returns)
+    arrays = read_arrays(folder / CURVES, CURVES)
+    for name, steps in arrays.items():
+        configuration, seed, part = name.split("/")
+        if part == "steps":
+            returns = arrays[f"{configuration}/{seed}/mean_return"]
+            curves[int(configuration), int(seed)] = Curve(steps, returns)
     policies: list[TrainedPolicy | None] = []
     for i in range(len(table)):
         file = folder / POLICIES / f"{i}.npz"
