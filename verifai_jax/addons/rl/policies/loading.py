@@ -220,7 +220,7 @@ def _of_weights(tensors: Tensors, mlp: _MlpOptions, normalised: bool) -> Policy:
             f"network=function(weights, observation); it has {listed(tensors)}"
         )
     if network is not None:
-        arrays = {n: jnp.asarray(a) for n, a in tensors.items() if n not in tensors.used}
+        arrays = {n: jnp.asarray(tensors.peek(n)) for n in tensors if n not in tensors.used}
         return Policy(arrays, _Given(network, what))
     assert activation is not None
     try:

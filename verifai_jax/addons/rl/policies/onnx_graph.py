@@ -242,10 +242,7 @@ def read_onnx(
         if re.search("(unsupported|inconsistent) type|input size", str(error)):
             wrong = one_line(str(error))
     nodes = reader.nodes(graph, {*arrays, *(i.name for i in fed)}, {})
-    used = [n for node in nodes if node.operator in _WEIGHTED for n in node.inputs if n in arrays]
-    for name in used:
-        if not np.all(np.isfinite(np.asarray(arrays[name], np.float32))):
-            raise PolicyError(f"the tensor {name!r} of {what} holds infinite weights")
+    _check_finite(nodes, arrays, what)
     types = {i.name: i.type.tensor_type.elem_type for i in fed}
     wrong = wrong or next((f"type {t} of {n!r}" for n, t in types.items() if t not in TYPES), "")
     if wrong:
@@ -289,9 +286,18 @@ def read_graph(data: Mapping[str, Any], arrays: Mapping[str, np.ndarray], what: 
         if array.dtype.kind not in "fiub" or np.any(np.isnan(array)):
             raise PolicyError(f"the array {name!r} of {what} holds NaN, or no numbers")
     check_nodes(nodes, {*arrays, *inputs}, [output, *(after for _, after in memory)], what)
+    _check_finite(nodes, arrays, what)
     rest = {n: a for n, a in arrays.items() if n not in dict(memory)}
     weights, constants = _sorted_out(rest)
     return Graph(nodes, constants, inputs, memory, output), weights, start
+
+
+def _check_finite(nodes: Sequence[Node], arrays: Mapping[str, np.ndarray], what: str) -> None:
+    """Refuse weights that are infinite; other constants, such as bounds, may be."""
+    used = {n for node in nodes if node.operator in _WEIGHTED for n in node.inputs if n in arrays}
+    for name in sorted(used):
+        if not np.all(np.isfinite(np.asarray(arrays[name], np.float32))):
+            raise PolicyError(f"the tensor {name!r} of {what} holds infinite weights")
 
 
 def check_nodes(nodes: Sequence[Node], known: set[str], outputs: Sequence[str], what: str) -> None:
