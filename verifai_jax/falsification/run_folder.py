@@ -10,7 +10,7 @@ entries. So it is noticed if one of the three files comes from another run or an
 
 import re
 import shlex
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
@@ -21,9 +21,9 @@ import numpy as np
 from jaxtyping import ArrayLike
 
 from verifai_jax.core.display.extensions import extension
-from verifai_jax.core.messages.text import one_line
+from verifai_jax.core.messages.text import format_error, one_line
 from verifai_jax.core.store import files
-from verifai_jax.core.store.files import DamagedError
+from verifai_jax.core.store.files import DamagedError, is_of
 from verifai_jax.core.store.locks import settled, write_lock
 from verifai_jax.core.store.log import Log, write_log
 from verifai_jax.core.store.replacements import replacing_all
@@ -108,6 +108,13 @@ def load(path: str | Path, problem: Problem | None = None) -> Run:
     folder = Path(path)
     record = read_record(folder)
     _check_entries(record, folder)
+    try:
+        return _as_recorded(folder, record, problem)
+    except (LookupError, TypeError, AttributeError, ArithmeticError) as error:
+        raise _of_another_form(folder, format_error(error)) from error
+
+
+def _as_recorded(folder: Path, record: Mapping[str, Any], problem: Problem | None) -> Run:
     features = tuple(record["features"])
     if problem is not None:
         problem = as_simulated(problem, record)
@@ -265,8 +272,17 @@ def _check_entries(record: Mapping[str, Any], folder: Path) -> None:
             f"{folder / RECORD} is of another version of verifai_jax, {version}, which can load "
             f"it: {names} is not in both{_rows_alongside(folder)}"
         )
+    kinds = {field.name: field.type for field in fields(Run)} | {"features": Sequence[str]}
+    if wrong := [name for name, value in record.items() if not is_of(value, kinds[name])]:
+        raise _of_another_form(folder, f"its {wrong[0]} cannot be {record[wrong[0]]!r}")
     for part in record["sources"]:
         Sources.from_json(part)
+
+
+def _of_another_form(folder: Path, why: str) -> DamagedError:
+    return DamagedError(
+        f"{folder / RECORD} is damaged: {one_line(why, 160)}{_rows_alongside(folder)}"
+    )
 
 
 def deciding_checksum(record: Mapping[str, Any]) -> int:

@@ -6,16 +6,21 @@ read_record(path)                               # DamagedError, where it has cha
 """
 
 import json
+import sys
 import zlib
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from types import UnionType
+from typing import TYPE_CHECKING, Any, Union, get_args, get_origin
 
+from verifai_jax.core.messages.checks import is_number
 from verifai_jax.core.store.atomic_files import replacing
 from verifai_jax.core.store.foreign_files import read_json
 
 if TYPE_CHECKING:
     import pyarrow as pa
+MAX_INTEGER = 2**63 - 1
+"""Greatest whole number of a record."""
 _CHECKSUM = "checksum"
 """Entry of a record with the checksum of the others."""
 
@@ -76,6 +81,25 @@ def read_record(path: Path) -> dict[str, Any]:
     if own != record_checksum(record):
         raise DamagedError(f"{path} is damaged: its content has changed since it was written")
     return record
+
+
+def is_of(value: object, kind: Any) -> bool:
+    """Return whether plain data fits an annotation: of numbers, texts, sequences and mappings."""
+    outer, inner = get_origin(kind), get_args(kind)
+    if outer in (Union, UnionType):
+        return any(is_of(value, each) for each in inner)
+    if kind in (int, float):
+        wanted = int if kind is int else int | float
+        most = MAX_INTEGER if kind is int else sys.float_info.max
+        # A number that is not one passes: nothing is known in its place.
+        return is_number(value) and isinstance(value, wanted) and not abs(value) > most
+    if outer is None:
+        return (
+            kind is Any or value is None if kind in (Any, type(None)) else isinstance(value, kind)
+        )
+    if issubclass(outer, Mapping):
+        return isinstance(value, dict) and all(is_of(each, inner[1]) for each in value.values())
+    return isinstance(value, list | tuple) and all(is_of(each, inner[0]) for each in value)
 
 
 def plain(value: object) -> Any:

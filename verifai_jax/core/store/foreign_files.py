@@ -173,8 +173,8 @@ def read_yaml(text: str) -> object:
     **Raises:** `ValueError` for anything else; `MissingExtra` without PyYAML.
     """
     yaml = require("yaml", "yaml")
-    loader = yaml.SafeLoader(text)
     try:
+        loader = yaml.SafeLoader(text)
         node = loader.get_single_node()
         check_shared(node, _yaml_parts, MAX_NODES, "its aliases stand for")
         return None if node is None else loader.construct_document(node)
@@ -182,8 +182,6 @@ def read_yaml(text: str) -> object:
         raise ValueError("its values are nested too deeply") from None
     except (yaml.YAMLError, ValueError, TypeError, AttributeError, OverflowError) as error:
         raise ValueError(" ".join(str(error).split())) from None
-    finally:
-        loader.dispose()
 
 
 def _yaml_parts(node: Any) -> list[Any]:
