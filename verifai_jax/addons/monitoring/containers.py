@@ -8,7 +8,6 @@ import itertools
 import json
 import operator
 import re
-import struct
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple, TypeAlias
@@ -17,7 +16,7 @@ import numpy as np
 
 from verifai_jax.addons.monitoring.stamps import find_clock, unit_in_name
 from verifai_jax.core.messages.errors import MissingExtra, require
-from verifai_jax.core.messages.text import counted, one_line
+from verifai_jax.core.messages.text import counted, format_error, one_line
 from verifai_jax.core.store.foreign_archives import check_values
 from verifai_jax.core.store.foreign_archives import read_parquet as read_parquet_file
 from verifai_jax.core.store.foreign_files import open_file
@@ -91,27 +90,26 @@ def _follow_each_other(files: Sequence[Path]) -> bool:
 
 def _messages(path: Path, notes: dict[str, int]) -> Iterator[tuple[Any, Any, Any]]:
     """Yield the messages of an MCAP file; of one that is damaged, those before the damage."""
-    reader = require("mcap.reader", EXTRA)
-    fault, count = require("mcap.exceptions", EXTRA).McapError, 0
+    reader, count = require("mcap.reader", EXTRA), 0
     try:
         with open_file(path) as file:
             for each in reader.make_reader(file).iter_messages():
                 count += 1
                 yield each
         return
-    except fault as error:
+    except Exception as error:  # Those of decompression are no McapError.
         if count:
-            raise ValueError(f"{path} cannot be read: {error}") from None
+            raise ValueError(f"{path} cannot be read: {one_line(str(error))}") from None
         damage = error
     try:
         with open_file(path) as file:
             for each in reader.NonSeekingReader(file).iter_messages(log_time_order=False):
                 count += 1
                 yield each
-    except (fault, struct.error, EOFError, AttributeError) as error:
+    except Exception as error:
         damage = error
     if not count:
-        raise ValueError(f"{path} cannot be read: {type(damage).__name__} {damage}")
+        raise ValueError(f"{path} cannot be read: {one_line(format_error(damage))}")
     notes[f"{path} is damaged or was cut: only its first {count} messages are read"] = 1
 
 

@@ -18,8 +18,10 @@ from verifai_jax.addons.monitoring.columns import LeftOut, numbers_of
 from verifai_jax.addons.monitoring.containers import UNIT, Episode, Table
 from verifai_jax.addons.monitoring.csv_tables import read_csv
 from verifai_jax.addons.monitoring.stamps import apart, find_clock, seconds_of
-from verifai_jax.core.messages.errors import missing_name
+from verifai_jax.core.messages.errors import MissingExtra, missing_name
+from verifai_jax.core.messages.text import format_error, one_line
 from verifai_jax.core.store.foreign_archives import read_arrays
+from verifai_jax.core.store.foreign_files import ForeignFileError
 from verifai_jax.core.values.trace import Trace
 
 if TYPE_CHECKING:
@@ -267,11 +269,18 @@ def _file_tables(path: Path, time: str, episode: int | None, notes: dict[str, in
             f"{path} cannot be read: the names of its columns are not UTF-8 ({error}); save it as "
             "UTF-8"
         ) from None
+    except ForeignFileError:
+        raise
     except (pyarrow.ArrowInvalid, OSError) as error:
         # A row with more cells than the first line has names is often one of decimal commas.
         advice = ". Decimal commas need semicolons between the columns"
         advice = advice if "Expected" in str(error) else ""
-        raise ValueError(f"{path} cannot be read: {error}{advice}") from None
+        why = one_line(str(error), 400).removeprefix(f"{path} ")
+        raise ValueError(f"{path} cannot be read: {why}{advice}") from None
+    except (ValueError, MissingExtra):
+        raise
+    except Exception as error:  # Those of the libraries that read bytes.
+        raise ValueError(f"{path} cannot be read: {one_line(format_error(error))}") from None
 
 
 def _read_arrays(path: Path) -> Any:

@@ -15,6 +15,7 @@ from pathlib import Path
 from xml.etree.ElementTree import Element
 
 from verifai_jax.core.messages.errors import missing_name
+from verifai_jax.core.messages.text import one_line
 from verifai_jax.core.store.foreign_archives import open_archive, read_member
 from verifai_jax.core.store.foreign_files import read_xml
 
@@ -191,6 +192,11 @@ def read_description(file: str | Path, exchange: bool | None = None) -> Descript
         )
     token = root.get("guid") if version == "2" else root.get("instantiationToken")
     states = len(root.findall("ModelStructure/Derivatives/Unknown"))
+    try:
+        variables = _variables(root, int(version))
+        indicators = int(root.get("numberOfEventIndicators", "0"))
+    except ValueError as error:
+        raise ValueError(f"{what} is damaged: {one_line(str(error))}") from None
     kind, two = there[exchange], version == "2"
 
     def says(attribute: str) -> bool:
@@ -198,8 +204,8 @@ def read_description(file: str | Path, exchange: bool | None = None) -> Descript
 
     return Description(
         path, int(version), root.get("modelName", path.stem),
-        kind.get("modelIdentifier", ""), token or "", _variables(root, int(version)),
-        exchange, (states, int(root.get("numberOfEventIndicators", "0"))),
+        kind.get("modelIdentifier", ""), token or "", variables,
+        exchange, (states, indicators),
         says("canHandleVariableCommunicationStepSize") or exchange,
         says("canGetAndSetFMUstate" if two else "canGetAndSetFMUState"),
         says("canBeInstantiatedOnlyOncePerProcess"),
