@@ -8,13 +8,14 @@ such a file says about sizes is checked before anything of that size is made.
 """
 
 import codecs
+import io
 import json
 import os
 import stat
 import tomllib
 from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 from xml.etree import ElementTree
 from xml.etree.ElementTree import Element
 from xml.parsers import expat
@@ -52,7 +53,9 @@ class ForeignFileError(OSError, ValueError):
     """An error for a file that is not regular, too large, damaged, or in another folder."""
 
 
-def open_file(path: str | Path, most: int = MAX_LENGTH, within: Path | None = None) -> BinaryIO:
+def open_file(
+    path: str | Path, most: int = MAX_LENGTH, within: Path | None = None
+) -> io.BufferedReader:
     """Open a regular file for reading bytes.
 
     **Arguments:**
