@@ -17,6 +17,8 @@ READS = {
 METHODS = {"read_text", "read_bytes", "open"}
 ALLOWED = {
     "systems/blackbox/worker_process.py": "the pipe to the process that has started it",
+    "core/user_code/source_collection.py": "the user's own program",
+    "core/user_code/user_files.py": "regular files that the user has named",
     "search/sobol.py": "a file of SciPy",
     "core/compute/devices.py": "/proc/cpuinfo",
     "addons/native/native_code/library.py": "/proc/cpuinfo",

@@ -90,9 +90,9 @@ def is_of(value: object, kind: Any) -> bool:
         return any(is_of(value, each) for each in inner)
     if kind in (int, float):
         wanted = int if kind is int else int | float
-        most = MAX_INTEGER if kind is int else sys.float_info.max
+        limit = MAX_INTEGER if kind is int else sys.float_info.max
         # A number that is not one passes: nothing is known in its place.
-        return is_number(value) and isinstance(value, wanted) and not abs(value) > most
+        return is_number(value) and isinstance(value, wanted) and not abs(value) > limit
     if outer is None:
         return (
             kind is Any or value is None if kind in (Any, type(None)) else isinstance(value, kind)

@@ -31,27 +31,29 @@ def check_values(count: int, what: str) -> None:
 
 
 def open_archive(
-    source: bytes | Path, what: str, most: int = MAX_BYTES, within: Path | None = None
+    source: bytes | Path, what: str, max_bytes: int = MAX_BYTES, within: Path | None = None
 ) -> zipfile.ZipFile:
     """Open an archive, given as its content or its path.
 
     **Arguments:**
-    - `most`: maximum bytes, also when it is unpacked.
+    - `max_bytes`: maximum bytes, also when it is unpacked.
     **Raises:** `ForeignFileError` for anything else; the errors of `open_file`.
     """
-    data = source if isinstance(source, bytes) else read_bytes(source, most, within)
+    data = source if isinstance(source, bytes) else read_bytes(source, max_bytes, within)
     try:
         archive = zipfile.ZipFile(io.BytesIO(data))
     except Exception as error:  # Bytes can be wrong in any way.
         why = one_line(str(error))
         raise ForeignFileError(f"{what} is not an archive, or is damaged: {why}") from error
-    if (size := sum(entry.file_size for entry in archive.infolist())) > most:
-        size, most = size // 10**6, most // 10**6
-        raise ForeignFileError(f"{what} unpacks to {size:,} MB; at most {most:,} MB are read")
+    if (size := sum(entry.file_size for entry in archive.infolist())) > max_bytes:
+        size, max_bytes = size // 10**6, max_bytes // 10**6
+        raise ForeignFileError(f"{what} unpacks to {size:,} MB; at most {max_bytes:,} MB are read")
     return archive
 
 
-def read_member(archive: zipfile.ZipFile, name: str, what: str, most: int = MAX_BYTES) -> bytes:
+def read_member(
+    archive: zipfile.ZipFile, name: str, what: str, max_bytes: int = MAX_BYTES
+) -> bytes:
     """Return the bytes of a member of an archive, at most so many.
 
     **Raises:** `ForeignFileError` for one that is missing or damaged, or larger than stated.
@@ -59,22 +61,24 @@ def read_member(archive: zipfile.ZipFile, name: str, what: str, most: int = MAX_
     try:
         with archive.open(name) as file:
             size = archive.getinfo(name).file_size
-            data = file.read(min(size, most) + 1)
+            data = file.read(min(size, max_bytes) + 1)
     except Exception as error:
         raise ForeignFileError(f"{what} has no readable {name}: {one_line(str(error))}") from error
-    if len(data) > min(size, most):
-        raise ForeignFileError(f"{name} of {what} is longer than stated, or than {most:,} bytes")
+    if len(data) > min(size, max_bytes):
+        raise ForeignFileError(
+            f"{name} of {what} is longer than stated, or than {max_bytes:,} bytes"
+        )
     return data
 
 
 def read_arrays(
-    source: bytes | Path, what: str, most: int = MAX_BYTES, within: Path | None = None
+    source: bytes | Path, what: str, max_bytes: int = MAX_BYTES, within: Path | None = None
 ) -> dict[str, np.ndarray]:
     """Return the arrays of an `.npz` archive by name; nothing in it is unpickled.
 
     **Raises:** as `open_archive`, and `ForeignFileError` for a member that is not an array.
     """
-    archive, arrays = open_archive(source, what, most, within), {}
+    archive, arrays = open_archive(source, what, max_bytes, within), {}
     for member in archive.namelist():
         data, name = read_member(archive, member, what), member.removesuffix(".npy")
         try:

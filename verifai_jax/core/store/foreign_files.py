@@ -54,12 +54,12 @@ class ForeignFileError(OSError, ValueError):
 
 
 def open_file(
-    path: str | Path, most: int = MAX_LENGTH, within: Path | None = None
+    path: str | Path, max_bytes: int = MAX_LENGTH, within: Path | None = None
 ) -> io.BufferedReader:
     """Open a regular file for reading bytes.
 
     **Arguments:**
-    - `most`: maximum size in bytes.
+    - `max_bytes`: maximum size in bytes.
     - `within`: a folder out of which no link may lead; None follows all links.
     **Raises:** `ForeignFileError` for anything else; `OSError` of the file system.
     """
@@ -75,22 +75,22 @@ def open_file(
         if stat.S_ISREG(mode):
             raise
         number = None
-    if number is not None and stat.S_ISREG(mode) and size <= most:
+    if number is not None and stat.S_ISREG(mode) and size <= max_bytes:
         return os.fdopen(number, "rb")
     if number is not None:
         os.close(number)
     if not stat.S_ISREG(mode):
         kind = _KINDS.get(stat.S_IFMT(mode), "no file")
         raise ForeignFileError(f"{path} is {kind}; give a regular file")
-    raise ForeignFileError(f"{path} has {size:,} bytes; at most {most:,} are read")
+    raise ForeignFileError(f"{path} has {size:,} bytes; at most {max_bytes:,} are read")
 
 
-def read_bytes(path: str | Path, most: int = MAX_BYTES, within: Path | None = None) -> bytes:
+def read_bytes(path: str | Path, max_bytes: int = MAX_BYTES, within: Path | None = None) -> bytes:
     """Read a regular file.
 
     **Raises:** as `open_file`.
     """
-    with open_file(path, most, within) as file:
+    with open_file(path, max_bytes, within) as file:
         return file.read(os.fstat(file.fileno()).st_size)
 
 
@@ -147,12 +147,12 @@ def read_xml(data: bytes, name: str) -> Element:
         raise ValueError(f"{name} is not XML: {error}") from None
 
 
-def read_json(path: str | Path, most: int = MAX_BYTES, within: Path | None = None) -> Any:
+def read_json(path: str | Path, max_bytes: int = MAX_BYTES, within: Path | None = None) -> Any:
     """Read JSON.
 
     **Raises:** `ValueError` for anything else; the errors of `open_file`.
     """
-    data = read_bytes(path, most, within)
+    data = read_bytes(path, max_bytes, within)
     try:
         return json.loads(data)
     except (ValueError, RecursionError) as error:
@@ -193,7 +193,11 @@ def _yaml_parts(node: Any) -> list[Any]:
 
 
 def check_shared(
-    root: Any, parts: Callable[[Any], Iterable[Any]], most: int, what: str, cycles: bool = False
+    root: Any,
+    parts: Callable[[Any], Iterable[Any]],
+    max_count: int,
+    what: str,
+    cycles: bool = False,
 ) -> None:
     """Refuse a value that has too many values when each that it shares is written out.
 
@@ -207,10 +211,10 @@ def check_shared(
 
     def count(value: Any) -> int:
         if id(value) not in known:
-            known[id(value)] = 0 if cycles else most
+            known[id(value)] = 0 if cycles else max_count
             known[id(value)] = total = 1 + sum(map(count, parts(value)))
-            if total > most:
-                raise ForeignFileError(f"{what} more than {most:,} values")
+            if total > max_count:
+                raise ForeignFileError(f"{what} more than {max_count:,} values")
         return known[id(value)]
 
     count(root)

@@ -24,7 +24,6 @@ from pathlib import Path
 from types import CodeType, FunctionType, MethodType, ModuleType
 from typing import Any, NamedTuple
 
-from verifai_jax.core.store.foreign_files import read_bytes
 from verifai_jax.core.user_code.sources import (
     CALLER,
     DECLARED,
@@ -210,7 +209,7 @@ def _find(name: str, folders: Sequence[str]) -> tuple[str | None, list[str]]:
 def _imported_names(file: str, package: str, changed: int) -> tuple[str, ...]:
     """Return the absolute names in the import statements of a program; none if it is not Python."""
     try:
-        tree = ast.parse(read_bytes(file))
+        tree = ast.parse(Path(file).read_bytes())
     except (SyntaxError, ValueError, RecursionError):
         return ()
     names: list[str] = []

@@ -13,8 +13,6 @@ from collections.abc import Iterable
 from functools import cache, lru_cache
 from pathlib import Path
 
-from verifai_jax.core.store.foreign_files import open_file
-
 PACKAGE = Path(__file__).resolve().parents[2]
 """Folder of this package."""
 FENCE = "VERIFAI_JAX_FENCE"
@@ -75,5 +73,5 @@ def declared_files(files: Iterable[str | Path]) -> dict[str, str]:
 
 @lru_cache(maxsize=4096)
 def _hash(file: str, changed: int, size: int, number: int) -> str:
-    with open_file(file) as opened:
+    with open(file, "rb") as opened:
         return hashlib.file_digest(opened, "sha256").hexdigest()
