@@ -15,6 +15,7 @@ import pytest
 from mutated import altered, flipped, wrong_answers
 
 import verifai_jax as vj
+from verifai_jax.addons.assurance.odd_files import read_odd
 from verifai_jax.addons.assurance.traceability.tested import read_cases
 from verifai_jax.addons.monitoring.recording import read
 from verifai_jax.addons.rl.policies import policy
@@ -26,7 +27,23 @@ JUNIT = """<testsuites><testsuite name="s"><testcase classname="a.b" name="t">
 <properties><property name="vj_simulations" value="7"/></properties><failure message="no"/>
 </testcase></testsuite></testsuites>"""
 ODD = """TAXONOMY:
-  road: {type: enum}
+  scenery:
+    road_type: [motorway, street, lane]
+  dynamic:
+    ego_speed: float velocity
+ODD:
+  town:
+    INCLUDE_AND:
+      road_type: [street, lane]
+      ego_speed: "[0 .. 54] km/h"
+    EXCLUDE_AND:
+      road_type: lane
+"""
+BINDING = """openodd: [odd.yaml]
+name: streets
+features:
+  speed: {attribute: dynamic.ego_speed, unit: m/s, reason: limit of the town, source: StVO 3}
+  road: {attribute: road_type}
 """
 
 
@@ -36,10 +53,6 @@ def load(path):
         loaded = policy(path, activation="elu" if path.suffix in (".pt", ".safetensors") else None)
         with np.load(POLICIES / f"{path.stem}.expected.npz") as known:
             jax.eval_shape(loaded.act, jnp.asarray(known["observations"][0]))
-
-
-def ramp(features, key):
-    return vj.Trace({"x": features["a"] * jnp.linspace(0, 1, 5)}, dt=0.25)
 
 
 def columns():
@@ -77,9 +90,9 @@ def write_mcap(path):
         made.finish()
 
 
-def write_estimate(path):
-    problem = vj.Problem("ramp", {"a": vj.Box(0, 1)}, ramp, "always x <= 0.9")
-    path.write_text(json.dumps(vj.estimate(problem, 64, progress=False).to_json()))
+def write_domain(path):
+    path.write_text(BINDING)
+    path.with_name("odd.yaml").write_text(ODD)
 
 
 DOORS = {
@@ -94,6 +107,7 @@ DOORS = {
     "drive.nc": (write_netcdf, read),
     "drive.mcap": (write_mcap, read),
     "watch.fmu": (lambda path: vj.mtl.export_fmu("x > 0", 0.1, path), read_description),
+    "streets.yaml": (write_domain, read_odd),
     "results.xml": (lambda path: path.write_text(JUNIT), lambda path: read_cases([path])),
 }
 """Valid files: what writes one, or None where there is one already, and what reads it."""

@@ -13,6 +13,7 @@ The files never name code: pass the study to `load_sweep(folder, study)`.
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from reprlib import repr as shown
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -44,6 +45,14 @@ POLICIES = "policies"
 """Folder of the policies."""
 _PLAIN = ("study", "seed", "hyperparameters", "certified", "options", "version", "seconds")
 """Fields of the record that are plain data."""
+_KINDS: dict[str, Any] = {
+    "study": str, "seed": int, "version": str, "complete": bool, "rows": int,
+    "hyperparameters": list[str], "mixed": list[str], "certified": list[int],
+    "options": dict[str, Any], "seconds": dict[str, float], "checksums": dict[str, int],
+    "used": dict[str, list[str]], "worst": list[dict[str, Any] | None],
+    "sources": list[dict[str, Any]], "space": dict[str, Any] | None,
+}  # fmt: skip
+"""What the entries of the record are."""
 
 
 class SweepFileError(ValueError):
@@ -133,9 +142,16 @@ def read_description(folder: Path) -> dict[str, Any]:
     if not file.exists():
         raise FileNotFoundError(f"no sweep in {folder}: {RECORD} is missing")
     try:
-        return files.read_record(file)
+        found = files.read_record(file)
     except DamagedError as error:
         raise SweepFileError(str(error)) from error
+    for name, kind in _KINDS.items():
+        if not files.is_of(found.get(name), kind):
+            value = shown(found.get(name))
+            raise SweepFileError(f"{file} is damaged: its {name} cannot be {value}")
+    if not files.is_of(found["options"].get("p"), float | None):
+        raise SweepFileError(f"{file} is damaged: its p cannot be {shown(found['options']['p'])}")
+    return found
 
 
 def check_study(
@@ -170,7 +186,7 @@ def read_sweep(description: Mapping[str, Any], folder: Path) -> StoredSweep:
         return StoredSweep(record, space, used, read_parquet(folder / FAILING).to_pandas())
     except FileNotFoundError as error:
         raise SweepFileError(f"the sweep in {folder} is incomplete: {error}") from error
-    except (KeyError, TypeError, ValueError, OSError) as error:
+    except (KeyError, TypeError, ValueError, AttributeError, OSError) as error:
         reason = one_line(str(error))
         raise SweepFileError(f"the sweep in {folder} is damaged: {reason}") from error
 
@@ -196,6 +212,8 @@ def _read_record(folder: Path, description: Mapping[str, Any]) -> SweepRecord:
         raise SweepFileError(
             f"the sweep in {folder} is damaged: {len(table)} rows in {TABLE}, {rows} in {RECORD}"
         )
+    if absent := {*description["hyperparameters"]} - {*table.columns}:
+        raise SweepFileError(f"{TABLE} has no column {min(absent)!r}")
     for name in description["mixed"]:
         table[name] = pd.Series([json.loads(v) for v in table[name]], table.index, dtype=object)
     curves: dict[tuple[int, int], Curve] = {}
