@@ -18,8 +18,10 @@ import verifai_jax as vj
 from verifai_jax.addons.assurance.odd_files import read_odd
 from verifai_jax.addons.assurance.traceability.tested import read_cases
 from verifai_jax.addons.monitoring.recording import read
+from verifai_jax.addons.reports.stored import read_result
 from verifai_jax.addons.rl.policies import policy
 from verifai_jax.addons.simulators.fmu.description import read_description
+from verifai_jax.cli.json_output import as_plain
 
 FEW, MANY = 40, 500
 POLICIES = Path(__file__).parent / "rl" / "policies" / "files"
@@ -95,6 +97,12 @@ def write_domain(path):
     path.with_name("odd.yaml").write_text(ODD)
 
 
+def write_estimate(path):
+    found = vj.Estimate("it", 0.1, 0.05, 0.2, 0.95, "monte_carlo", 50, 90, 6, 0, 0.4, 50, 6, 0)
+    about = {"command": "estimate", "version": "0.1.0"}
+    path.write_text(json.dumps({**about, **as_plain(found)}))
+
+
 DOORS = {
     "ppo.zip": (None, load),
     "mlp.onnx": (None, load),
@@ -108,6 +116,7 @@ DOORS = {
     "drive.mcap": (write_mcap, read),
     "watch.fmu": (lambda path: vj.mtl.export_fmu("x > 0", 0.1, path), read_description),
     "streets.yaml": (write_domain, read_odd),
+    "estimate.json": (write_estimate, lambda path: str(read_result(path))),
     "results.xml": (lambda path: path.write_text(JUNIT), lambda path: read_cases([path])),
 }
 """Valid files: what writes one, or None where there is one already, and what reads it."""
@@ -140,7 +149,8 @@ def check(name, tmp_path, count):
     for seed in range(count):
         rng = np.random.default_rng(seed)
         zipped = zipfile.is_zipfile(io.BytesIO(content)) and rng.integers(4)
-        path.write_bytes((rezipped if zipped else flipped)(content, rng))
+        of_json = path.suffix == ".json" and rng.integers(4)
+        path.write_bytes((rezipped if zipped else altered if of_json else flipped)(content, rng))
         if why := wrong_answers(lambda: read_it(path)):
             wrong.append(f"{seed}: {why}")
     assert not wrong, "\n".join(wrong)

@@ -10,6 +10,7 @@ from typing import Any
 
 from verifai_jax.core.display.extensions import extension, extensions
 from verifai_jax.core.messages.text import one_line
+from verifai_jax.core.store.files import is_of
 from verifai_jax.core.store.foreign_files import ForeignFileError, read_json
 from verifai_jax.core.user_code.sources import Sources
 from verifai_jax.features import FeatureSpace
@@ -37,7 +38,7 @@ def read_result(file: Path, space: FeatureSpace | None = None) -> Any:
         )
     try:
         return extension(READERS, kind)(file, data, space)
-    except (KeyError, TypeError, AttributeError) as error:
+    except (LookupError, TypeError, AttributeError, ArithmeticError) as error:
         raise ValueError(
             f"{file} is damaged: {one_line(str(error))} is missing, or of another form"
         ) from None
@@ -59,8 +60,7 @@ def values_of(kind: type, data: Mapping[str, Any], null: Collection[str] = ()) -
         value = data[field.name]
         if value is None and field.name not in null:
             raise KeyError(field.name)
-        wanted = {int: int, float: (int, float), str: str}.get(field.type)
-        if wanted is not None and value is not None and not isinstance(value, wanted):
+        if value is not None and not is_of(value, field.type):
             raise TypeError(field.name)
         values[field.name] = value
     return values
