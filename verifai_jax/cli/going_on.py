@@ -52,9 +52,9 @@ class Kept:
 def kept_until_done() -> Iterator[Kept]:
     """Keep the simulations of the present command until it reports that it is done.
 
-    If nothing can be written, or the same command is running, nothing is kept.
+    If nothing can be written, or the same command is running, nothing is kept, and a note says so.
     """
-    from verifai_jax.core.display.progress import goes_on_with
+    from verifai_jax.core.display.progress import goes_on_with, write_line
     from verifai_jax.evaluation.unfinished import keeping
 
     context = click.get_current_context()
@@ -66,9 +66,11 @@ def kept_until_done() -> Iterator[Kept]:
     try:
         with contextlib.ExitStack() as held:
             kept = None
-            with contextlib.suppress(ValueError):
+            try:
                 kept = held.enter_context(keeping(folder, work))
                 held.enter_context(goes_on_with(command_line(), lambda: True))
+            except ValueError as error:
+                write_line(f"note: goes on without keeping what is finished: {error}")
             try:
                 yield Kept(kept)
             except KeyboardInterrupt:

@@ -187,4 +187,5 @@ def describe_run(run: Any) -> dict[str, Any]:
         "table": run.table_path,
         "notes": run.notes,
         "damage": run.damage,
+        **run._more_findings(),
     }

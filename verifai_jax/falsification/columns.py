@@ -31,7 +31,7 @@ def import_tables() -> None:
 
 def length(columns: Columns) -> int:
     """Return the number of rows of a batch."""
-    return len(columns["rho"])
+    return len(next(iter(columns.values()), ()))
 
 
 def cut(batch: Batch, begin: int, stop: int) -> Batch:

@@ -436,6 +436,10 @@ class Run(InNotebook):
         """
         return lazy_import("verifai_jax.falsification.run_folder", "save_run")(self, Path(path))
 
+    def _more_findings(self) -> dict[str, Any]:
+        """Return what a run of another verb has found besides, as plain data."""
+        return {}
+
     def _notebook_parts(self) -> Iterator[str]:
         yield from self.table._notebook_parts()
 

@@ -10,7 +10,7 @@ entries. So it is noticed if one of the three files comes from another run or an
 
 import re
 import shlex
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
@@ -21,11 +21,12 @@ import numpy as np
 from jaxtyping import ArrayLike
 
 from verifai_jax.core.display.extensions import extension
-from verifai_jax.core.messages.text import one_line
+from verifai_jax.core.messages.text import format_error, one_line
 from verifai_jax.core.store import files
-from verifai_jax.core.store.files import DamagedError
-from verifai_jax.core.store.locks import write_lock
+from verifai_jax.core.store.files import DamagedError, is_of
+from verifai_jax.core.store.locks import settled, write_lock
 from verifai_jax.core.store.log import Log, write_log
+from verifai_jax.core.store.replacements import replacing_all
 from verifai_jax.core.user_code.sources import Sources
 from verifai_jax.falsification.derived import as_simulated
 from verifai_jax.falsification.run import Run
@@ -76,7 +77,7 @@ def save_run(run: Run, folder: Path) -> Path:
             _write(run, folder)
         else:
             names = (TAIL, SEGMENTS, FAILURES, FINISHED, STATE, RECORD)
-            with files.replacing_all(folder, names) as made:
+            with replacing_all(folder, names) as made:
                 _write(run, made)
     return folder
 
@@ -107,6 +108,13 @@ def load(path: str | Path, problem: Problem | None = None) -> Run:
     folder = Path(path)
     record = read_record(folder)
     _check_entries(record, folder)
+    try:
+        return _as_recorded(folder, record, problem)
+    except (LookupError, TypeError, AttributeError, ArithmeticError) as error:
+        raise _of_another_form(folder, format_error(error)) from error
+
+
+def _as_recorded(folder: Path, record: Mapping[str, Any], problem: Problem | None) -> Run:
     features = tuple(record["features"])
     if problem is not None:
         problem = as_simulated(problem, record)
@@ -243,7 +251,7 @@ def read_record(folder: Path) -> dict[str, Any]:
     **Raises:** `FileNotFoundError` if there is none; `DamagedError` for one that is damaged. Both
     errors name the files of the rows, which are not affected.
     """
-    file = folder / RECORD
+    file = settled(folder) / RECORD
     if not file.is_file():
         raise FileNotFoundError(f"no run in {folder}: {RECORD} is missing{_rows_alongside(folder)}")
     try:
@@ -264,8 +272,17 @@ def _check_entries(record: Mapping[str, Any], folder: Path) -> None:
             f"{folder / RECORD} is of another version of verifai_jax, {version}, which can load "
             f"it: {names} is not in both{_rows_alongside(folder)}"
         )
+    kinds = {field.name: field.type for field in fields(Run)} | {"features": Sequence[str]}
+    if wrong := [name for name, value in record.items() if not is_of(value, kinds[name])]:
+        raise _of_another_form(folder, f"its {wrong[0]} cannot be {record[wrong[0]]!r}")
     for part in record["sources"]:
         Sources.from_json(part)
+
+
+def _of_another_form(folder: Path, why: str) -> DamagedError:
+    return DamagedError(
+        f"{folder / RECORD} is damaged: {one_line(why, 160)}{_rows_alongside(folder)}"
+    )
 
 
 def deciding_checksum(record: Mapping[str, Any]) -> int:

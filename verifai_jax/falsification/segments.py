@@ -23,6 +23,7 @@ from jaxtyping import Int
 
 from verifai_jax.core.messages.text import format_error, printable
 from verifai_jax.core.store.files import DamagedError, checksum, write_complete
+from verifai_jax.core.store.foreign_files import read_bytes
 from verifai_jax.core.store.log import Arrays, Log
 from verifai_jax.falsification.columns import ROW, Columns, column_to_arrow, to_arrow
 
@@ -67,7 +68,7 @@ class Segment:
     def damage(self) -> str:
         """Describe how the file differs from what was written; empty if it does not."""
         try:
-            own = checksum(self.path.read_bytes())
+            own = checksum(self._read())
         except OSError as error:
             return printable(format_error(error), 300)
         return "" if self._is_of(own) else "its bytes have changed"
@@ -78,10 +79,12 @@ class Segment:
 
         **Raises:** `TableError` for a file that is damaged.
         """
+        import pyarrow as pa
         import pyarrow.parquet as pq
 
         try:
-            return tuple(name for name in pq.read_schema(self.path).names if name != ROW)
+            names = pq.read_schema(pa.BufferReader(self._read())).names
+            return tuple(name for name in names if name != ROW)
         except Exception as error:
             raise damaged(self.path, error) from error
 
@@ -94,7 +97,7 @@ class Segment:
         import pyarrow.parquet as pq
 
         try:
-            content = self.path.read_bytes()
+            content = self._read()
             if not self._is_of(checksum(content)):
                 raise TableError(f"{self.path} is damaged: its bytes have changed")
             names = None if columns is None else [ROW, *columns]
@@ -114,6 +117,9 @@ class Segment:
                 return others.read()
         frame = self.read()
         return frame.iloc[standing_out({str(name): frame[name].to_numpy() for name in frame})]
+
+    def _read(self) -> bytes:
+        return read_bytes(self.path, within=self.path.parents[1])
 
     def _is_of(self, own: int) -> bool:
         return self.path.name.endswith(f"-{own:08x}.parquet")

@@ -16,6 +16,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from verifai_jax.core.store.files import write_complete
+from verifai_jax.core.store.foreign_archives import read_parquet
+from verifai_jax.core.store.locks import settled
 from verifai_jax.core.store.log import Log, write_log
 from verifai_jax.falsification import segments
 from verifai_jax.falsification.columns import (
@@ -157,7 +159,7 @@ class ErrorTable(TableView):
         **Raises:** `FileNotFoundError` if there is none; `TableError` for a `table.parquet` that is
         damaged, or a column that is missing or holds values of a wrong type.
         """
-        if not cls.exists(folder):
+        if not cls.exists(settled(folder)):
             raise FileNotFoundError(
                 f"no error table in {folder}: neither {FINISHED} nor {SEGMENTS}/ nor {TAIL}"
             )
@@ -293,13 +295,8 @@ class ErrorTable(TableView):
 
 
 def _read_finished(path: Path) -> "pd.DataFrame":
-    import pyarrow.parquet as pq
-
-    if not path.is_file():
-        # Pandas would read a folder as a table of the files in it.
-        raise TableError(f"{path} is damaged: it is not a file")
     try:
-        frame = pq.read_table(path, page_checksum_verification=True).to_pandas()
+        frame = read_parquet(path, within=path.parent).to_pandas()
     except PermissionError:
         raise
     except Exception as error:  # Bytes can be wrong in any way.

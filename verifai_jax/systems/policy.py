@@ -28,6 +28,7 @@ from verifai_jax.core.messages.checks import check_count, is_number
 from verifai_jax.core.messages.errors import check_names
 from verifai_jax.core.messages.text import one_line
 from verifai_jax.core.store.atomic_files import replacing
+from verifai_jax.core.store.foreign_archives import read_arrays
 from verifai_jax.core.user_code.source_collection import made_here, sources_of
 from verifai_jax.systems.actions import Action, Continuous, Discrete
 
@@ -346,8 +347,7 @@ def _plain_data(path: str | Path, name: str) -> dict[str, Any]:
 
 def _read(path: str | Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     try:
-        with np.load(path, allow_pickle=False) as file:
-            arrays = {name: file[name] for name in file.files}
+        arrays = read_arrays(Path(path), str(path))
         about = json.loads(str(arrays.pop("about")))
         if not isinstance(about, dict):
             raise ValueError("its description of itself is not an object")

@@ -115,6 +115,10 @@ class Variable(SimpleNamespace):
     def ndim(self):
         return self.values.ndim
 
+    @property
+    def size(self):
+        return self.values.size
+
 
 def dataset(**variables):
     coordinates = {k: v for k, v in variables.items() if k == v.dims[0]}
@@ -151,6 +155,7 @@ def test_data_sets_of_hdf5_have_the_times_of_their_group(tmp_path, double):
         ndim = property(lambda self: self.values.ndim)
         dtype = property(lambda self: self.values.dtype)
         shape = property(lambda self: self.values.shape)
+        size = property(lambda self: self.values.size)
 
         def __getitem__(self, key):
             return self.values

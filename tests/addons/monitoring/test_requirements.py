@@ -191,7 +191,7 @@ def test_encodings_and_separators(tmp_path, encoding, text):
         ("a.csv", b'id,formula\nA,"x" < 1\n', "a.csv is not CSV"),
         ("a.csv", b"id,formula\nA," + b"x" * 200_000, "a.csv is not CSV: field larger"),
         ("a.csv", b"", "a.csv has no requirement"),
-        ("a.toml", b"a = " + b"[" * 5000, "a.toml is nested too deeply"),
+        ("a.toml", b"a = " + b"[" * 5000, "a.toml is not TOML: its values are nested"),
         ("a.toml", b"[[requirement]]\nid" + b".a" * 5000 + b" = 1", "id must be a text; got {'a'"),
         ("a.yaml", b"requirements: " + b"[" * 3000, "a.yaml is nested too deeply|is not YAML"),
         ("a.yaml", b"requirements: [{id: A}]\nconstants: [1]", "constants must be a table of"),

@@ -78,7 +78,7 @@ def test_files_of_another_kind(tmp_path):
         Cache(tmp_path, "augmentation").claim({"seeds": 3})
     file.unlink()
     file.mkdir()
-    with pytest.raises(CacheError, match=r"sweep\.cache is damaged: it is not a file"):
+    with pytest.raises(CacheError, match=r"sweep\.cache is damaged: it is a folder"):
         Cache(tmp_path)
 
 

@@ -122,7 +122,7 @@ def test_a_forged_log_is_damaged_in_words(tmp_path):
         assert dict(Log(path).entries()).keys() <= {"b"}
     path.unlink()
     path.mkdir()
-    with pytest.raises(DamagedError, match=r"a\.log is damaged: it is not a file"):
+    with pytest.raises(DamagedError, match=r"a\.log is damaged: it is a folder"):
         Log(path).names()
 
 

@@ -28,6 +28,8 @@ import click
 from verifai_jax._version import __version__
 from verifai_jax.cli.exit_codes import CommandError
 from verifai_jax.cli.json_output import output_to_errors
+from verifai_jax.core.store.atomic_files import replacing
+from verifai_jax.core.store.foreign_files import read_text
 from verifai_jax.core.user_code.user_files import FENCE
 
 VERSIONS = ("2025-11-25", "2025-06-18", "2025-03-26", "2024-11-05")
@@ -330,7 +332,6 @@ class Server:
         path = self.folder / OWN / f"{name}.py"
         if not path.resolve().is_relative_to(self.folder):
             raise Refused(f"{OWN} leads out of the folder of this server")
-        path.parent.mkdir(exist_ok=True)
         text = (
             "from dataclasses import replace\n\nimport verifai_jax as vj\n"
             "from verifai_jax.core.user_code.targets import load_target\n\n"
@@ -339,9 +340,10 @@ class Server:
             f"    spec={{{name!r}: {values['formula']!r}}},\n"
             "    priority=None,\n    requirements=None,\n)\ndel base\n"
         )
-        if path.exists() and path.read_text(encoding="utf-8") != text:
+        if path.exists() and read_text(path) != text:
             raise Refused(f"there is another problem {name!r} in {OWN}: take another name")
-        path.write_text(text, encoding="utf-8")
+        with replacing(path) as partial:
+            partial.write_text(text, encoding="utf-8")
         return f"{OWN}/{name}.py:{name}"
 
 

@@ -7,6 +7,7 @@ odd_of(space, "town", units={"speed": "m/s"}).write("odd.yaml")
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
+from reprlib import repr as shown
 from typing import Any
 
 from verifai_jax.addons.assurance.odd_conditions import (
@@ -59,7 +60,7 @@ def read_odd(path: str | Path) -> OperationalDomain:
         tree = {}
         for name in _listed(whole["openodd"]):
             tree = _joined(tree, _with_imports(path.parent / name, files))
-        for feature, about in (whole.get("features") or {}).items():
+        for feature, about in _section(whole, "features", path).items():
             if not isinstance(about, Mapping) or "attribute" not in about:
                 raise ValueError(f"{path}: feature {feature!r} needs its attribute")
             check_names(f"entry of feature {feature!r} of {path}", about, ABOUT)
@@ -118,7 +119,7 @@ def _domain(
             each.name: {"feature": end if last.count(end) == 1 else each.name.replace(".", "_")}
             for each, end in zip(found, last, strict=True)
         }
-    sections = {**(tree.get("MODULES") or {}), **(tree.get("ODD") or {})}
+    sections = _section(tree, "MODULES", where) | _section(tree, "ODD", where)
     attributes = []
     for each in found:
         own = {key: value for key, value in mapped.get(each.name, {}).items() if value}
@@ -245,6 +246,12 @@ def _refuse_circles(name: str, above: tuple[str, ...], uses: Mapping[str, set[st
         raise ValueError(f"modules refer to each other in a circle: {' -> '.join([*above, name])}")
     for other in uses[name]:
         _refuse_circles(other, (*above, name), uses)
+
+
+def _section(tree: Mapping[str, Any], name: str, where: object) -> dict[str, Any]:
+    if not isinstance(section := tree.get(name) or {}, dict):
+        raise ValueError(f"{name} of {where} must be a mapping; got {shown(section)}")
+    return section
 
 
 def _mapping(path: Path, files: dict[Path, None]) -> dict[str, Any]:

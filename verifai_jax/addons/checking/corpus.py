@@ -27,6 +27,7 @@ from verifai_jax.core.display.progress import shows_progress
 from verifai_jax.core.messages.checks import check_count, is_number
 from verifai_jax.core.messages.text import format_error, one_line
 from verifai_jax.core.store.atomic_files import replacing
+from verifai_jax.core.store.foreign_files import read_json
 from verifai_jax.counterexamples._shrink import shrink as shrink_row
 from verifai_jax.counterexamples.selection import columns_at, problem_of
 from verifai_jax.evaluation.replay import replay
@@ -102,8 +103,8 @@ class SavedCounterexample:
         **Raises:** `CorpusError` for anything else.
         """
         try:
-            content = json.loads(path.read_text(encoding="utf-8-sig"))
-        except (OSError, ValueError, RecursionError) as error:
+            content = read_json(path)
+        except (OSError, ValueError) as error:
             raise CorpusError(f"{path} cannot be read: {one_line(format_error(error))}") from None
         form = content.get("format") if isinstance(content, dict) else None
         if form != FORMAT:

@@ -10,7 +10,7 @@ from verifai_jax.cli import arguments
 from verifai_jax.cli.arguments import option
 from verifai_jax.cli.falsify import print_run
 from verifai_jax.cli.gates import Gate, check_gate, fail_on
-from verifai_jax.cli.json_output import command, give_result
+from verifai_jax.cli.json_output import command
 from verifai_jax.cli.next_folder import given_or_next
 
 
@@ -52,11 +52,6 @@ def fuzz(
     with given_or_next(folder, "runs", problem.name, goes_on) as path:
         run = run_fuzz(problem, cells=chosen or None, folder=path, target=target, **options)
     print_run(run, pictures, ends)
-    parts = [
-        {"of": part.where, "kind": part.what, "covered": part.covered, "total": part.total}
-        for part in run.coverage.parts
-    ]
-    give_result(coverage=parts)
     check_gate(fail_on, {"counterexample": run.table.counts.may_fail})
 
 

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass, fields
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -29,7 +29,7 @@ class FuzzRun(Run):
 
         **Raises:** `ValueError` for a run without its problem or its counts.
         """
-        if self.problem is None or not self.checkpoint or SEEN not in self.checkpoint:
+        if self.problem is None or not self.checkpoint or not self._is_counted:
             raise ValueError(
                 f"the run of {self.name!r} has no coverage: its problem or checkpoint is missing"
             )
@@ -48,10 +48,21 @@ class FuzzRun(Run):
         table = self.table.all
         return table.loc[table["violated"] | (table["status"] != "ok")]
 
+    def _more_findings(self) -> dict[str, Any]:
+        parts = [
+            {"of": part.where, "kind": part.what, "covered": part.covered, "total": part.total}
+            for part in (self.coverage.parts if self._is_counted else ())
+        ]
+        return {"coverage": parts}
+
+    @property
+    def _is_counted(self) -> bool:
+        return self.problem is not None and SEEN in (self.checkpoint or ())
+
     def summary(self) -> str:
         """Write the summary of the run and of its coverage; every number comes from its data."""
         lines = [super().summary()]
-        if self.problem is not None and self.checkpoint and SEEN in self.checkpoint:
+        if self._is_counted:
             covered = [f"{part.where}: {part}" for part in self.coverage.parts]
             lines += [f"  {'covered' if not i else '':<13}{text}" for i, text in enumerate(covered)]
             corpus = self.corpus

@@ -8,7 +8,6 @@ import itertools
 import json
 import operator
 import re
-import struct
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple, TypeAlias
@@ -18,7 +17,10 @@ import numpy as np
 from verifai_jax.addons.monitoring.columns import LeftOut
 from verifai_jax.addons.monitoring.stamps import find_clock, unit_in_name
 from verifai_jax.core.messages.errors import MissingExtra, require
-from verifai_jax.core.messages.text import counted, one_line
+from verifai_jax.core.messages.text import counted, format_error, one_line
+from verifai_jax.core.store.foreign_archives import check_values
+from verifai_jax.core.store.foreign_archives import read_parquet as read_parquet_file
+from verifai_jax.core.store.foreign_files import open_file
 
 Table: TypeAlias = Any
 """An Arrow table, whose package has no types."""
@@ -110,7 +112,7 @@ def _follow_each_other(files: Sequence[Path]) -> bool:
     reader, spans = require("mcap.reader", EXTRA), []
     for each in files:
         try:
-            with open(each, "rb") as file:
+            with open_file(each) as file:
                 about = reader.make_reader(file).get_summary().statistics
                 spans.append((about.message_start_time, about.message_end_time))
         except (require("mcap.exceptions", EXTRA).McapError, AttributeError):
@@ -120,27 +122,26 @@ def _follow_each_other(files: Sequence[Path]) -> bool:
 
 def _messages(path: Path, notes: dict[str, int]) -> Iterator[tuple[Any, Any, Any]]:
     """Yield the messages of an MCAP file; of one that is damaged, those before the damage."""
-    reader = require("mcap.reader", EXTRA)
-    fault, count = require("mcap.exceptions", EXTRA).McapError, 0
+    reader, count = require("mcap.reader", EXTRA), 0
     try:
-        with open(path, "rb") as file:
+        with open_file(path) as file:
             for each in reader.make_reader(file).iter_messages():
                 count += 1
                 yield each
         return
-    except fault as error:
+    except Exception as error:  # Those of decompression are no McapError.
         if count:
-            raise ValueError(f"{path} cannot be read: {error}") from None
+            raise ValueError(f"{path} cannot be read: {one_line(str(error))}") from None
         damage = error
     try:
-        with open(path, "rb") as file:
+        with open_file(path) as file:
             for each in reader.NonSeekingReader(file).iter_messages(log_time_order=False):
                 count += 1
                 yield each
-    except (fault, struct.error, EOFError, AttributeError) as error:
+    except Exception as error:
         damage = error
     if not count:
-        raise ValueError(f"{path} cannot be read: {type(damage).__name__} {damage}")
+        raise ValueError(f"{path} cannot be read: {one_line(format_error(damage))}")
     notes[f"{path} is damaged or was cut: only its first {count} messages are read"] = 1
 
 
@@ -248,7 +249,11 @@ def read_dataset(path: Path, time: str, notes: dict[str, int]) -> list[Table]:
     try:
         # Versions of xarray differ in the units of the times that they make.
         opened = xarray.open_zarr if store else xarray.open_dataset
+        if not store:
+            open_file(path).close()
         with opened(path, decode_times=False) as dataset:
+            for name, variable in dataset.variables.items():
+                check_values(variable.size, f"{name} of {path}")
             return list(_dimensions(dataset, time, notes))
     except (ImportError, ValueError) as error:
         require("netCDF4", EXTRA)
@@ -285,11 +290,13 @@ def read_hdf5(path: Path, time: str, notes: dict[str, int]) -> list[Table]:
         if getattr(item, "ndim", 0):
             # What is no signal is left out by its form, unread.
             form = np.broadcast_to(np.empty((), item.dtype), item.shape)
+            if item.ndim < 3 and item.dtype.kind in "biufS":
+                check_values(item.size, f"{name} of {path}")
             found[name] = item[()] if item.ndim < 3 and item.dtype.kind in "biufS" else form
             said = item.attrs.get("units", item.attrs.get("unit", ""))
             units[name] = said.decode() if isinstance(said, bytes) else str(said)
 
-    with require("h5py", EXTRA).File(path, "r") as file:
+    with open_file(path) as opened, require("h5py", EXTRA).File(opened, "r") as file:
         file.visititems(visit)
     groups: dict[str, list[str]] = {}
     for name in found:
@@ -320,10 +327,8 @@ def lerobot_files(folder: Path) -> list[Path]:
 
 def episodes_of(files: Sequence[Path]) -> Iterator[Episode]:
     """Yield the episodes in data files of a LeRobot data set."""
-    from pyarrow import parquet
-
     for file in files:
-        numbers = parquet.read_table(file, columns=[EPISODE]).column(EPISODE).unique()
+        numbers = read_parquet_file(file, [EPISODE]).column(EPISODE).unique()
         yield from (Episode(file, number) for number in sorted(numbers.to_pylist()))
 
 
@@ -333,9 +338,9 @@ def read_parquet(path: Path, time: str, episode: int | None) -> list[Table]:
     **Raises:** `ValueError` for a file of several episodes if none is named, and for an episode
     that it does not contain.
     """
-    from pyarrow import compute, parquet
+    from pyarrow import compute
 
-    table = parquet.read_table(path)
+    table = read_parquet_file(path)
     if not {EPISODE, FRAME, STAMP} <= set(table.column_names):
         if episode is not None:
             raise ValueError(f"{path} has no episodes: it lacks the columns of a LeRobot data set")

@@ -13,7 +13,7 @@ from verifai_jax.addons.monitoring.columns import GAPS, TRUTHS, is_numeric
 from verifai_jax.addons.monitoring.containers import UNIT, Table
 from verifai_jax.addons.monitoring.units import NONE
 from verifai_jax.core.messages.text import counted, shorten
-from verifai_jax.core.store.foreign_files import decoded
+from verifai_jax.core.store.foreign_files import decoded, read_bytes
 
 NUMBER = re.compile(r'^\s*"?[-+]?[.,]?\d')
 """The beginning of a number, or of a date."""
@@ -27,7 +27,7 @@ def read_csv(path: Path, notes: dict[str, int]) -> Table:
     """Read a CSV file as an Arrow table with any separator of columns and decimals."""
     from pyarrow import csv
 
-    data = path.read_bytes()
+    data = read_bytes(path)
     if not data.isascii() or b"\0" in data[:2]:
         text, note = decoded(path, data, cut=True)
         data = text.encode()

@@ -14,6 +14,7 @@ from verifai_jax.addons.monitoring.c_monitor import export_c
 from verifai_jax.addons.monitoring.margins import margins
 from verifai_jax.addons.monitoring.watching import FLAGS
 from verifai_jax.addons.native.native_code.machine_code import Unavailable, compile_library
+from verifai_jax.core.messages.checks import check_name
 from verifai_jax.core.messages.text import counted
 from verifai_jax.core.store.atomic_files import replacing
 from verifai_jax.mtl.formula import Formula
@@ -188,6 +189,8 @@ def export_fmu(
             f"{counted(len(twice), 'variable')} of the FMU would have one name with another: "
             f"{', '.join(twice)}; name the formulas, as in {{'gap_kept': 'always gap > 2'}}"
         )
+    for name in (path.stem, *inputs, *outputs):
+        check_name("a name in an FMU", name)
     header = export_c(formulas, dt, semantics=semantics, every=every, sizes=sizes)
     parts = {"columns": max(1, len(inputs)), "outputs": len(plan.outputs), "dt": repr(dt)}
     wrapper = re.sub(r"@(columns|outputs|dt)", lambda found: str(parts[found[1]]), WRAPPER)

@@ -19,7 +19,8 @@ from verifai_jax.addons.monitoring.containers import UNIT, Episode, Table
 from verifai_jax.addons.monitoring.csv_tables import read_csv
 from verifai_jax.addons.monitoring.stamps import apart, find_clock, in_order, seconds_of
 from verifai_jax.core.messages.errors import MissingExtra, missing_name
-from verifai_jax.core.messages.text import format_error, one_line
+from verifai_jax.core.messages.text import format_error
+from verifai_jax.core.store.foreign_archives import read_arrays
 from verifai_jax.core.values.trace import Trace
 
 if TYPE_CHECKING:
@@ -280,20 +281,17 @@ def _file_tables(path: Path, time: str, episode: int | None, notes: dict[str, in
     except (MissingExtra, FileNotFoundError):
         raise
     except Exception as error:  # The readers of other packages raise what they like.
-        if type(error) is ValueError and str(path) in str(error):
+        if isinstance(error, ValueError) and str(path) in str(error):
             raise
         raise ValueError(f"{path} cannot be read: {format_error(error)}") from None
 
 
 def _read_arrays(path: Path, time: str, notes: dict[str, int]) -> Table:
     """Read the arrays of an `.npz` file as an Arrow table; nothing in it is unpickled."""
-    arrays = {}
-    with open(path, "rb") as file, np.load(file, allow_pickle=False) as stored:
-        for name in stored.files:
-            try:
-                arrays[name] = stored[name]
-            except ValueError as error:
-                notes[LeftOut(f"column {name!r}: {one_line(str(error))}: left out", name)] = 1
+    left_out: dict[str, str] = {}
+    arrays = read_arrays(path, str(path), left_out=left_out)
+    for name, why in left_out.items():
+        notes[LeftOut(f"column {name!r}: {why}: left out", name)] = 1
     return containers.table_of_arrays(arrays, find_clock(arrays, time), notes)
 
 

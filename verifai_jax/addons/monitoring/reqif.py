@@ -7,6 +7,7 @@ Source: OMG, Requirements Interchange Format 1.2, formal/2016-07-01. A file with
 refused unread, since its entities could read other files or expand without end.
 """
 
+import io
 import zipfile
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from datetime import UTC, datetime
@@ -14,7 +15,8 @@ from pathlib import Path
 from xml.etree import ElementTree
 from xml.etree.ElementTree import Element
 
-from verifai_jax.core.store.foreign_files import read_xml
+from verifai_jax.core.store.foreign_archives import open_archive, read_member
+from verifai_jax.core.store.foreign_files import read_bytes, read_xml
 
 NAMESPACE = "http://www.omg.org/spec/ReqIF/20110401/reqif.xsd"
 STANDARD = "reqif."
@@ -106,22 +108,18 @@ def links_of(text: str) -> tuple[str, ...]:
 
 def _documents(path: Path) -> Iterator[tuple[str, bytes]]:
     """Yield the names and contents of the ReqIF files in a file."""
-    if not zipfile.is_zipfile(path):
+    data = read_bytes(path, MAX_BYTES)
+    if not zipfile.is_zipfile(io.BytesIO(data)):
         if path.suffix.lower() == ".reqifz":
             raise ValueError(f"{path} is not a ZIP archive of ReqIF files: export it again")
-        yield str(path), path.read_bytes()
+        yield str(path), data
         return
-    with zipfile.ZipFile(path) as archive:
-        inside = [each for each in archive.infolist() if each.filename.lower().endswith(".reqif")]
-        if not inside:
-            raise ValueError(f"{path} contains no file .reqif")
-        if (size := sum(each.file_size for each in inside)) > MAX_BYTES:
-            raise ValueError(f"{path} contains {size:,} bytes of ReqIF; {MAX_BYTES:,} are read")
-        for each in inside:
-            try:
-                yield f"{each.filename} in {path}", archive.read(each)
-            except (zipfile.BadZipFile, NotImplementedError, RuntimeError) as error:
-                raise ValueError(f"{each.filename} in {path} cannot be read: {error}") from None
+    archive = open_archive(data, str(path), MAX_BYTES)
+    inside = [name for name in archive.namelist() if name.lower().endswith(".reqif")]
+    if not inside:
+        raise ValueError(f"{path} contains no file .reqif")
+    for name in inside:
+        yield f"{name} in {path}", read_member(archive, name, str(path))
 
 
 def _tag(element: Element) -> str:

@@ -8,7 +8,6 @@ write_requirements(requirements, "requirements.csv")
 """
 
 import csv
-import tomllib
 from collections.abc import Iterable, Mapping, Sequence
 from io import StringIO
 from itertools import zip_longest
@@ -18,7 +17,7 @@ from reprlib import repr as shown
 from verifai_jax.addons.monitoring.reqif import links_of, read_reqif, reqif_document
 from verifai_jax.core.messages.errors import check_names
 from verifai_jax.core.store.atomic_files import replacing
-from verifai_jax.core.store.foreign_files import read_text, read_yaml
+from verifai_jax.core.store.foreign_files import parse_toml, read_text, read_yaml
 from verifai_jax.mtl._parse import parse
 from verifai_jax.mtl.formula import Formula
 from verifai_jax.mtl.requirements import FIELDS, Requirement
@@ -154,9 +153,7 @@ def _tables(
     kind = "TOML" if path.suffix.lower() == ".toml" else "YAML"
     text = read_text(path)
     try:
-        whole: object = (tomllib.loads if kind == "TOML" else read_yaml)(text)
-    except RecursionError:
-        raise ValueError(f"{path} is nested too deeply: an entry has texts alone") from None
+        whole: object = (parse_toml if kind == "TOML" else read_yaml)(text)
     except ValueError as error:
         raise ValueError(f"{path} is not {kind}: {error}") from None
     if not isinstance(whole, dict):

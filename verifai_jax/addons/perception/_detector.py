@@ -24,6 +24,7 @@ from jaxtyping import Array, Float, Key
 
 from verifai_jax.addons.perception.camera import STATIC, described
 from verifai_jax.core.store.atomic_files import replacing
+from verifai_jax.core.store.foreign_archives import read_arrays
 
 FORMAT = "verifai_jax detector 1"
 
@@ -196,8 +197,7 @@ def load_detector(path: str | Path) -> Detector:
     **Raises:** `DetectorFileError` for any other file.
     """
     try:
-        with np.load(path, allow_pickle=False) as file:
-            arrays = {name: file[name] for name in file.files}
+        arrays = read_arrays(Path(path), str(path))
         about = json.loads(str(arrays["about"]))
         if about["format"] != FORMAT:
             raise DetectorFileError(f"{path} has the format {about['format']!r}, not {FORMAT!r}")

@@ -3,7 +3,6 @@
 result = read_result(Path("estimate.json"))     # an Estimate, a Comparison or a Verification
 """
 
-import json
 from collections.abc import Collection, Mapping
 from dataclasses import MISSING, fields
 from pathlib import Path
@@ -11,6 +10,8 @@ from typing import Any
 
 from verifai_jax.core.display.extensions import extension, extensions
 from verifai_jax.core.messages.text import one_line
+from verifai_jax.core.store.files import is_of
+from verifai_jax.core.store.foreign_files import ForeignFileError, read_json
 from verifai_jax.core.user_code.sources import Sources
 from verifai_jax.features import FeatureSpace
 
@@ -25,8 +26,10 @@ def read_result(file: Path, space: FeatureSpace | None = None) -> Any:
     **Raises:** `FileNotFoundError` if there is no such file; `ValueError` for other content.
     """
     try:
-        data = json.loads(file.read_text(encoding="utf-8"))
-    except (ValueError, RecursionError):
+        data = read_json(file)
+    except ForeignFileError:
+        raise
+    except ValueError:
         data = None
     kind = data.get("kind", data.get("command")) if isinstance(data, dict) else None
     if not isinstance(kind, str) or kind not in extensions(READERS):
@@ -35,7 +38,7 @@ def read_result(file: Path, space: FeatureSpace | None = None) -> Any:
         )
     try:
         return extension(READERS, kind)(file, data, space)
-    except (KeyError, TypeError, AttributeError) as error:
+    except (LookupError, TypeError, AttributeError, ArithmeticError) as error:
         raise ValueError(
             f"{file} is damaged: {one_line(str(error))} is missing, or of another form"
         ) from None
@@ -57,8 +60,7 @@ def values_of(kind: type, data: Mapping[str, Any], null: Collection[str] = ()) -
         value = data[field.name]
         if value is None and field.name not in null:
             raise KeyError(field.name)
-        wanted = {int: int, float: (int, float), str: str}.get(field.type)
-        if wanted is not None and value is not None and not isinstance(value, wanted):
+        if value is not None and not is_of(value, field.type):
             raise TypeError(field.name)
         values[field.name] = value
     return values

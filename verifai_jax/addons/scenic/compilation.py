@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import Any
 
 from verifai_jax.core.messages.errors import require
+from verifai_jax.core.store.foreign_files import read_text
 
 
 class ProgramError(ValueError):
@@ -78,7 +79,7 @@ def compile_program(
     _with_time_series(require("scenic.syntax.veneer", "scenic"))
     sys.excepthook = hook  # Scenic's own would show every error of the user's program differently.
     path = _path_of(program)
-    source = str(program) if path is None else path.read_text()
+    source = str(program) if path is None else read_text(path)
     filename = "<string>" if path is None else str(path.resolve())
     options = translator.CompileOptions(
         modelOverride=model, paramOverrides=dict(params), mode2D=mode2D

@@ -26,6 +26,7 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from verifai_jax.core.compute.devices import cache_folder
 from verifai_jax.core.compute.fingerprint import identity
 from verifai_jax.core.store.atomic_files import replacing
+from verifai_jax.core.store.foreign_files import read_bytes
 from verifai_jax.core.user_code.user_files import PACKAGE
 
 MAX_BYTES = 64 * 2**20
@@ -124,7 +125,7 @@ def _folder() -> Path:
 
 def _read(path: Path) -> "jax.export.Exported | None":
     try:
-        content = path.read_bytes()
+        content = read_bytes(path)
         seal, data = content[:SEAL], content[SEAL:]
         if hashlib.sha256(data).digest() != seal:
             return None

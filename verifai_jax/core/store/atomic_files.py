@@ -3,17 +3,27 @@
     with replacing("report.html") as partial:
         partial.write_text(page)                # takes the place of report.html at the end
 
-All files of results are written by it: tables, records, pictures, films, policies, reports.
+All files of results are written by it: tables, records, pictures, films, policies, reports. Its
+temporary file is locked while it is written, so the next writer in the folder knows those that a
+killed process left, and removes them.
 """
 
 import contextlib
 import errno
 import io
 import os
+import re
 import threading
 from collections.abc import Iterator
 from pathlib import Path
 
+try:
+    import fcntl
+except ImportError:
+    fcntl = None
+_PARTIAL = re.compile(r"\..*\.\d+-\d+\.part(\..*)?", re.DOTALL)
+"""Names of temporary files of writers that may not be alone in a folder."""
+_NO_LOCKS = {errno.ENOLCK, errno.ENOSYS, errno.ENOTSUP, errno.EOPNOTSUPP}
 _REMEDIES = {
     errno.ENOSPC: "make room on its disk, or give another path",
     errno.EDQUOT: "make room on its disk, or give another path",
@@ -45,16 +55,57 @@ def replacing(path: str | Path, *, locked: bool = False) -> Iterator[Path]:
     writer = f"{os.getpid()}-{threading.get_ident()}"
     name = f".{path.name}.part" if locked else f".{path.stem}.{writer}.part{path.suffix}"
     partial = path.with_name(name)
-    try:
-        if not locked:
-            path.parent.mkdir(parents=True, exist_ok=True)
-        yield partial
-        partial.replace(path)
-    except OSError as error:
-        raise unwritable(path, error) from error
-    finally:
-        with contextlib.suppress(OSError):
-            partial.unlink(missing_ok=True)
+    with contextlib.ExitStack() as ends:
+        try:
+            if not locked:
+                path.parent.mkdir(parents=True, exist_ok=True)
+                _remove_leftovers(path.parent)
+                if (file := held(partial)) is not None:
+                    ends.enter_context(file)
+            yield partial
+            partial.replace(path)
+        except OSError as error:
+            raise unwritable(path, error) from error
+        finally:
+            with contextlib.suppress(OSError):
+                partial.unlink(missing_ok=True)
+
+
+def held(path: Path) -> io.FileIO | None:
+    """Open a file for writing, made if it is missing, and lock it until it is closed.
+
+    None where there are no such locks; on a file system without them the file is not locked.
+
+    **Raises:** `BlockingIOError` if another process has the lock; `OSError` of the file system.
+    """
+    while fcntl is not None:
+        file = io.FileIO(path, "r+", opener=_open)
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            if error.errno not in _NO_LOCKS:
+                file.close()
+                raise
+        with contextlib.suppress(FileNotFoundError):
+            if os.path.samestat(os.fstat(file.fileno()), path.stat()):
+                return file
+        file.close()  # Its holder removed it meanwhile.
+    return None
+
+
+def _open(path: str, flags: int) -> int:
+    # A folder from elsewhere may have a link of this name, to a file that is not to be emptied.
+    return os.open(path, flags | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK, 0o644)
+
+
+def _remove_leftovers(folder: Path) -> None:
+    """Remove the temporary files in a folder that nobody has locked."""
+    if fcntl is None:
+        return
+    for name in filter(_PARTIAL.fullmatch, os.listdir(folder)):
+        with contextlib.suppress(OSError), io.FileIO(folder / name, "r+", opener=_open) as file:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            (folder / name).unlink()
 
 
 def append(path: Path, content: bytes) -> None:

@@ -5,20 +5,22 @@ write_record(path, {"seed": 0})
 read_record(path)                               # DamagedError, where it has changed since
 """
 
-import contextlib
 import json
-import shutil
-import tempfile
+import sys
 import zlib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from types import UnionType
+from typing import TYPE_CHECKING, Any, Union, get_args, get_origin
 
-from verifai_jax.core.messages.text import one_line
-from verifai_jax.core.store.atomic_files import replacing, unwritable
+from verifai_jax.core.messages.checks import is_number
+from verifai_jax.core.store.atomic_files import replacing
+from verifai_jax.core.store.foreign_files import read_json
 
 if TYPE_CHECKING:
     import pyarrow as pa
+MAX_INTEGER = 2**63 - 1
+"""Greatest whole number of a record."""
 _CHECKSUM = "checksum"
 """Entry of a record with the checksum of the others."""
 
@@ -48,35 +50,6 @@ def write_complete(path: Path, content: "pa.Buffer | bytes", locked: bool = True
     return path
 
 
-@contextlib.contextmanager
-def replacing_all(folder: Path, names: Sequence[str]) -> Iterator[Path]:
-    """Yield a folder for files that replace those in `folder` together when all are complete.
-
-    If the disk is full, the old files stay and no new one remains.
-
-    **Arguments:**
-    - `folder`: an existing folder without another writer.
-    - `names`: the names of all files and folders that belong together, including optional ones. The
-      last is the one without which the others are useless: it is removed first and written last.
-    **Raises:** `OSError` that names `folder`, if the file system refuses.
-    """
-    *others, last = names
-    try:
-        with tempfile.TemporaryDirectory(prefix=".part-", dir=folder) as made:
-            yield Path(made)
-            for name in (last, *others):
-                old = folder / name
-                if old.is_dir() and not old.is_symlink():
-                    shutil.rmtree(old)
-                else:
-                    old.unlink(missing_ok=True)
-            for name in (*others, last):
-                if (new := Path(made) / name).exists():
-                    new.replace(folder / name)
-    except OSError as error:
-        raise unwritable(folder, error, "The results are still in memory") from error
-
-
 def write_record(path: Path, record: Mapping[str, Any], locked: bool = True) -> dict[str, Any]:
     """Write plain data as JSON with a checksum, atomically; return it as it will be read back.
 
@@ -96,18 +69,37 @@ def read_record(path: Path) -> dict[str, Any]:
     record, or whose content has changed.
     """
     try:
-        record = json.loads(path.read_text())
+        record = read_json(path, within=path.parent)
     except FileNotFoundError:
         raise
-    except (ValueError, RecursionError, OSError) as error:
-        why = f"it cannot be read as JSON ({one_line(str(error))})"
-        raise DamagedError(f"{path} is damaged, or of another program: {why}") from error
+    except (ValueError, OSError) as error:
+        why = str(error).removeprefix(f"{path} ")
+        raise DamagedError(f"{path} is damaged, or of another program: it {why}") from error
     if not isinstance(record, dict) or _CHECKSUM not in record:
         raise DamagedError(f"{path} is damaged, or of another program: it has no checksum")
     own = record.pop(_CHECKSUM)
     if own != record_checksum(record):
         raise DamagedError(f"{path} is damaged: its content has changed since it was written")
     return record
+
+
+def is_of(value: object, kind: Any) -> bool:
+    """Return whether plain data fits an annotation: of numbers, texts, sequences and mappings."""
+    outer, inner = get_origin(kind), get_args(kind)
+    if outer in (Union, UnionType):
+        return any(is_of(value, each) for each in inner)
+    if kind in (int, float):
+        wanted = int if kind is int else int | float
+        limit = MAX_INTEGER if kind is int else sys.float_info.max
+        # A number that is not one passes: nothing is known in its place.
+        return is_number(value) and isinstance(value, wanted) and not abs(value) > limit
+    if outer is None:
+        return (
+            kind is Any or value is None if kind in (Any, type(None)) else isinstance(value, kind)
+        )
+    if issubclass(outer, Mapping):
+        return isinstance(value, dict) and all(is_of(each, inner[1]) for each in value.values())
+    return isinstance(value, list | tuple) and all(is_of(each, inner[0]) for each in value)
 
 
 def plain(value: object) -> Any:

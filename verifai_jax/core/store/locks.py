@@ -4,12 +4,12 @@
         ...
 
 The lock is the operating system's, on a file in the folder, so it ends with the process even after
-a kill. The file names the process. Without such locks (`fcntl` is missing, or the file system has
-none) nothing is locked. Reading needs no lock.
+a kill. The file names the process. Whoever locks a folder finishes the replacement of a killed
+process, and removes its leftovers (`replacements.py`). Without such locks (`fcntl` is missing, or
+the file system has none) nothing is locked. Reading needs no lock.
 """
 
 import contextlib
-import errno
 import os
 import socket
 import weakref
@@ -17,15 +17,11 @@ from collections.abc import Iterator
 from io import FileIO
 from pathlib import Path
 
-from verifai_jax.core.store.atomic_files import reason
+from verifai_jax.core.store.atomic_files import held, reason
+from verifai_jax.core.store.replacements import WHOLE, recover
 
-try:
-    import fcntl
-except ImportError:
-    fcntl = None
 LOCK = "writer.lock"
 """Name of the file in a folder that is being written."""
-_NO_LOCKS = {errno.ENOLCK, errno.ENOSYS, errno.ENOTSUP, errno.EOPNOTSUPP}
 
 
 class FolderInUse(ValueError):
@@ -60,6 +56,8 @@ def write_lock(folder: Path | None) -> Iterator[None]:
         folder.mkdir(parents=True, exist_ok=True)
         file, owner = _acquire(folder), os.getpid()
     try:
+        with writing(folder):
+            recover(folder)
         yield
     finally:
         if file is not None and os.getpid() == owner:
@@ -69,6 +67,17 @@ def write_lock(folder: Path | None) -> Iterator[None]:
             with contextlib.suppress(OSError):
                 path.unlink()
             file.close()
+
+
+def settled(folder: Path) -> Path:
+    """Return a folder that is to be read, after finishing what a killed process had decided.
+
+    **Raises:** as `write_lock`, if a process was killed while it replaced the files.
+    """
+    if (folder / WHOLE).exists():
+        with write_lock(folder):
+            pass
+    return folder
 
 
 @contextlib.contextmanager
@@ -84,35 +93,19 @@ def writing(folder: Path | None) -> Iterator[None]:
 
 
 def _acquire(folder: Path) -> FileIO | None:
-    path = folder / LOCK
-    if fcntl is None:
-        return None
-    while True:
-        file = FileIO(path, "r+", opener=_open)
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            owner = file.read(200).decode(errors="replace")
-            file.close()
-            raise FolderInUse(_in_use(folder, owner)) from None
-        except OSError as error:
-            if error.errno not in _NO_LOCKS:
-                file.close()
-                raise
-        with contextlib.suppress(FileNotFoundError):
-            if os.path.samestat(os.fstat(file.fileno()), path.stat()):
-                break
-        file.close()  # Its holder removed it meanwhile.
-    _held.add(file)
-    with contextlib.suppress(OSError):  # On a full disk nobody is told who has it.
-        file.truncate(0)
-        file.write(f"{os.getpid()} {socket.gethostname()}".encode())
+    try:
+        file = held(folder / LOCK)
+    except BlockingIOError:
+        owner = ""
+        with contextlib.suppress(OSError), FileIO(folder / LOCK) as other:
+            owner = other.read(200).decode(errors="replace")
+        raise FolderInUse(_in_use(folder, owner)) from None
+    if file is not None:
+        _held.add(file)
+        with contextlib.suppress(OSError):  # On a full disk nobody is told who has it.
+            file.truncate(0)
+            file.write(f"{os.getpid()} {socket.gethostname()}".encode())
     return file
-
-
-def _open(path: str, flags: int) -> int:
-    # A folder from elsewhere may have a link of this name, to a file that is not to be emptied.
-    return os.open(path, flags | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK, 0o644)
 
 
 def _in_use(folder: Path, owner: str) -> str:

@@ -28,6 +28,7 @@ import numpy as np
 
 from verifai_jax.core.store.atomic_files import append_to, unwritable
 from verifai_jax.core.store.files import DamagedError, checksum, write_complete
+from verifai_jax.core.store.foreign_files import ForeignFileError, open_file
 
 Arrays: TypeAlias = Mapping[str, np.ndarray]
 """An entry: arrays of numbers or texts, by name."""
@@ -130,7 +131,7 @@ class Log:
             close()
 
     def _opened(self) -> AbstractContextManager[IO[bytes]]:
-        return contextlib.nullcontext(self._memory) if self.path is None else open(self.path, "rb")
+        return contextlib.nullcontext(self._memory) if self.path is None else open_file(self.path)
 
     def _index(self) -> dict[str, _Extent]:
         """Find the frames of the file: the place of the last entry of each name.
@@ -147,8 +148,9 @@ class Log:
                         extents.update(found or {})
             except FileNotFoundError:
                 pass
-            except IsADirectoryError as error:
-                raise DamagedError(f"{self.path} is damaged: it is not a file") from error
+            except ForeignFileError as error:
+                why = str(error).removeprefix(f"{self.path} ")
+                raise DamagedError(f"{self.path} is damaged: it {why}") from error
             self._extents = extents
         return self._extents
 

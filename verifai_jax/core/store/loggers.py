@@ -16,6 +16,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from verifai_jax.core.store.atomic_files import append, replacing
+from verifai_jax.core.store.foreign_files import read_text
 from verifai_jax.core.user_code.callbacks import Values
 
 STEP = "step"
@@ -35,8 +36,7 @@ class CSVLogger:
         self.path = Path(path)
         self._columns: list[str] = []
         if self.path.exists() and self.path.stat().st_size:
-            with self.path.open(newline="") as file:
-                self._columns = next(csv.reader(file), [])
+            self._columns = next(csv.reader(io.StringIO(read_text(self.path))), [])
             if self._columns[:1] != [STEP]:
                 raise ValueError(
                     f"{self.path} is not the file of a CSVLogger: its first column is "
@@ -51,8 +51,7 @@ class CSVLogger:
             # Write the file anew with more columns.
             rows: list[dict[str, str]] = []
             if self._columns:
-                with self.path.open(newline="") as file:
-                    rows = list(csv.DictReader(file))
+                rows = list(csv.DictReader(io.StringIO(read_text(self.path))))
             with replacing(self.path) as partial, partial.open("w", newline="") as file:
                 writer = csv.DictWriter(file, columns)
                 writer.writeheader()

@@ -8,10 +8,13 @@ import struct
 import zipfile
 from pathlib import Path
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import onnx
 import pytest
-from onnx import TensorProto, helper
+from mutated import limited
+from onnx import TensorProto, helper, numpy_helper
 
 from verifai_jax.addons.rl.policies import PolicyError, policy
 from verifai_jax.addons.rl.policies.pickled import Name, Record, array_of, read_pickle
@@ -77,7 +80,7 @@ def test_an_archive_that_unpacks_to_gigabytes(tmp_path):
         with archive.open("data", "w", force_zip64=True) as file:
             for _ in range(200):
                 file.write(bytes(1_000_000))
-    with pytest.raises(PolicyError, match="unpacks to 200 MB, and a policy may have 150 MB"):
+    with pytest.raises(PolicyError, match="unpacks to 200 MB; at most 150 MB are read"):
         policy(tmp_path / "bomb.zip")
 
 
@@ -94,10 +97,10 @@ def test_a_header_of_four_gigabytes(tmp_path):
         policy(file, activation="tanh")
 
 
-def graph(nodes, file, initializers=(), outputs=("y",)):
+def graph(nodes, file, initializers=(), outputs=("y",), opset=17):
     value = lambda name: helper.make_tensor_value_info(name, TensorProto.FLOAT, [1, 2])  # noqa: E731
     made = helper.make_graph(nodes, "g", [value("x")], [value(n) for n in outputs], initializers)
-    onnx.save(helper.make_model(made, opset_imports=[helper.make_opsetid("", 17)]), file)
+    onnx.save(helper.make_model(made, opset_imports=[helper.make_opsetid("", opset)]), file)
     return file
 
 
@@ -162,10 +165,11 @@ def test_tensors_are_read_from_the_folder_of_the_model_only(tmp_path):
         file = graph([helper.make_node("Add", ["x", "w"], ["y"])], tmp_path / "far.onnx", [tensor])
         with pytest.raises(PolicyError, match=message):
             policy(file)
-    (tmp_path / "apart").mkdir()
-    (tmp_path / "weights.bin").rename(tmp_path / "apart" / "weights.bin")
-    (tmp_path / "weights.bin").symlink_to(tmp_path / "apart" / "weights.bin")
-    with pytest.raises(PolicyError, match=r"weights\.bin is a link to another folder"):
+    apart = tmp_path.with_name(f"{tmp_path.name}.apart")
+    apart.mkdir()
+    (tmp_path / "weights.bin").rename(apart / "weights.bin")
+    (tmp_path / "weights.bin").symlink_to(apart / "weights.bin")
+    with pytest.raises(PolicyError, match=r"weights\.bin is a link out of"):
         policy(file)
     (tmp_path / "weights.bin").unlink()
     (tmp_path / "weights.bin").write_bytes(np.float32([1, 2]).tobytes())
@@ -186,3 +190,54 @@ def test_what_is_wrong_is_said(tmp_path):
         policy(FILES / "ppo.zip", activation="tanh")
     with pytest.raises(PolicyError, match="takes observations of 4 numbers; got shape"):
         policy(FILES / "ppo.zip").act(np.zeros(5, np.float32))
+
+
+def test_shared_tuples_and_references(tmp_path):
+    value = ()
+    for _ in range(25):
+        value = (value, value)
+    wide = {"w": np.zeros(1)}
+    for _ in range(8):
+        wide = [wide] * 40
+    for content in (value, wide, {((),): 1}):
+        data = pickle.dumps({"a": content})
+        assert len(data) < 1000
+        with zipfile.ZipFile(tmp_path / "it.pt", "w") as archive:
+            archive.writestr("it/data.pkl", data)
+        with limited(), pytest.raises(PolicyError, match=r"refers to more than|is neither a text"):
+            policy(tmp_path / "it.pt", activation="elu")
+
+
+def huge(nodes, tmp_path, initializers=(), opset=17):
+    file = graph(nodes, tmp_path / "huge.onnx", list(initializers), opset=opset)
+    with limited(), pytest.raises(PolicyError) as error:
+        jax.eval_shape(policy(file).act, jnp.zeros(2))
+    return str(error.value)
+
+
+def test_results_are_bounded_before_they_are_computed(tmp_path):
+    many = numpy_helper.from_array(np.array([2**24 - 10], np.int64), "many")
+    zeros = helper.make_node("ConstantOfShape", ["many"], ["zeros"])
+    joined = helper.make_node("Concat", ["zeros"] * 30, ["y"], axis=0)
+    assert "the graph of a policy may compute at most" in huge([zeros, joined], tmp_path, [many])
+    split = helper.make_node("Split", ["x"], ["y", "z"], num_outputs=10**8, axis=1)
+    assert "which are not its num_outputs" in huge([split], tmp_path, opset=18)
+    pooled = helper.make_node("Reshape", ["x", "image"], ["i"])
+    image = numpy_helper.from_array(np.array([1, 1, 2], np.int64), "image")
+    pool = helper.make_node(
+        "AveragePool", ["i"], ["y"], kernel_shape=[2**31], auto_pad="SAME_UPPER", strides=[1]
+    )
+    assert "may compute at most" in huge([pooled, pool], tmp_path, [image])
+
+
+def test_infinite_weights_and_two_of_one_name(tmp_path):
+    weights = numpy_helper.from_array(np.full((2, 2), np.inf, np.float32), "w")
+    node = helper.make_node("MatMul", ["x", "w"], ["y"])
+    assert "'w' of" in (told := huge([node], tmp_path, [weights]))
+    assert "holds infinite weights" in told
+    ones = numpy_helper.from_array(np.ones((2, 2), np.float32), "w")
+    assert "two tensors that are called 'w'" in huge([node], tmp_path, [ones, weights])
+    bounds = numpy_helper.from_array(np.array(np.inf, np.float32), "high")
+    clip = helper.make_node("Clip", ["x", "", "high"], ["y"])
+    file = graph([clip], tmp_path / "clip.onnx", [bounds])
+    assert policy(file).act(np.zeros(2)).shape == (2,)

@@ -91,13 +91,13 @@ def _usual(name: str) -> list[Path]:
 
 def _tested_files() -> list[Path]:
     """Return the files of problems that the configuration of pytest says are tests."""
-    import tomllib
+    from verifai_jax.core.store.foreign_files import parse_toml, read_text
 
     file = Path("pyproject.toml")
     if not file.is_file():
         return []
     try:
-        options = tomllib.loads(file.read_text(encoding="utf-8")).get("tool", {}).get("pytest", {})
+        options = parse_toml(read_text(file)).get("tool", {}).get("pytest", {})
     except ValueError as error:
         raise ValueError(f"{file} is not TOML: {error}") from None
     patterns = options.get("ini_options", {}).get("vj_specs", [])

@@ -5,7 +5,6 @@ evidence = [*runs_in(["runs"]), *claims_in(["reports"])]
 Nothing in a folder is executed: a run is read without its problem.
 """
 
-import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -16,6 +15,7 @@ from verifai_jax.addons.reports.claims import PAGE, sealed
 from verifai_jax.addons.reports.provenance import Model, chained
 from verifai_jax.addons.reports.run_report import chain_of
 from verifai_jax.core.messages.text import counted
+from verifai_jax.core.store.foreign_files import read_json
 from verifai_jax.core.user_code.sources import Sources, file_hash, list_changes
 from verifai_jax.falsification.model_changes import model_changes
 from verifai_jax.falsification.run import Run
@@ -179,7 +179,7 @@ def claims_in(paths: Sequence[str | Path]) -> Iterator[Evidence]:
         found |= dict.fromkeys(file for file in files if file.is_file())
     for file in found:
         try:
-            data = json.loads(file.read_text(encoding="utf-8"))
+            data = read_json(file)
             if about := data["about"]:
                 yield Evidence(
                     "claims", str(about["result"]), str(file), str(data["subject"]),

@@ -20,7 +20,7 @@ from verifai_jax.addons.assurance.traceability.result import (
 )
 from verifai_jax.addons.checking._test import MARK, source_hash, tested_problem
 from verifai_jax.core.messages.text import counted, one_line
-from verifai_jax.core.store.foreign_files import read_xml
+from verifai_jax.core.store.foreign_files import read_bytes, read_xml
 from verifai_jax.core.user_code.targets import NothingDefined, definitions, values_in
 from verifai_jax.problem.model_digest import digest_of_model
 from verifai_jax.problem.problem import Problem
@@ -74,7 +74,7 @@ def read_cases(paths: Sequence[Location]) -> list[Case]:
         if not path.exists():
             raise FileNotFoundError(f"there is no file of results {path}")
         for file in sorted(path.rglob("*.xml")) if path.is_dir() else [path]:
-            root = read_xml(file.read_bytes(), str(file))
+            root = read_xml(read_bytes(file), str(file))
             if root.tag not in ("testsuites", "testsuite"):
                 raise ValueError(f"{file} is not of JUnit: its first element is {root.tag}")
             for case in root.iter("testcase"):

@@ -10,6 +10,8 @@ from typing import TYPE_CHECKING, TypeAlias
 from verifai_jax.addons.monitoring.judging import judge
 from verifai_jax.core.messages.errors import missing_name
 from verifai_jax.core.messages.text import listed
+from verifai_jax.core.store.foreign_archives import read_parquet
+from verifai_jax.core.store.foreign_files import MAX_BYTES, open_file
 from verifai_jax.problem.problem import Problem
 
 if TYPE_CHECKING:
@@ -88,8 +90,11 @@ def table_of(trials: TrialTable) -> "tuple[pd.DataFrame, Path]":
         if not path.exists():
             raise FileNotFoundError(f"there is no file {path} of trials")
         folder = path.parent
-        read = pd.read_parquet if path.suffix.lower() == ".parquet" else pd.read_csv
-        trials = read(path)
+        if path.suffix.lower() == ".parquet":
+            trials = read_parquet(path).to_pandas()
+        else:
+            with open_file(path, MAX_BYTES) as file:
+                trials = pd.read_csv(file)
     if not isinstance(trials, pd.DataFrame):
         raise TypeError(
             f"trials are the path of a table or a pandas.DataFrame; got {type(trials).__name__}"

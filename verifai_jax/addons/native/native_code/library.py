@@ -20,6 +20,7 @@ from verifai_jax.addons.native.native_code import machine_code
 from verifai_jax.addons.native.native_code.source import OTHERS, PRELUDE
 from verifai_jax.core.compute.remembered import remembered_as
 from verifai_jax.core.store.atomic_files import replacing
+from verifai_jax.core.store.foreign_files import read_bytes
 
 FLAGS = (
     "-std=c++11", "-march=native", "-ffp-contract=fast",
@@ -111,7 +112,7 @@ def load(name: str, count: int, translate: Callable[[], str], quickly: bool = Fa
 def is_approved(path: Path) -> bool | None:
     """Return whether the library in a file agrees with XLA, as stored by `approve`, or None."""
     try:
-        known = path.with_suffix(".agrees").read_bytes()
+        known = read_bytes(path.with_suffix(".agrees"))
     except OSError:
         return None
     return next((agrees for agrees in (True, False) if known == _record(path, agrees)), None)

@@ -23,6 +23,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from verifai_jax.core.compute.devices import cache_folder
+from verifai_jax.core.store.foreign_files import read_bytes
 
 COMPILERS = ("c++", "g++", "clang++")
 """Names under which a compiler is looked for."""
@@ -106,7 +107,7 @@ def library_folder() -> Path:
 def _is_whole(path: Path) -> bool:
     """Return whether a library has the content that its name says."""
     try:
-        return path.stem.endswith(f"-{_checksum(path.read_bytes())}")
+        return path.stem.endswith(f"-{_checksum(read_bytes(path))}")
     except OSError:
         return False
 
@@ -142,7 +143,7 @@ def compile_library(
             if status != 0:
                 said = said or f"status {status}"
                 raise Unavailable(f"what {tool} made cannot be loaded: {said}")
-        path = folder / f"{name}-{_checksum(made.read_bytes())}.so"
+        path = folder / f"{name}-{_checksum(read_bytes(made))}.so"
         # At once, or not at all: another process may be compiling the same.
         os.replace(made, path)
         return path

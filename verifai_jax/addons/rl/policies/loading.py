@@ -6,12 +6,10 @@ policy("actor.safetensors", activation="elu")           # weights of an MLP
 policy(torch_module, observation=np.zeros(48))
 """
 
-import io
 import json
 import logging
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -35,15 +33,12 @@ from verifai_jax.addons.rl.policies.tensors import (
     normaliser_of,
     normalisers,
 )
-from verifai_jax.addons.rl.policies.torch_archive import (
-    open_archive,
-    read_member,
-    read_state,
-    widened,
-)
+from verifai_jax.addons.rl.policies.torch_archive import read_state, widened
 from verifai_jax.core.compute.fingerprint import used_inputs
 from verifai_jax.core.messages.checks import check_count
 from verifai_jax.core.messages.errors import require, suggests_options
+from verifai_jax.core.store.foreign_archives import read_arrays
+from verifai_jax.core.store.foreign_files import ForeignFileError, read_bytes
 from verifai_jax.systems.policy import Policy as OwnPolicy
 from verifai_jax.systems.policy import load_policy
 
@@ -120,7 +115,10 @@ def policy(
         loaded = source
     elif isinstance(source, str | Path):
         mlp, graph = (activation, network, layers, ignore), (output, memory)
-        loaded = _of_file(Path(source), mlp, graph, normalise is not None)
+        try:
+            loaded = _of_file(Path(source), mlp, graph, normalise is not None)
+        except ForeignFileError as error:
+            raise PolicyError(str(error)) from error
     else:
         loaded = from_object(source, observation, batched)
     stated = action is not None or low is not None or high is not None
@@ -152,10 +150,7 @@ def _of_file(
     kind = path.suffix.lower()
     if kind not in FORMATS:
         raise PolicyError(f"{path} has to be one of {', '.join(FORMATS)}, or a folder of Brax")
-    if (size := path.stat().st_size) > MAX_BYTES:
-        limit = f"a policy may have at most {MAX_BYTES / 1e6:z.0f} MB"
-        raise PolicyError(f"{path} has {size / 1e6:z.0f} MB, and {limit}")
-    data = path.read_bytes()
+    data = read_bytes(path, MAX_BYTES)
     stored = _stored_graph(data, path)
     weights_alone = kind in (".safetensors", ".pt", ".pth") and stored is None
     if not weights_alone and any(mlp):
@@ -180,10 +175,7 @@ def _stored_graph(data: bytes, path: Path) -> tuple[Any, dict[str, np.ndarray]] 
     """Return the graph and the arrays of a file of `Policy.save`; None for another file."""
     with refused(f"{path} holds no policy"):
         if path.suffix.lower() == ".npz":
-            archive = open_archive(data, str(path))
-            files = {n: io.BytesIO(read_member(archive, n, str(path))) for n in archive.namelist()}
-            read = partial(np.lib.format.read_array, allow_pickle=False)
-            arrays = {n.removesuffix(".npy"): read(file) for n, file in files.items()}
+            arrays = read_arrays(data, str(path), MAX_BYTES)
             about = json.loads(str(arrays.pop("about")))
             return (about["graph"], arrays) if "graph" in about else None
         if path.suffix.lower() == ".safetensors":
@@ -228,7 +220,7 @@ def _of_weights(tensors: Tensors, mlp: _MlpOptions, normalised: bool) -> Policy:
             f"network=function(weights, observation); it has {listed(tensors)}"
         )
     if network is not None:
-        arrays = {n: jnp.asarray(a) for n, a in tensors.items() if n not in tensors.used}
+        arrays = {n: jnp.asarray(tensors.peek(n)) for n in tensors if n not in tensors.used}
         return Policy(arrays, _Given(network, what))
     assert activation is not None
     try:
@@ -252,7 +244,8 @@ def _normaliser(given: str | Path | tuple[ArrayLike, ArrayLike] | Normaliser) ->
     if isinstance(given, Normaliser):
         return given
     if isinstance(given, str | Path):
-        return read_normaliser(Path(given).read_bytes(), str(given))
+        with refused("normalise"):
+            return read_normaliser(read_bytes(given, MAX_BYTES), str(given))
     if not isinstance(given, tuple) or len(given) != 2:
         raise PolicyError(f"normalise must be a file or (mean, scale); got {given!r}")
     mean, scale = (np.asarray(v, np.float32) for v in given)

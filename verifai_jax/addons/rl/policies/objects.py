@@ -6,7 +6,6 @@ policy = from_object(model, observation=np.zeros(8))
 import contextlib
 import inspect
 import io
-import json
 import logging
 import time
 import warnings
@@ -29,6 +28,7 @@ from verifai_jax.addons.simulators.environments.episode import count_required, w
 from verifai_jax.core.compute.purity import AS_MEMORY, watch, why_differs
 from verifai_jax.core.messages.errors import require
 from verifai_jax.core.messages.text import format_seconds, one_line
+from verifai_jax.core.store.foreign_files import read_json
 from verifai_jax.core.user_code.kept_state import changed, holds_tracer, state_of
 from verifai_jax.core.user_code.user_errors import defined_at
 
@@ -285,7 +285,7 @@ def read_brax(folder: Path) -> Policy:
     known = require("brax.training.networks", extra="brax").ACTIVATION
     statistics = require("brax.training.acme.running_statistics", extra="brax")
     with refused(f"{folder} holds no checkpoint of Brax' PPO"):
-        config = json.loads((folder / "ppo_network_config.json").read_text())
+        config = read_json(folder / "ppo_network_config.json", within=folder)
         # Brax 0.14.2 refuses a checkpoint of its own whose initialisers are not named; a trained
         # network needs none.
         given = config["network_factory_kwargs"].items()

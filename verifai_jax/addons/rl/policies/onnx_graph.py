@@ -9,6 +9,7 @@ fixed shapes. Source: the ONNX specification, `docs/IR.md` and `docs/Operators.m
 import hashlib
 import json
 import math
+import os
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
@@ -20,13 +21,20 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, PyTree
 
-from verifai_jax.addons.rl.policies.errors import MAX_BYTES, MAX_NUMBERS, PolicyError, refused
+from verifai_jax.addons.rl.policies.errors import (
+    MAX_BYTES,
+    MAX_NUMBERS,
+    MAX_VALUES,
+    PolicyError,
+    refused,
+)
 from verifai_jax.addons.rl.policies.onnx_layers import extreme
 from verifai_jax.addons.rl.policies.onnx_memory import Stated, memory_of
 from verifai_jax.addons.rl.policies.onnx_node import TYPES, Node, cast, fitting, known
 from verifai_jax.addons.rl.policies.onnx_operators import GROWING, OPERATORS, output_size
 from verifai_jax.core.messages.errors import check_names, require
 from verifai_jax.core.messages.text import one_line
+from verifai_jax.core.store.foreign_files import open_file
 
 Values = dict[str, Any]
 OPSET = 18
@@ -35,6 +43,8 @@ SPILLED = ""
 """What has the name of no value: whether whole numbers have left their range."""
 OPSETS = 7, 26
 """The first and the last operator set that is read."""
+_WEIGHTED = {"Gemm", "MatMul", "Conv", "LSTM", "GRU", "RNN"}
+"""Operators whose constant inputs are weights."""
 _DOMAINS = "", "ai.onnx"
 """Names of ONNX's own operators."""
 
@@ -127,9 +137,11 @@ def _as_json(part: Any) -> Any:
     return vars(part) if is_node else [part.dtype.str, part.shape, part.tobytes().hex()]
 
 
-def run(nodes: Sequence[Node], values: Values) -> None:
-    """Compute nodes one after the other, and store their outputs among the values."""
-    total = 0
+def run(nodes: Sequence[Node], values: Values, total: int = 0) -> int:
+    """Compute nodes one after the other, and store their outputs among the values.
+
+    **Returns:** the count of numbers computed, together with the `total` before.
+    """
     for node in nodes:
         absent = [name for name in node.inputs if name and name not in values]
         if absent:
@@ -139,7 +151,7 @@ def run(nodes: Sequence[Node], values: Values) -> None:
         with refused(f"{node} cannot be computed from inputs of shapes {shapes}"):
             _check_size(node, total + output_size(node, *inputs))
             if node.operator == "If":
-                outputs = _branch(node, inputs[0], values)
+                outputs, total = _branch(node, inputs[0], values, total)
             else:
                 outputs = OPERATORS[node.operator](node, *inputs)
                 _note_spilled(node, inputs, outputs, values)
@@ -147,6 +159,7 @@ def run(nodes: Sequence[Node], values: Values) -> None:
         total += sum(int(np.size(made)) for made in outputs)
         _check_size(node, total)
         values.update(zip(node.outputs, outputs, strict=False))
+    return total
 
 
 def _note_spilled(node: Node, inputs: Sequence[Any], outputs: Any, values: Values) -> None:
@@ -172,7 +185,7 @@ def _check_size(node: Node, count: int) -> None:
         )
 
 
-def _branch(node: Node, condition: Any, values: Values) -> tuple[Any, ...]:
+def _branch(node: Node, condition: Any, values: Values, total: int) -> tuple[tuple[Any, ...], int]:
     """Compute the branch of an `If` whose condition is a constant."""
     node.refuse(
         not known(condition),
@@ -181,9 +194,9 @@ def _branch(node: Node, condition: Any, values: Values) -> tuple[Any, ...]:
     )
     inner, outputs = node.attributes["then_branch" if np.all(condition) else "else_branch"]
     within = dict(values)
-    run(inner, within)
+    total = run(inner, within, total)
     values.update({SPILLED: within[SPILLED]} if SPILLED in within else {})
-    return tuple(within[name] for name in outputs)
+    return tuple(within[name] for name in outputs), total
 
 
 def read_onnx(
@@ -229,6 +242,7 @@ def read_onnx(
         if re.search("(unsupported|inconsistent) type|input size", str(error)):
             wrong = one_line(str(error))
     nodes = reader.nodes(graph, {*arrays, *(i.name for i in fed)}, {})
+    _check_finite(nodes, arrays, what)
     types = {i.name: i.type.tensor_type.elem_type for i in fed}
     wrong = wrong or next((f"type {t} of {n!r}" for n, t in types.items() if t not in TYPES), "")
     if wrong:
@@ -272,14 +286,25 @@ def read_graph(data: Mapping[str, Any], arrays: Mapping[str, np.ndarray], what: 
         if array.dtype.kind not in "fiub" or np.any(np.isnan(array)):
             raise PolicyError(f"the array {name!r} of {what} holds NaN, or no numbers")
     check_nodes(nodes, {*arrays, *inputs}, [output, *(after for _, after in memory)], what)
+    _check_finite(nodes, arrays, what)
     rest = {n: a for n, a in arrays.items() if n not in dict(memory)}
     weights, constants = _sorted_out(rest)
     return Graph(nodes, constants, inputs, memory, output), weights, start
 
 
+def _check_finite(nodes: Sequence[Node], arrays: Mapping[str, np.ndarray], what: str) -> None:
+    """Refuse weights that are infinite; other constants, such as bounds, may be."""
+    used = {n for node in nodes if node.operator in _WEIGHTED for n in node.inputs if n in arrays}
+    for name in sorted(used):
+        if not np.all(np.isfinite(np.asarray(arrays[name], np.float32))):
+            raise PolicyError(f"the tensor {name!r} of {what} holds infinite weights")
+
+
 def check_nodes(nodes: Sequence[Node], known: set[str], outputs: Sequence[str], what: str) -> None:
     """Check that operators exist, and that inputs of nodes and outputs are computed earlier."""
     known = set(known)
+    if len(nodes) > MAX_VALUES:
+        raise PolicyError(f"{what} has {len(nodes):,} nodes; at most {MAX_VALUES:,} are read")
     missing = sorted({n.operator for n in nodes} - {*OPERATORS, "If"})
     if missing:
         first = next(n for n in nodes if n.operator == missing[0])
@@ -357,6 +382,9 @@ class _Reader:
 
     def tensors(self, graph: Any) -> dict[str, np.ndarray]:
         """Return the tensors of a graph by name."""
+        names = [t.name for t in graph.initializer]
+        if twice := next((name for name in set(names) if names.count(name) > 1), ""):
+            raise PolicyError(f"{self.what} has two tensors that are called {twice!r}")
         return {t.name: self._tensor(t) for t in graph.initializer}
 
     def _tensor(self, tensor: Any) -> np.ndarray:
@@ -386,11 +414,9 @@ class _Reader:
         file = self.path.parent / name
         if length != count or min(offset, count) < 0 or count > MAX_BYTES:
             raise ValueError(f"it says {length} bytes for shape {list(tensor.dims)}")
-        if file.resolve().parent != self.path.resolve().parent:
-            raise ValueError(f"{name} is a link to another folder")
-        if offset + count > file.stat().st_size:
-            raise ValueError(f"{name} is smaller than the model says")
-        with file.open("rb") as opened:
+        with open_file(file, within=self.path.parent) as opened:
+            if offset + count > opened.seek(0, os.SEEK_END):
+                raise ValueError(f"{name} is smaller than the model says")
             opened.seek(offset)
             return np.frombuffer(opened.read(count), dtype).reshape(tuple(tensor.dims))
 

@@ -125,6 +125,7 @@ def recurrent(node: Node, x: Array, w: Array, r: Array, *more: Array | None) -> 
     odd = node.get("layout", 0) or node.get("clip", None)
     node.refuse(odd, "has layout=1 or clip, which are not supported")
     hidden, count = r.shape[-1], r.shape[0]
+    node.refuse(count > 2, f"has {count} directions; there are two")
     names = node.get("activations", usual * count)
     unknown = sorted({*names} - {*_FUNCTIONS})
     node.refuse(unknown != [], f"has the activation {unknown[:1]}, which is not supported")

@@ -158,7 +158,9 @@ def _split(node: Node, x: Value, sizes: Given = None) -> tuple[Value, ...]:
     axis = node.get("axis", 0)
     lengths = node.get("split", None) if sizes is None else static(node, sizes)
     if lengths is None:
-        count = node.get("num_outputs", len(node.outputs))
+        count = len(node.outputs)
+        differ = node.get("num_outputs", count) != count
+        node.refuse(differ, f"has {count} outputs, which are not its num_outputs")
         step = -(-x.shape[axis] // count)
         lengths = [min(step, x.shape[axis] - i * step) for i in range(count)]
     return tuple(module(x).split(x, np.cumsum(lengths)[:-1].tolist(), axis=axis))
@@ -257,7 +259,8 @@ GROWING = {
     "ReduceMean": "ReduceSum", "Cast": "Identity", "CastLike": "Identity",
 }  # fmt: skip
 """Operators whose results may be larger than their inputs, with those that say how large."""
-_ELEMENTWISE = {*_OF_NUMPY, "Min", "Max", "Sum", "Mean", "Div", "Mod", "PRelu", "Where"}
+_ELEMENTWISE = {*_OF_NUMPY, "Min", "Max", "Sum", "Mean", "Div", "Mod", "PRelu", "Where", "Clip"}
+_ELEMENTWISE |= {"LayerNormalization", "RMSNormalization"}
 
 
 def output_size(node: Node, *inputs: Any) -> int:
@@ -282,6 +285,9 @@ def output_size(node: Node, *inputs: Any) -> int:
         case "Conv" | "MaxPool" | "AveragePool", _:
             channels = shapes[1][0] if node.operator == "Conv" else shapes[0][1]
             wide = 2 * max(0, 0, *node.get("pads", ()))
+            if node.get("auto_pad", "NOTSET").startswith("SAME"):
+                spans = node.get("kernel_shape", shapes[-1][2:])
+                wide += max(spans) * max(node.get("dilations", (1,)))
             return shapes[0][0] * channels * math.prod(n + wide for n in shapes[0][2:])
         case "Gather", 2:
             rows = max(1, shapes[0][node.get("axis", 0)])
@@ -290,6 +296,14 @@ def output_size(node: Node, *inputs: Any) -> int:
             a, b = shapes
             batch = math.prod(np.broadcast_shapes(a[:-2], b[:-2]))
             return batch * math.prod(a[-2:-1]) * math.prod(b[-1:] if len(b) > 1 else ())
+        case "Concat", _:
+            return sum(map(math.prod, shapes))
+        case "BatchNormalization" | "InstanceNormalization", _:
+            return math.prod(shapes[0]) * (
+                1 if shapes[0][1] > 1 else max(map(math.prod, shapes[1:]))
+            )
+        case "LSTM" | "GRU" | "RNN", _:
+            return math.prod(shapes[0][:2]) * math.prod(shapes[1][:2])
         case "Gemm", _:
             return max(shapes[0]) * max(shapes[1])
         case operator, _ if operator in _ELEMENTWISE:

@@ -15,7 +15,8 @@ from typing import Any
 
 import numpy as np
 
-from verifai_jax.addons.rl.policies.errors import PolicyError, refused
+from verifai_jax.addons.rl.policies.errors import MAX_VALUES, PolicyError, refused
+from verifai_jax.core.store.foreign_files import check_shared
 
 
 @dataclass(frozen=True)
@@ -24,6 +25,10 @@ class Name:
 
     module: str
     name: str
+
+    def __post_init__(self) -> None:
+        if not (isinstance(self.module, str) and isinstance(self.name, str)):
+            raise ValueError("the name of a class is not a text")
 
 
 @dataclass(eq=False)
@@ -91,7 +96,19 @@ class _Stack(list[Any]):
 
 
 def _pairs(taken: list[Any]) -> Iterable[tuple[Any, Any]]:
+    if not all(isinstance(key, str | bytes | float | int | Name | None) for key in taken[::2]):
+        raise ValueError("a key of a dictionary is neither a text nor a number")
     return zip(taken[::2], taken[1::2], strict=True)
+
+
+def _parts(value: Any) -> list[Any]:
+    """Return the values that are directly below one."""
+    if isinstance(value, Record):
+        return [value.function, value.arguments, value.state, value.items]
+    if isinstance(value, Persistent):
+        return [value.reference]
+    inner = [*value.values()] if isinstance(value, dict) else value
+    return [*inner] if isinstance(inner, list | tuple) else []
 
 
 def _named(function: Any, arguments: Any, named: Any) -> Record:
@@ -149,6 +166,8 @@ def read_pickle(data: bytes, what: str) -> Any:
             else:
                 raise ValueError(f"the operation {operation.name} is not supported")
         (result,) = stack
+        # Whoever walks or shows it meets a shared value as often as it is referred to.
+        check_shared(result, _parts, MAX_VALUES, f"{what} refers to", cycles=True)
         return result
 
 

@@ -17,11 +17,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from verifai_jax.addons.rl.policies.base import Actions, Normaliser, Policy
-from verifai_jax.addons.rl.policies.errors import PolicyError, refused
+from verifai_jax.addons.rl.policies.errors import MAX_BYTES, PolicyError, refused
 from verifai_jax.addons.rl.policies.networks import Mlp, activation_name
 from verifai_jax.addons.rl.policies.pickled import Name, Record, array_of, read_pickle
 from verifai_jax.addons.rl.policies.tensors import Tensors, linear_layers, natural
-from verifai_jax.addons.rl.policies.torch_archive import open_archive, read_member, read_state
+from verifai_jax.addons.rl.policies.torch_archive import read_state
+from verifai_jax.core.store.foreign_archives import open_archive, read_member
 
 _KINDS = (
     # What is there, the hidden layers, the last layer (None: the last of the hidden ones), the
@@ -42,7 +43,7 @@ EXPORT = "export it as ONNX, and load that"
 
 def read_sb3(data: bytes, what: str) -> Policy:
     """Return a model of Stable-Baselines3, which acts as its `predict(..., deterministic=True)`."""
-    archive = open_archive(data, what)
+    archive = open_archive(data, what, MAX_BYTES)
     if "data" not in archive.namelist() or "policy.pth" not in archive.namelist():
         raise PolicyError(
             f"{what} is not a model of Stable-Baselines3: it has no data and policy.pth. Name an "

@@ -43,7 +43,10 @@ class Tensors(dict[str, np.ndarray]):
 
     def peek(self, name: str) -> np.ndarray:
         """Return a tensor that does not count as read by that."""
-        return super().__getitem__(name)
+        array = super().__getitem__(name)
+        if not np.all(np.isfinite(array)):
+            raise PolicyError(f"the tensor {name!r} of {self.what} holds NaN or infinite numbers")
+        return array
 
     def ignore(self, names: Iterable[str]) -> None:
         """Count tensors as read, by names or their beginnings, of which each must exist."""

@@ -6,9 +6,7 @@ A file of `torch.save` is an archive with one pickle, `data.pkl`, that refers to
 Source: `torch/serialization.py` of PyTorch 2.
 """
 
-import io
 import math
-import zipfile
 from collections.abc import Mapping
 from typing import Any
 
@@ -17,6 +15,7 @@ import numpy as np
 
 from verifai_jax.addons.rl.policies.errors import MAX_BYTES, PolicyError, refused
 from verifai_jax.addons.rl.policies.pickled import Name, Persistent, Record, array_of, read_pickle
+from verifai_jax.core.store.foreign_archives import open_archive, read_member
 
 _STORAGES: dict[str, Any] = {
     "FloatStorage": np.float32, "DoubleStorage": np.float64, "HalfStorage": np.float16,
@@ -26,32 +25,9 @@ _STORAGES: dict[str, Any] = {
 }  # fmt: skip
 
 
-def open_archive(data: bytes, what: str) -> zipfile.ZipFile:
-    """Open an archive; refuse one larger than `MAX_BYTES` when unpacked."""
-    with refused(f"{what} is not an archive, or is damaged"):
-        archive = zipfile.ZipFile(io.BytesIO(data))
-    size = sum(entry.file_size for entry in archive.infolist())
-    if size > MAX_BYTES:
-        raise PolicyError(
-            f"{what} unpacks to {size / 1e6:z.0f} MB, and a policy may have "
-            f"{MAX_BYTES / 1e6:z.0f} MB"
-        )
-    return archive
-
-
-def read_member(archive: zipfile.ZipFile, name: str, what: str) -> bytes:
-    """Return the bytes of a member of an archive; refuse one larger than stated."""
-    with refused(f"{what} has no readable {name}"), archive.open(name) as file:
-        size = archive.getinfo(name).file_size
-        data = file.read(size + 1)
-    if len(data) > size:
-        raise PolicyError(f"{name} of {what} is larger than the archive says")
-    return data
-
-
 def read_state(data: bytes, what: str) -> dict[str, np.ndarray]:
     """Return the tensors in a file of `torch.save`; dots join names of nested dictionaries."""
-    archive = open_archive(data, what)
+    archive = open_archive(data, what, MAX_BYTES)
     pickles = [n for n in archive.namelist() if n.rpartition("/")[2] == "data.pkl"]
     if len(pickles) != 1:
         raise PolicyError(f"{what} is not a file of torch.save: it has no data.pkl")
@@ -91,6 +67,7 @@ def _tensor(value: Any, read: Any, name: str) -> np.ndarray | None:
         storage, offset, shape, stride = value.arguments[:4]
         assert isinstance(storage, Persistent)
         _, kind, key, _, _ = storage.reference
+        assert isinstance(key, str)
         flat = np.frombuffer(read(key), _STORAGES[kind.name])
         last = offset + sum((n - 1) * s for n, s in zip(shape, stride, strict=True))
         if min((offset, *shape, *stride)) < 0 or (math.prod(shape) and last >= len(flat)):

@@ -11,7 +11,6 @@ FMU that crashes ends only its worker and costs one row.
 import atexit
 import shutil
 import tempfile
-import zipfile
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -28,6 +27,7 @@ from verifai_jax.addons.simulators.fmu.exchange import ExchangeInstance
 from verifai_jax.addons.simulators.fmu.library import FMUError, Instance
 from verifai_jax.core.messages.checks import check_positive, is_number
 from verifai_jax.core.messages.errors import missing_name, suggests_options
+from verifai_jax.core.store.foreign_archives import open_archive
 from verifai_jax.core.values.trace import Trace
 from verifai_jax.core.values.waveform import is_waveform
 from verifai_jax.features import Domain
@@ -215,8 +215,7 @@ class FMUSimulation:
                 )
             folder = Path(tempfile.mkdtemp(prefix="verifai_jax_fmu_"))
             atexit.register(shutil.rmtree, folder, ignore_errors=True)
-            with zipfile.ZipFile(self.file) as archive:
-                archive.extractall(folder)
+            open_archive(self.file, self.file.name).extractall(folder)
             kind = ExchangeInstance if self.description.exchange else Instance
             _instances[self._key] = kind(self.description, folder)
         return _instances[self._key]

@@ -9,13 +9,14 @@ A document type declaration is refused, since it could make XML read files or gr
 import math
 import platform
 import sys
-import zipfile
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from xml.etree.ElementTree import Element
 
 from verifai_jax.core.messages.errors import missing_name
+from verifai_jax.core.messages.text import one_line
+from verifai_jax.core.store.foreign_archives import open_archive, read_member
 from verifai_jax.core.store.foreign_files import read_xml
 
 MAX_BYTES = 64 << 20
@@ -145,8 +146,7 @@ class Description:
         folder = f"{system}64" if self.version == 2 else f"{machine}-{system}"
         folder = f"{machine}-windows" if folder.endswith("-win") else folder
         wanted = f"binaries/{folder}/{self.identifier}.{ending}"
-        with zipfile.ZipFile(self.file) as archive:
-            names = archive.namelist()
+        names = open_archive(self.file, self.file.name).namelist()
         if wanted not in names:
             there = sorted({n.split("/")[1] for n in names if n.startswith("binaries/")} - {""})
             raise ValueError(
@@ -170,14 +170,13 @@ def read_description(file: str | Path, exchange: bool | None = None) -> Descript
         raise FileNotFoundError(f"there is no FMU {path}")
     what = f"the modelDescription.xml of {path.name}"
     try:
-        with zipfile.ZipFile(path) as archive:
-            if archive.getinfo("modelDescription.xml").file_size > MAX_BYTES:
-                raise ValueError(f"{what} is over {MAX_BYTES} bytes")
-            root = read_xml(archive.read("modelDescription.xml"), what)
-    except (zipfile.BadZipFile, KeyError) as error:
+        archive = open_archive(path, path.name)
+        text = read_member(archive, "modelDescription.xml", path.name, MAX_BYTES)
+    except ValueError as error:
         raise ValueError(
             f"{path.name} is not an FMU: an archive with modelDescription.xml is expected ({error})"
         ) from error
+    root = read_xml(text, what)
     declared = root.get("fmiVersion", "without a version")
     if (version := declared.split(".")[0]) not in ("2", "3"):
         raise ValueError(f"{path.name} is of FMI {declared}; 2 and 3 can be simulated")
@@ -193,6 +192,11 @@ def read_description(file: str | Path, exchange: bool | None = None) -> Descript
         )
     token = root.get("guid") if version == "2" else root.get("instantiationToken")
     states = len(root.findall("ModelStructure/Derivatives/Unknown"))
+    try:
+        variables = _variables(root, int(version))
+        indicators = int(root.get("numberOfEventIndicators", "0"))
+    except ValueError as error:
+        raise ValueError(f"{what} is damaged: {one_line(str(error))}") from None
     kind, two = there[exchange], version == "2"
 
     def says(attribute: str) -> bool:
@@ -200,8 +204,8 @@ def read_description(file: str | Path, exchange: bool | None = None) -> Descript
 
     return Description(
         path, int(version), root.get("modelName", path.stem),
-        kind.get("modelIdentifier", ""), token or "", _variables(root, int(version)),
-        exchange, (states, int(root.get("numberOfEventIndicators", "0"))),
+        kind.get("modelIdentifier", ""), token or "", variables,
+        exchange, (states, indicators),
         says("canHandleVariableCommunicationStepSize") or exchange,
         says("canGetAndSetFMUstate" if two else "canGetAndSetFMUState"),
         says("canBeInstantiatedOnlyOncePerProcess"),

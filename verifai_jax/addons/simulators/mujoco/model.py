@@ -19,6 +19,7 @@ import numpy as np
 
 from verifai_jax.addons.simulators.mujoco.part_paths import MjModel, names
 from verifai_jax.core.messages.errors import require, unknown_name
+from verifai_jax.core.store.foreign_files import open_file, read_bytes
 from verifai_jax.core.user_code.user_files import file_hash
 
 MAX_FILES = 200
@@ -204,8 +205,9 @@ def _spec(mujoco: ModuleType, source: ModelSource) -> Any:
     try:
         if "<" in str(source):
             return mujoco.MjSpec.from_string(str(source))
-        if not Path(source).is_file():
+        if not Path(source).exists():
             raise FileNotFoundError(f"there is no MJCF file {str(source)!r}")
+        open_file(source).close()
         return mujoco.MjSpec.from_file(str(source))
     except ValueError as error:
         where = "MJCF text" if "<" in str(source) else str(source)
@@ -254,7 +256,7 @@ def files_referred_to(model: Path) -> list[Path]:
         if file.suffix.lower() not in _MODELS:
             continue
         try:
-            text = file.read_text(encoding="utf-8", errors="replace")
+            text = read_bytes(file).decode("utf-8", "replace")
         except OSError:
             continue
         folders[file.parent] = None

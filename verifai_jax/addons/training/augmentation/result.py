@@ -25,8 +25,8 @@ from verifai_jax.core.display.figure import Figure
 from verifai_jax.core.display.lazy import lazy_import
 from verifai_jax.core.display.notebook import InNotebook
 from verifai_jax.core.messages.errors import check_names, unknown_name
-from verifai_jax.core.store.files import replacing_all
 from verifai_jax.core.store.locks import write_lock
+from verifai_jax.core.store.replacements import replacing_all
 
 TABLE, ADDED, SUMMARY = "table.parquet", "added.parquet", "summary.txt"
 """Files of a result in a folder."""

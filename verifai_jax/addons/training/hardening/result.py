@@ -15,8 +15,8 @@ from verifai_jax.addons.training.paired import PairedDifference, paired_differen
 from verifai_jax.core.display.figure import Drawn
 from verifai_jax.core.display.notebook import Tabular
 from verifai_jax.core.messages.text import counted, format_percent
-from verifai_jax.core.store.files import replacing_all
 from verifai_jax.core.store.locks import write_lock
+from verifai_jax.core.store.replacements import replacing_all
 from verifai_jax.statistics.confidence_sequences import safe_at
 
 HARDENED, BASELINE = "hardened", "randomised"

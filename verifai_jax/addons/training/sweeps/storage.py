@@ -11,9 +11,9 @@ The files never name code: pass the study to `load_sweep(folder, study)`.
 """
 
 import json
-import zipfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from reprlib import repr as shown
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -23,7 +23,10 @@ from verifai_jax.addons.training.sweeps.record import Curve, SweepRecord, Traine
 from verifai_jax.core.messages.text import one_line
 from verifai_jax.core.store import files
 from verifai_jax.core.store.files import DamagedError, checksum, plain
-from verifai_jax.core.store.locks import write_lock
+from verifai_jax.core.store.foreign_archives import read_arrays, read_parquet
+from verifai_jax.core.store.foreign_files import read_bytes
+from verifai_jax.core.store.locks import settled, write_lock
+from verifai_jax.core.store.replacements import replacing_all
 from verifai_jax.core.user_code.sources import Sources
 from verifai_jax.features import FeatureSpace
 from verifai_jax.systems.policy import Policy, save_policy
@@ -42,6 +45,14 @@ POLICIES = "policies"
 """Folder of the policies."""
 _PLAIN = ("study", "seed", "hyperparameters", "certified", "options", "version", "seconds")
 """Fields of the record that are plain data."""
+_KINDS: dict[str, Any] = {
+    "study": str, "seed": int, "version": str, "complete": bool, "rows": int,
+    "hyperparameters": list[str], "mixed": list[str], "certified": list[int],
+    "options": dict[str, Any], "seconds": dict[str, float], "checksums": dict[str, int],
+    "used": dict[str, list[str]], "worst": list[dict[str, Any] | None],
+    "sources": list[dict[str, Any]], "space": dict[str, Any] | None,
+}  # fmt: skip
+"""What the entries of the record are."""
 
 
 class SweepFileError(ValueError):
@@ -72,9 +83,8 @@ def write_sweep(stored: StoredSweep, table: "pd.DataFrame", folder: Path) -> Pat
     **Raises:** `FolderInUse` if another process writes there; `OSError` if the file system refuses,
     in which case the old content stays.
     """
-    # The record comes last: a folder without it holds no sweep.
     names = (TABLE, FAILING, CURVES, POLICIES, RECORD)
-    with write_lock(folder), files.replacing_all(folder, names) as made:
+    with write_lock(folder), replacing_all(folder, names) as made:
         _write_files(stored, table, made)
     return folder
 
@@ -110,7 +120,7 @@ def _write_files(stored: StoredSweep, table: "pd.DataFrame", folder: Path) -> No
         "worst": record.worst,
         "space": _space_to_json(stored.space),
         "checksums": {
-            file.relative_to(folder).as_posix(): checksum(file.read_bytes())
+            file.relative_to(folder).as_posix(): checksum(read_bytes(file))
             for file in _files(folder, record.rows)
         },
     }
@@ -128,13 +138,20 @@ def read_description(folder: Path) -> dict[str, Any]:
 
     **Raises:** `FileNotFoundError` for a folder without one; `SweepFileError` for a damaged file.
     """
-    file = folder / RECORD
+    file = settled(folder) / RECORD
     if not file.exists():
         raise FileNotFoundError(f"no sweep in {folder}: {RECORD} is missing")
     try:
-        return files.read_record(file)
+        found = files.read_record(file)
     except DamagedError as error:
         raise SweepFileError(str(error)) from error
+    for name, kind in _KINDS.items():
+        if not files.is_of(found.get(name), kind):
+            value = shown(found.get(name))
+            raise SweepFileError(f"{file} is damaged: its {name} cannot be {value}")
+    if not files.is_of(found["options"].get("p"), float | None):
+        raise SweepFileError(f"{file} is damaged: its p cannot be {shown(found['options']['p'])}")
+    return found
 
 
 def check_study(
@@ -162,16 +179,14 @@ def read_sweep(description: Mapping[str, Any], folder: Path) -> StoredSweep:
     - `description`: the description of the folder, from `read_description`.
     **Raises:** `SweepFileError` if a file is missing or damaged.
     """
-    import pandas as pd
-
     try:
         _check_files(folder, description["checksums"])
         used = {name: tuple(names) for name, names in description["used"].items()}
         record, space = _read_record(folder, description), _space_from_json(description["space"])
-        return StoredSweep(record, space, used, pd.read_parquet(folder / FAILING))
+        return StoredSweep(record, space, used, read_parquet(folder / FAILING).to_pandas())
     except FileNotFoundError as error:
         raise SweepFileError(f"the sweep in {folder} is incomplete: {error}") from error
-    except (KeyError, TypeError, ValueError, OSError, zipfile.BadZipFile) as error:
+    except (KeyError, TypeError, ValueError, AttributeError, OSError) as error:
         reason = one_line(str(error))
         raise SweepFileError(f"the sweep in {folder} is damaged: {reason}") from error
 
@@ -181,7 +196,9 @@ def _check_files(folder: Path, checksums: Mapping[str, int]) -> None:
     for name, own in checksums.items():
         file = folder / name
         optional = name.startswith(f"{POLICIES}/")
-        if not (optional and not file.exists()) and checksum(file.read_bytes()) != own:
+        if optional and not file.exists():
+            continue
+        if checksum(read_bytes(file, within=folder)) != own:
             hint = "; the rest can be read without this file" if optional else ""
             raise SweepFileError(f"{name} has changed since it was written{hint}")
 
@@ -189,21 +206,23 @@ def _check_files(folder: Path, checksums: Mapping[str, int]) -> None:
 def _read_record(folder: Path, description: Mapping[str, Any]) -> SweepRecord:
     import pandas as pd
 
-    table = pd.read_parquet(folder / TABLE)
+    table = read_parquet(folder / TABLE).to_pandas()
     rows = description["rows"]
     if len(table) != rows or len(description["worst"]) != rows:
         raise SweepFileError(
             f"the sweep in {folder} is damaged: {len(table)} rows in {TABLE}, {rows} in {RECORD}"
         )
+    if absent := {*description["hyperparameters"]} - {*table.columns}:
+        raise SweepFileError(f"{TABLE} has no column {min(absent)!r}")
     for name in description["mixed"]:
         table[name] = pd.Series([json.loads(v) for v in table[name]], table.index, dtype=object)
     curves: dict[tuple[int, int], Curve] = {}
-    with np.load(folder / CURVES, allow_pickle=False) as arrays:
-        for name in arrays.files:
-            configuration, seed, part = name.split("/")
-            if part == "steps":
-                returns = arrays[f"{configuration}/{seed}/mean_return"]
-                curves[int(configuration), int(seed)] = Curve(arrays[name], returns)
+    arrays = read_arrays(folder / CURVES, CURVES)
+    for name, steps in arrays.items():
+        configuration, seed, part = name.split("/")
+        if part == "steps":
+            returns = arrays[f"{configuration}/{seed}/mean_return"]
+            curves[int(configuration), int(seed)] = Curve(steps, returns)
     policies: list[TrainedPolicy | None] = []
     for i in range(len(table)):
         file = folder / POLICIES / f"{i}.npz"

@@ -1,0 +1,167 @@
+"""Mutated files of every door of the add-ons give a result, or one error in words."""
+
+import io
+import json
+import logging
+import warnings
+import zipfile
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pandas as pd
+import pytest
+from mutated import altered, flipped, wrong_answers
+
+import verifai_jax as vj
+from verifai_jax.addons.assurance.odd_files import read_odd
+from verifai_jax.addons.assurance.traceability.tested import read_cases
+from verifai_jax.addons.monitoring.recording import read
+from verifai_jax.addons.reports.stored import read_result
+from verifai_jax.addons.rl.policies import policy
+from verifai_jax.addons.simulators.fmu.description import read_description
+from verifai_jax.cli.json_output import as_plain
+
+FEW, MANY = 40, 500
+POLICIES = Path(__file__).parent / "rl" / "policies" / "files"
+JUNIT = """<testsuites><testsuite name="s"><testcase classname="a.b" name="t">
+<properties><property name="vj_simulations" value="7"/></properties><failure message="no"/>
+</testcase></testsuite></testsuites>"""
+ODD = """TAXONOMY:
+  scenery:
+    road_type: [motorway, street, lane]
+  dynamic:
+    ego_speed: float velocity
+ODD:
+  town:
+    INCLUDE_AND:
+      road_type: [street, lane]
+      ego_speed: "[0 .. 54] km/h"
+    EXCLUDE_AND:
+      road_type: lane
+"""
+BINDING = """openodd: [odd.yaml]
+name: streets
+features:
+  speed: {attribute: dynamic.ego_speed, unit: m/s, reason: limit of the town, source: StVO 3}
+  road: {attribute: road_type}
+"""
+
+
+def load(path):
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        loaded = policy(path, activation="elu" if path.suffix in (".pt", ".safetensors") else None)
+        with np.load(POLICIES / f"{path.stem}.expected.npz") as known:
+            jax.eval_shape(loaded.act, jnp.asarray(known["observations"][0]))
+
+
+def columns():
+    time = np.arange(30) * 0.1
+    return {"time": time, "speed": np.sin(time), "gap": np.linspace(5.0, 1.0, 30)}
+
+
+def write_hdf5(path):
+    h5py = pytest.importorskip("h5py")
+    with h5py.File(path, "w") as file:
+        for name, values in columns().items():
+            file.create_dataset(name, data=values, chunks=(10,), compression="gzip")
+
+
+def write_netcdf(path):
+    xarray = pytest.importorskip("xarray")
+    pytest.importorskip("netCDF4")
+    values = columns()
+    time = values.pop("time")
+    data = {name: ("time", column) for name, column in values.items()}
+    xarray.Dataset(data, {"time": time}).to_netcdf(path)
+
+
+def write_mcap(path):
+    writer = pytest.importorskip("mcap.writer")
+    with path.open("wb") as file:
+        made = writer.Writer(file)
+        made.start()
+        schema = made.register_schema("any", "jsonschema", b"{}")
+        channel = made.register_channel("/speed", "json", schema)
+        for i in range(20):
+            made.add_message(
+                channel, i * 10**8, json.dumps({"v": i, "p": [1, 2]}).encode(), i * 10**8
+            )
+        made.finish()
+
+
+def write_domain(path):
+    path.write_text(BINDING)
+    path.with_name("odd.yaml").write_text(ODD)
+
+
+def write_estimate(path):
+    found = vj.Estimate("it", 0.1, 0.05, 0.2, 0.95, "monte_carlo", 50, 90, 6, 0, 0.4, 50, 6, 0)
+    about = {"command": "estimate", "version": "0.1.0"}
+    path.write_text(json.dumps({**about, **as_plain(found)}))
+
+
+DOORS = {
+    "ppo.zip": (None, load),
+    "mlp.onnx": (None, load),
+    "mlp.pt": (None, load),
+    "mlp.safetensors": (None, load),
+    "drive.csv": (lambda path: pd.DataFrame(columns()).to_csv(path, index=False), read),
+    "drive.parquet": (lambda path: pd.DataFrame(columns()).to_parquet(path), read),
+    "drive.npz": (lambda path: np.savez_compressed(path, **columns()), read),
+    "drive.h5": (write_hdf5, read),
+    "drive.nc": (write_netcdf, read),
+    "drive.mcap": (write_mcap, read),
+    "watch.fmu": (lambda path: vj.mtl.export_fmu("x > 0", 0.1, path), read_description),
+    "streets.yaml": (write_domain, read_odd),
+    "estimate.json": (write_estimate, lambda path: str(read_result(path))),
+    "results.xml": (lambda path: path.write_text(JUNIT), lambda path: read_cases([path])),
+}
+"""Valid files: what writes one, or None where there is one already, and what reads it."""
+
+
+def rezipped(data, rng):
+    """Return an archive with a member that is mutated, and its checksum right again."""
+    with zipfile.ZipFile(io.BytesIO(data)) as archive:
+        members = {name: archive.read(name) for name in archive.namelist()}
+    name = list(members)[rng.integers(len(members))]
+    content = members[name]
+    members[name] = (altered if content[:1] == b"{" else flipped)(content, rng)
+    made = io.BytesIO()
+    with zipfile.ZipFile(made, "w") as archive:
+        for each, content in members.items():
+            archive.writestr(each, content)
+    return made.getvalue()
+
+
+def check(name, tmp_path, count):
+    logging.getLogger("verifai_jax").setLevel(logging.CRITICAL)
+    write, read_it = DOORS[name]
+    path = tmp_path / name
+    if write is not None:
+        write(path)
+    content = path.read_bytes() if write is not None else (POLICIES / name).read_bytes()
+    path.write_bytes(content)
+    read_it(path)
+    wrong = []
+    for seed in range(count):
+        rng = np.random.default_rng(seed)
+        zipped = zipfile.is_zipfile(io.BytesIO(content)) and rng.integers(4)
+        of_json = path.suffix == ".json" and rng.integers(4)
+        path.write_bytes((rezipped if zipped else altered if of_json else flipped)(content, rng))
+        if why := wrong_answers(lambda: read_it(path)):
+            wrong.append(f"{seed}: {why}")
+    assert not wrong, "\n".join(wrong)
+
+
+@pytest.mark.parametrize("name", DOORS)
+def test_mutated(name, tmp_path):
+    check(name, tmp_path, FEW)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", DOORS)
+def test_many_mutated(name, tmp_path):
+    check(name, tmp_path, MANY)
