@@ -37,7 +37,7 @@ Temperature: TypeAlias = Float[np.ndarray, " n"] | float
 """Temperatures of the smooth robustness, or one for all."""
 ALIKE = 1e-2
 """Relative difference of two derivatives from which on they differ by more than rounding."""
-ROUNDINGS = 10
+ROUNDINGS = 4
 """How far native code may be from XLA, in differences of XLA's own results in two roundings."""
 FLOOR = 2e-6
 """What native code may differ by where XLA rounds nothing, relative to 1 or the robustness: the 16
