@@ -158,7 +158,7 @@ def by_cross_entropy(game, simulations, seed):
     """Return the greatest log-density of a failure that cross-entropy found."""
     space = {f"w{k}": vj.Normal(0.0, 1.0) for k in range(PERIODS)}
     problem = vj.Problem("game", space, game.simulate, "always margin >= 0")
-    run = vj.falsify(problem, "cross_entropy", simulations, objective="likelihood", seed=seed,
+    run = vj.falsify(problem, vj.search.Likeliest(vj.search.CrossEntropy()), simulations, seed=seed,
                      confirm=False, progress=False)  # fmt: skip
     failing = run.table.counterexamples
     points = failing[list(space)].to_numpy()

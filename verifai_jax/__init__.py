@@ -93,10 +93,12 @@ if TYPE_CHECKING:
     from verifai_jax.counterexamples import explain as explain
     from verifai_jax.counterexamples import replay_counterexamples as replay_counterexamples
     from verifai_jax.counterexamples import shrink as shrink
+    from verifai_jax.evaluation.run_on import RunOn as RunOn
     from verifai_jax.falsification import ErrorTable as ErrorTable
     from verifai_jax.falsification import Replay as Replay
     from verifai_jax.falsification import Run as Run
     from verifai_jax.falsification import RunError as RunError
+    from verifai_jax.falsification import Start as Start
     from verifai_jax.falsification import falsify as falsify
     from verifai_jax.falsification import load as load
     from verifai_jax.falsification import resume as resume
@@ -142,6 +144,7 @@ if TYPE_CHECKING:
     )
     from verifai_jax.statistics.confidence_sequences import anytime_interval as anytime_interval
     from verifai_jax.statistics.stopping import Decided as Decided
+    from verifai_jax.statistics.stopping import Stop as Stop
     from verifai_jax.statistics.stopping import Within as Within
     from verifai_jax.systems.base import System as System
     from verifai_jax.systems.blackbox import blackbox as blackbox

@@ -45,8 +45,8 @@ MAX_DROPPED = 100
 ever for one that mixes up its answers."""
 MAX_AHEAD = 1 << 22
 """Rows at most that are on their way at a time: a bound on the memory that they take."""
-SHIPMENTS: Slot[tuple[str, str | None], Any] = Slot("shipments")
-"""The problem as it is sent, by kind of executor and target."""
+SHIPMENTS: Slot[str, Any] = Slot("shipments")
+"""The problem as it is sent, by kind of executor."""
 
 
 class ExecutorEngine:
@@ -59,7 +59,6 @@ class ExecutorEngine:
     - `gradient`, `clauses`, `precision`, `guidance`: as in `engine.Engine`.
     - `given`: whether points are rows of given features, as in `CubePoints`.
     - `journal`: the journal of rows in progress, for a problem on the host.
-    - `target`: the name `FILE.py:NAME` of the problem, for an executor that cannot pickle it.
     **Raises:** `TypeError` for anything that is not an executor; `ValueError` for an executor that
     cannot work here, or to which the problem cannot be sent.
     """
@@ -74,7 +73,6 @@ class ExecutorEngine:
         clauses: bool = False,
         precision: str = "float32",
         journal: Journal | None = None,
-        target: str | None = None,
         guidance: Guidance = NOTHING,
         given: bool = False,
     ) -> None:
@@ -84,8 +82,8 @@ class ExecutorEngine:
         self._journal = journal if problem.black_box else None
         self._shipment = problem.programs.get(
             SHIPMENTS,
-            (type(executor).__module__ + type(executor).__name__, target),
-            lambda: executors.ship(problem, executor, target, identity),
+            type(executor).__module__ + type(executor).__name__,
+            lambda: executors.ship(problem, executor, problem.target, identity),
         )
         form = problem.space.feature_form
         self._features: Any = jax.tree.structure(form)

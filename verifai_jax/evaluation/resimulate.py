@@ -197,7 +197,6 @@ class HostReplays:
     **Arguments:**
     - `problem`, `precision`, `key`: as in `Replays`.
     - `executor`: an executor with `submit`; this process simulates when left out.
-    - `target`: the name of the problem, for an executor that cannot pickle it.
 
     `draws` is False: a black box gets an integer seed, which is the same in every precision.
     """
@@ -211,7 +210,6 @@ class HostReplays:
         precision: str,
         key: Key[Any, ""],
         executor: "Executor | None" = None,
-        target: str | None = None,
     ) -> None:
         from verifai_jax.evaluation.host_engine import HostEngine
 
@@ -227,8 +225,8 @@ class HostReplays:
             check_executor(executor)
             self._shipment = problem.programs.get(
                 SHIPMENTS,
-                (type(executor).__module__ + type(executor).__name__, target),
-                lambda: ship(problem, executor, target, identity),
+                type(executor).__module__ + type(executor).__name__,
+                lambda: ship(problem, executor, problem.target, identity),
             )
 
     def begin_compiling(self, factor: int, count: int, times: int) -> None:
@@ -309,18 +307,17 @@ def finest_replays(
     run: str,
     key: Key[Any, ""],
     executor: "Executor | None" = None,
-    target: str | None = None,
 ) -> tuple[Replays | HostReplays | None, list[str], str]:
     """Return replays of a problem's rows in the highest precision in which it can be traced.
 
     **Arguments:**
     - `run`: precision of the run.
-    - `key`, `executor`, `target`: as in `HostReplays`.
+    - `key`, `executor`: as in `HostReplays`.
     **Returns:** the replays, None if they cannot be traced; notes on checks that are left out; the
     error raised in tracing, empty if there was none.
     """
     if problem.black_box:
-        replays = HostReplays(problem, run, key, executor, target)
+        replays = HostReplays(problem, run, key, executor)
         return replays, ["not checked in float64: a black box"], ""
     note = "not checked in float64: in it the system would draw other random numbers"
     if run != "float64" and problem.system.can_refine:

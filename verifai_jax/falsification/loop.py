@@ -68,7 +68,6 @@ class Rounds:
         folder: Path | None = None,
         confirm: bool = False,
         executor: "Executor | None" = None,
-        target: str | None = None,
         first: Float[np.ndarray, "n row"] | None = None,
         engine: Wanted = "xla",
         budget: int = 0,
@@ -85,14 +84,14 @@ class Rounds:
         self._journal_without_traces()
         self._simulations = Simulations(
             problem, search, batch, seed, precision=precision, journal=self._journal,
-            executor=executor, target=target, guidance=self.learning.guidance,
+            executor=executor, guidance=self.learning.guidance,
             keep_traces=self.learning.surrogate is not None,
             given=self.first.shape[1] > problem.space.dim,
             engine=engine, budget=budget,
         )  # fmt: skip
         self._confirmer = None
         if confirm:
-            self._confirmer = Confirmer(problem, precision, seed, executor=executor, target=target)
+            self._confirmer = Confirmer(problem, precision, seed, executor=executor)
         self.tally = Tally()
         self.stop_after = 0
         self.watch = Stopwatch(COMPILE)

@@ -44,7 +44,7 @@ class Simulations:
     - `search`: the search; it determines what is computed in addition to the robustness.
     - `batch`: maximum number of simulations in a round.
     - `seed`: the seed of the run.
-    - `precision`, `journal`, `executor`, `target`, `guidance`, `keep_traces`, `given`,
+    - `precision`, `journal`, `executor`, `guidance`, `keep_traces`, `given`,
       `engine`, `budget`: as for `Evaluator`.
 
     `hopeless` is the error that all timed rows raised; None if one of them did not.
@@ -60,7 +60,6 @@ class Simulations:
         precision: str,
         journal: "Journal | None",
         executor: "Executor | None",
-        target: str | None,
         guidance: Guidance,
         keep_traces: bool,
         given: bool = False,
@@ -74,7 +73,6 @@ class Simulations:
             precision=precision,
             seed=seed,
             executor=executor,
-            target=target,
             guidance=guidance,
             engine=engine,
             budget=budget,

@@ -27,16 +27,18 @@ from verifai_jax.addons.synthesis.parametric import FeatureParameters, Parametri
 from verifai_jax.addons.synthesis.region import Region, region_of
 from verifai_jax.addons.synthesis.results import Repair, Round
 from verifai_jax.core.display.progress import shows_progress
-from verifai_jax.core.messages.checks import check_options
+from verifai_jax.core.messages.checks import check_options, options_of
 from verifai_jax.core.messages.errors import check_names, suggests_options
 from verifai_jax.core.user_code.source_collection import sources_of
 from verifai_jax.core.values.budget import Budget, split_budget
+from verifai_jax.evaluation.run_on import RunOn
 from verifai_jax.falsification.run import Run
 from verifai_jax.falsification.validation import usual_batch
 from verifai_jax.problem.problem import Problem
 from verifai_jax.search import Search
 from verifai_jax.statistics.max_min import max_min_step
 from verifai_jax.statistics.smallest_change import smallest_change
+from verifai_jax.statistics.stopping import Stop
 
 ADDED = 8
 """Counterexamples that a round adds to the set at most."""
@@ -63,9 +65,9 @@ def repair(
     gradient: bool | None = None,
     batch: int = 256,
     seed: int = 0,
-    max_seconds: float | None = None,
+    stop: Stop | None = None,
     precision: str = "float32",
-    backend: str | None = None,
+    run_on: RunOn | None = None,
     progress: bool | None = None,
 ) -> Repair:
     """Change parameters as little as possible so that the formula holds in all counterexamples.
@@ -88,7 +90,8 @@ def repair(
       environment is attacked; environments farther out in the tails are ignored. With 1 the attack
       reaches the ends of all tails at once.
     - `gradient`: whether to follow gradients; by default if the present backend has them.
-    - `max_seconds`: wall-clock seconds; a fifth is reserved for the check.
+    - `stop`: the seconds of the work, a fifth of which is reserved for the check.
+    - `run_on`: the backend of the simulations.
     - `progress`: whether to show one line of progress; see `core.display.progress` for the default.
     - all other arguments: as in `falsify`.
     **Returns:** a `Repair`; after Ctrl-C the finished part, without the check.
@@ -102,7 +105,9 @@ def repair(
     if whole is None:
         assert run is not None
         raise ValueError(f"the run of {run.name!r} has no problem: use vj.load(path, problem)")
-    check_options(budget, batch, seed, max_seconds, None)
+    check_options(budget, batch, seed)
+    max_seconds = options_of("repair", Stop, stop, "seconds").seconds
+    backend = options_of("repair", RunOn, run_on, "backend").backend
     arguments.check_numbers(margin, rounds=rounds, held_out=held_out)
     check_names("aim", [aim], arguments.AIMS)
     if aim == "probability" and system_of is not None:

@@ -26,14 +26,16 @@ from verifai_jax.addons.synthesis.parametric import FeatureParameters, Parametri
 from verifai_jax.addons.synthesis.region import Region, region_of
 from verifai_jax.addons.synthesis.results import Synthesis
 from verifai_jax.core.display.progress import shows_progress
-from verifai_jax.core.messages.checks import check_options, check_positive
+from verifai_jax.core.messages.checks import check_options, check_positive, options_of
 from verifai_jax.core.messages.errors import check_names, suggests_options
 from verifai_jax.core.values.budget import Budget, split_budget
+from verifai_jax.evaluation.run_on import RunOn
 from verifai_jax.falsification.validation import usual_batch
 from verifai_jax.problem.dependence import depends_on_key
 from verifai_jax.problem.problem import Problem
 from verifai_jax.search import Search
 from verifai_jax.statistics.max_min import max_min_step
+from verifai_jax.statistics.stopping import Stop
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -64,9 +66,9 @@ def synthesize(
     gradient: bool | None = None,
     batch: int = 256,
     seed: int = 0,
-    max_seconds: float | None = None,
+    stop: Stop | None = None,
     precision: str = "float32",
-    backend: str | None = None,
+    run_on: RunOn | None = None,
     progress: bool | None = None,
 ) -> Synthesis:
     """Find values of some features for which the formula holds robustly for all others.
@@ -90,14 +92,17 @@ def synthesize(
       the formula holds. No proof when left out.
     - `gradient`: whether to follow gradients; by default if the present backend has them.
     - `batch`: simulations at once.
-    - `max_seconds`: wall-clock seconds; a fifth is reserved for the check.
+    - `stop`: the seconds of the work, a fifth of which is reserved for the check.
+    - `run_on`: the backend of the simulations.
     - `progress`: whether to show one line of progress; see `core.display.progress` for the default.
     - all other arguments: as in `falsify`.
     **Returns:** a `Synthesis`; after Ctrl-C the finished part, without the check.
     **Raises:** `ValueError` before anything compiles for unknown features and options out of range.
     """
     started = time.perf_counter()
-    check_options(budget, batch, seed, max_seconds, None)
+    check_options(budget, batch, seed)
+    max_seconds = options_of("synthesize", Stop, stop, "seconds").seconds
+    backend = options_of("synthesize", RunOn, run_on, "backend").backend
     arguments.check_numbers(margin, environments=environments, held_out=held_out)
     check_names("aim", [aim], arguments.AIMS)
     if prove is not None:

@@ -267,8 +267,8 @@ def ship(
         raise ValueError(
             f"{type(executor).__name__} cannot send the {type(thing).__name__.lower()} to its "
             f"workers ({one_line(format_error(error))[:200]}); name it, "
-            "target='specs/FILE.py:NAME', so that they load it themselves, or use Dask or Ray, "
-            "which can send functions that are not in a module"
+            "Problem(..., target='specs/FILE.py:NAME'), so that they load it themselves, or use "
+            "Dask or Ray, which can send functions that are not in a module"
         ) from error
     return shipment
 

@@ -83,7 +83,7 @@ def test_certificates_from_workers_are_the_same(traced):
     options = {"p": 0.1, "samples": 64, "seed": 3, "attack_simulations": 64}
     here = certify(problem_of, policies, **options)
     with ThreadPoolExecutor(2) as executor:
-        there = certify(problem_of, policies, **options, executor=executor)
+        there = certify(problem_of, policies, **options, run_on=vj.RunOn(executor=executor))
     assert here.safest == there.safest
     for one, other in zip(here.rows, there.rows, strict=True):
         assert (one.failures, one.simulations, one.rate) == (

@@ -117,7 +117,7 @@ def test_trainings_on_workers_give_the_same_table(halving):
     study = drifting({"rate": vj.LogUniform(0.01, 1.0), "limit": vj.Box(0.05, 9.0)}, seeds=2)
     here = sweep(study, **options)
     with ThreadPoolExecutor(2) as executor:
-        there = sweep(study, **options, executor=executor)
+        there = sweep(study, **options, run_on=vj.RunOn(executor=executor))
     same_tables(here, there)
 
 
@@ -381,14 +381,14 @@ def test_without_optuna_it_says_how_to_get_it(monkeypatch):
 
 
 def test_out_of_time_is_what_there_is():
-    found = sweep(drifting(), configurations=4, samples=8, max_seconds=1e-6)
+    found = sweep(drifting(), configurations=4, samples=8, stop=vj.Stop(seconds=1e-6))
     assert not found.record.complete
     assert len(found.table) in range(1, 4 * 3)
 
 
 def test_what_was_trained_in_time_is_certified(monkeypatch):
     monkeypatch.setattr(driver, "FOR_TRAINING", 1e-9)
-    found = sweep(drifting(), configurations=4, samples=8, max_seconds=1000.0)
+    found = sweep(drifting(), configurations=4, samples=8, stop=vj.Stop(seconds=1000.0))
     assert not found.record.complete
     assert len(found.table) in range(1, 4 * 3)
     assert (found.table["simulations"] == 8).all()

@@ -29,12 +29,12 @@ from verifai_jax.addons.estimation.certification.blocks import Blocks, Remember
 from verifai_jax.addons.estimation.certification.result import Certificate, Certificates
 from verifai_jax.core.compute.compilation import power_of_two
 from verifai_jax.core.compute.devices import enable_compile_cache
-from verifai_jax.core.compute.executors import Executor
 from verifai_jax.core.display.progress import say_done, shows_progress
-from verifai_jax.core.messages.checks import check_count, check_fraction
+from verifai_jax.core.messages.checks import check_count, check_fraction, options_of
 from verifai_jax.core.messages.errors import suggests_options
 from verifai_jax.evaluation.confirmations import Repetitions, came_otherwise
 from verifai_jax.evaluation.confirmer import LIMIT, MORE, REPEATED, SHARE_REPEATED
+from verifai_jax.evaluation.run_on import RunOn
 from verifai_jax.features import FeatureSpace
 from verifai_jax.problem.dependence import depends_on_key
 from verifai_jax.problem.problem import Problem
@@ -70,7 +70,7 @@ def certify(
     remember: Remember | None = None,
     progress: ProgressReport | bool | None = None,
     devices: Sequence[Any] | None = None,
-    executor: Executor | None = None,
+    run_on: RunOn | None = None,
 ) -> Certificates:
     """Attack all policies, then bound the failure probability of each from fresh samples.
 
@@ -99,7 +99,7 @@ def certify(
       once a minute elsewhere. A function `(done, total, text)` is called instead, with the
       simulations so far; `total` may not be reached.
     - `devices`: JAX devices; all of this process when left out.
-    - `executor`: an executor whose workers simulate, as in `falsify`, with the same result.
+    - `run_on`: the workers of the simulations; with them the result is the same.
 
     Ctrl-C returns the certificates from finished samples. The same seed gives the same
     certificates, bit for bit on one machine, whatever the order of the policies, the number of
@@ -127,7 +127,7 @@ def certify(
         lanes=lanes,
         remember=remember,
         devices=devices,
-        executor=executor,
+        executor=options_of("certify", RunOn, run_on, "executor").executor,
     )
     attacker = check_attack(blocks.problem, attack)
     rounds = -(-attack_simulations // lanes)

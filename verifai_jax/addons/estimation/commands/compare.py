@@ -5,7 +5,16 @@ from typing import Any
 
 import click
 
-from verifai_jax.cli.arguments import CLUSTER, ERRORS, MAX_SECONDS, REPORT, SEED, TARGET, on_cluster
+from verifai_jax.cli.arguments import (
+    CLUSTER,
+    ERRORS,
+    MAX_SECONDS,
+    REPORT,
+    SEED,
+    TARGET,
+    on_cluster,
+    values_of,
+)
 from verifai_jax.cli.gates import Gate, check_gate, fail_on
 from verifai_jax.cli.going_on import kept_until_done
 from verifai_jax.cli.json_output import as_plain, command, give_result
@@ -55,7 +64,7 @@ def compare(
 
     with kept_until_done() as kept, on_cluster(cluster) as executor:
         named = {name: name for name in candidates}
-        result = run_compare(target, named, executor=executor, **options)
+        result = run_compare(target, named, **values_of(options, executor=executor))
         click.echo(printable(str(result)))
         kept.stopped(result.stopped)
     if errors is not None:

@@ -26,6 +26,7 @@ from verifai_jax.core.messages.errors import end_if_interrupted
 from verifai_jax.core.store.cache import Cache
 from verifai_jax.core.store.log import Arrays
 from verifai_jax.core.user_code.callbacks import Callback, notify
+from verifai_jax.evaluation.run_on import RunOn
 from verifai_jax.search import Search
 
 SCREENING = 64
@@ -319,7 +320,7 @@ class RunningSweep:
             confidence=self.options["confidence"],
             attack=self.attack,
             remember=remember,
-            executor=self.executor,
+            run_on=RunOn(executor=self.executor),
             **options,
         )
 
