@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from verifai_jax.addons.estimation import estimate as estimate
     from verifai_jax.addons.estimation import sequence as sequence
     from verifai_jax.addons.estimation.certification import Certificates as Certificates
+    from verifai_jax.addons.estimation.certification import Certification as Certification
     from verifai_jax.addons.estimation.certification import certify as certify
     from verifai_jax.addons.estimation.comparison import Comparison as Comparison
     from verifai_jax.addons.estimation.comparison import compare as compare
@@ -61,6 +62,7 @@ if TYPE_CHECKING:
     from verifai_jax.addons.simulators.mujoco import mujoco as mujoco
     from verifai_jax.addons.simulators.mujoco import native as native
     from verifai_jax.addons.simulators.remote import remote as remote
+    from verifai_jax.addons.synthesis import Aim as Aim
     from verifai_jax.addons.synthesis import Repair as Repair
     from verifai_jax.addons.synthesis import Synthesis as Synthesis
     from verifai_jax.addons.synthesis import repair as repair
@@ -69,6 +71,7 @@ if TYPE_CHECKING:
     from verifai_jax.addons.training.augmentation import Augmentation as Augmentation
     from verifai_jax.addons.training.augmentation import SupervisedTask as SupervisedTask
     from verifai_jax.addons.training.augmentation import augment as augment
+    from verifai_jax.addons.training.hardening import FurtherTraining as FurtherTraining
     from verifai_jax.addons.training.hardening import Hardening as Hardening
     from verifai_jax.addons.training.hardening import harden as harden
     from verifai_jax.addons.training.sweeps import Halving as Halving

@@ -147,7 +147,7 @@ def _of_policy(policy):
 
 @pytest.mark.thorough
 def test_policies_of_which_all_raise_are_not_certified():
-    options = {"samples": 64, "attack_simulations": 64, "progress": False}
+    options = {"certification": vj.Certification(64, attack_simulations=64), "progress": False}
     CALLS.clear()
     with pytest.raises(RuntimeError, match=r"each of the first 66 simulations .* no road at"):
         vj.certify(_of_policy, [0.0, 1.0, 2.0], **options)

@@ -11,13 +11,13 @@ from checked_types import unchecked
 import verifai_jax as vj
 
 VERBS = (
-    "certify", "compare", "confirm", "estimate", "explain", "falsify", "fmea", "fuzz", "harden",
-    "modes", "real_trials", "repair", "resume", "sequence", "shrink", "simulate", "sweep",
+    "augment", "certify", "compare", "confirm", "estimate", "explain", "falsify", "fmea", "fuzz",
+    "harden", "modes", "real_trials", "repair", "resume", "sequence", "shrink", "simulate", "sweep",
     "synthesize", "transfer", "verify",
 )  # fmt: skip
 JOINED = {
-    "after", "backend", "engine", "executor", "keep_going", "max_seconds", "stop_after",
-    "stop_when", "target", "warm_start",
+    "after", "attack_simulations", "backend", "engine", "executor", "keep_going", "max_seconds",
+    "stop_after", "stop_when", "target", "warm_start",
 }  # fmt: skip
 
 
@@ -43,6 +43,17 @@ def test_verbs_take_few_arguments_and_share_their_words(verb):
         (lambda: vj.Stop(when=0.05), TypeError, r"a rule such as Within\(0.005\); got 0.05"),
         (lambda: vj.RunOn(engine="nativ"), ValueError, "engine 'nativ'; did you mean 'native'"),
         (lambda: vj.RunOn(executor=3), TypeError, "executor must have concurrent.futures' submit"),
+        (lambda: vj.Certification(confidence=95), ValueError, "confidence must lie between 0 and"),
+        (lambda: vj.Certification(samples=0), ValueError, "samples must be an integer of at least"),
+        (
+            lambda: vj.Certification(attack_simulations=1.5),
+            ValueError,
+            "attack_simulations must be an integer of at least 0; got 1.5",
+        ),
+        (lambda: vj.FurtherTraining(own=0.6, failing=0.6), ValueError, "shares of all episodes"),
+        (lambda: vj.Aim(margin=-1.0), ValueError, "margin must be a robustness of at least 0"),
+        (lambda: vj.Aim(held_out=-1), ValueError, "held_out must be an integer of at least 0"),
+        (lambda: vj.Aim("robustnes"), ValueError, "did you mean 'robustness'"),
         (
             lambda: vj.Start(rows=[{"x": 0.1}], cheap=PROBLEM),
             ValueError,

@@ -127,7 +127,7 @@ PARAMETER_CHOICE = all_of(
     MAX_SECONDS,
     BACKEND,
 )
-"""Options of `synthesize` and `repair`: keywords of both functions."""
+"""Options of `synthesize` and `repair`, for `values_of`."""
 NAMES = all_of(
     option("--const", "constants", multiple=True, metavar="NAME=NUMBER"),
     option("--define", "definitions", multiple=True, metavar="NAME=FORMULA"),
@@ -178,8 +178,11 @@ def values_of(
     when: "StoppingRule | None" = None,
     executor: "Executor | None" = None,
 ) -> dict[str, Any]:
-    """Return the options of a command as arguments of its verb, with `stop` and `run_on`."""
+    """Return the options of a command as arguments of its verb, with the values that join some."""
     left = dict(options)
+    if "aim" in left:
+        aim = ("margin", "attack", "mass", "held_out")
+        left["aim"] = vj.Aim(left["aim"], **{name: left.pop(name) for name in aim})
     after, seconds = left.pop("stop_after", None), left.pop("max_seconds", None)
     stop = vj.Stop(after, seconds, when, left.pop("keep_going", False))
     where = vj.RunOn(left.pop("engine", None), left.pop("backend", None), executor)

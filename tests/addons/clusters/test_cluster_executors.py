@@ -123,7 +123,8 @@ def test_dask_gives_the_table_of_one_machine_also_when_a_worker_is_killed(dask, 
 def test_dask_gives_the_sweep_of_one_machine(dask):
     from drifting import drifting
 
-    options = {"configurations": 3, "samples": 128, "attack_simulations": 64}
+    options = {"configurations": 3}
+    options["certification"] = vj.Certification(samples=128, attack_simulations=64)
     here = vj.sweep(drifting(seeds=2), **options)
     there = vj.sweep(drifting(seeds=2), **options, run_on=vj.RunOn(executor=dask.get_executor()))
     for name in set(here.record.columns) - {"training_seconds"}:

@@ -156,7 +156,7 @@ def test_parameters_are_proved_as_a_set():
              "kind": vj.Categorical("a", "b")}  # fmt: skip
     problem = vj.Problem("gains", space, system, "always margin >= 0")
     found = vj.synthesize(
-        problem, ["gain", "d", "kind"], 600, held_out=0, prove=4, seed=1, progress=False
+        problem, ["gain", "d", "kind"], 600, aim=vj.Aim(held_out=0), prove=4, seed=1, progress=False
     )
     assert found.proved is not None
     (low, high), (least, greatest) = found.proved.ends["gain"], found.proved.ends["d"]

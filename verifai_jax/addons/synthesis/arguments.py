@@ -9,7 +9,6 @@ from jaxtyping import Float
 from verifai_jax import search as searches
 from verifai_jax.addons.synthesis.parametric import ArrayParameters, FeatureParameters, Parametric
 from verifai_jax.core.compute.precision import in_precision
-from verifai_jax.core.messages.checks import check_count
 from verifai_jax.core.messages.errors import check_names
 from verifai_jax.evaluation.backends import resolved
 from verifai_jax.falsification.validation import check_search
@@ -17,18 +16,8 @@ from verifai_jax.problem.dependence import without_derivative
 from verifai_jax.problem.problem import Problem
 from verifai_jax.search import Search
 
-AIMS = ("robustness", "probability")
-"""What parameters are chosen for."""
 ATTACK = 20_000
 """Simulations of an attack at most, however large the budget."""
-
-
-def check_numbers(margin: float, **counts: int) -> None:
-    """Check that numbers are in range."""
-    if isinstance(margin, bool) or not isinstance(margin, int | float) or not margin >= 0:
-        raise ValueError(f"margin must be a robustness of at least 0; got {margin!r}")
-    for name, count in counts.items():
-        check_count(name, count, 0 if name == "held_out" else 1)
 
 
 def feature_parameters(

@@ -26,6 +26,7 @@ from verifai_jax.addons.estimation.certification.attack import (
     check_attack,
 )
 from verifai_jax.addons.estimation.certification.blocks import Blocks, Remember
+from verifai_jax.addons.estimation.certification.certification import Certification
 from verifai_jax.addons.estimation.certification.result import Certificate, Certificates
 from verifai_jax.core.compute.compilation import power_of_two
 from verifai_jax.core.compute.devices import enable_compile_cache
@@ -39,7 +40,6 @@ from verifai_jax.features import FeatureSpace
 from verifai_jax.problem.dependence import depends_on_key
 from verifai_jax.problem.problem import Problem
 from verifai_jax.problem.silent_mistakes import formula_notes
-from verifai_jax.search import Search
 from verifai_jax.statistics.confidence_sequences import simultaneous_interval, verdict
 
 LANES = 64
@@ -60,12 +60,8 @@ def certify(
     policies: Sequence[Any],
     *,
     p: float = 0.01,
-    confidence: float = 0.95,
-    samples: int = 512,
+    certification: Certification | None = None,
     seed: int = 0,
-    budget: int | None = None,
-    attack: str | Search = "cross_entropy",
-    attack_simulations: int = 256,
     tie: float | None = None,
     remember: Remember | None = None,
     progress: ProgressReport | bool | None = None,
@@ -80,15 +76,9 @@ def certify(
       each policy is compiled by itself.
     - `policies`: `rl.Policy` objects, or other pytrees of numbers.
     - `p`: the failure probability below which a policy is called safe.
-    - `confidence`: the probability that all intervals hold at once.
-    - `samples`: minimum number of samples of each policy, rounded up to whole blocks of 64 (smaller
-      blocks for fewer than 64 samples). 32 are enough if only the safest policy is wanted.
+    - `certification`: the attack on each policy and the samples of its certificate.
     - `seed`: the seed of samples and search. All policies get the same samples, which differ from
       those of a training with this seed.
-    - `budget`: samples of all policies together; four times the minimum when left out. Samples
-      beyond the minimum go to policies whose verdict is open, and to those that may be the safest.
-    - `attack`: the search that looks for failures first; its failures are not part of any rate.
-    - `attack_simulations`: simulations of each attack, rounded up to whole blocks; 0 for no attack.
     - `tie`: failure rates that differ by less than this count as equally safe. The default is `p /
       10` or less, such that resolving it takes about as many samples as the minimum for all
       policies together.
@@ -117,7 +107,9 @@ def certify(
             f"policies; got {type(problem_of).__name__} and {type(policies).__name__}"
         )
     policies = list(policies)
-    budget = _check(policies, p, confidence, samples, seed, budget, attack_simulations, tie)
+    certified = options_of("certify", Certification, certification)
+    samples, confidence, attacks = certified.samples, certified.confidence, certified.attacks(256)
+    budget = _check(policies, p, certified, seed, tie)
     lanes = LANES if samples >= LANES else max(8, power_of_two(samples))
     enable_compile_cache()  # Before the search compiles, too.
     blocks = Blocks(
@@ -129,8 +121,8 @@ def certify(
         devices=devices,
         executor=options_of("certify", RunOn, run_on, "executor").executor,
     )
-    attacker = check_attack(blocks.problem, attack)
-    rounds = -(-attack_simulations // lanes)
+    attacker = check_attack(blocks.problem, certified.attack)
+    rounds = -(-attacks // lanes)
     if tie is None:
         tie = min(p / 10, SETTLED / (len(policies) * samples))
     allocation = Allocation(p, confidence, samples, budget, lanes, tie)
@@ -311,35 +303,19 @@ class _Report:
 def _check(
     policies: list[Any],
     p: float,
-    confidence: float,
-    samples: int,
+    certified: Certification,
     seed: int,
-    budget: int | None,
-    attack_simulations: int,
     tie: float | None,
 ) -> int:
     """Refuse values out of range, and return the budget."""
     if not policies:
         raise ValueError("there is no policy to certify")
-    for name, value in (("p", p), ("confidence", confidence)):
-        check_fraction(name, value)
-    for name, value, minimum in (
-        ("samples", samples, 1),
-        ("seed", seed, 0),
-        ("attack_simulations", attack_simulations, 0),
-    ):
-        check_count(name, value, minimum)
+    check_fraction("p", p)
+    check_count("seed", seed, 0)
     if tie is not None:
         check_fraction("tie", tie, zero=True)
-    minimum = len(policies) * samples
-    if budget is None:
-        return 4 * minimum
-    if budget < minimum:
-        raise ValueError(
-            f"{len(policies)} policies with {samples} samples each need a budget of at least "
-            f"{minimum}; got {budget!r}"
-        )
-    return budget
+    certified.check_budget(len(policies))
+    return certified.budget or 4 * len(policies) * certified.samples
 
 
 def repeat_failures(

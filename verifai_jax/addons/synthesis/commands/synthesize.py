@@ -5,7 +5,14 @@ from typing import Any
 
 import click
 
-from verifai_jax.cli.arguments import PARAMETER_CHOICE, PATH, TARGET, load_problem, option
+from verifai_jax.cli.arguments import (
+    PARAMETER_CHOICE,
+    PATH,
+    TARGET,
+    load_problem,
+    option,
+    values_of,
+)
 from verifai_jax.cli.gates import Gate, check_gate, fail_on
 from verifai_jax.cli.going_on import kept_until_done
 from verifai_jax.cli.json_output import command, show_result
@@ -31,7 +38,7 @@ def synthesize(
 
     problem = load_problem(target)
     with kept_until_done() as kept:
-        result = run_synthesize(problem, parameters, budget, **keywords)
+        result = run_synthesize(problem, parameters, budget, **values_of(keywords))
         show_result(
             result, None, "parameters", "robustness", "holds", "margin", "converged",
             "simulations", "without_verdict", "held_out", "stopped", "seed", "sources",

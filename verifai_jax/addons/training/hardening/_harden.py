@@ -1,7 +1,7 @@
 """Hardening of a policy: train, attack, train further on the failures, certify.
 
     result = harden(study)                              # a Study: trainer, problem, p
-    result = harden(CartPoleTask(), balance_with, algorithm=PPO())
+    result = harden(Trainer(CartPoleTask(), PPO()), balance_with)
     print(result); result.policy
 
 Sources: Pinto, Davidson, Sukthankar and Gupta, Robust adversarial reinforcement learning, ICML
@@ -21,11 +21,12 @@ import numpy as np
 import pandas as pd
 
 from verifai_jax._version import __version__
-from verifai_jax.addons.estimation.certification import Certificates, certify
+from verifai_jax.addons.estimation.certification import Certificates, Certification, certify
 from verifai_jax.addons.estimation.comparison import Comparison, compare
-from verifai_jax.addons.rl import PPO, Algorithm, evaluate
+from verifai_jax.addons.rl import PPO, evaluate
 from verifai_jax.addons.training.hardening.arms import FunctionArms, TaskArms
 from verifai_jax.addons.training.hardening.collecting import Collected, collect
+from verifai_jax.addons.training.hardening.further import FurtherTraining
 from verifai_jax.addons.training.hardening.mixture import (
     CAPACITY,
     HardeningError,
@@ -41,7 +42,7 @@ from verifai_jax.core.compute.fingerprint import stable_text
 from verifai_jax.core.compute.keys import run_keys
 from verifai_jax.core.compute.precision import reproducible_settings
 from verifai_jax.core.display.progress import say_done, shows_progress
-from verifai_jax.core.messages.checks import check_count, check_fraction
+from verifai_jax.core.messages.checks import check_count, check_fraction, options_of
 from verifai_jax.core.messages.errors import end_if_interrupted, suggests_options
 from verifai_jax.core.store.cache import Cache, locked_cache
 from verifai_jax.features import Categorical
@@ -49,6 +50,7 @@ from verifai_jax.problem.problem import Problem
 from verifai_jax.problem.silent_mistakes import formula_notes
 from verifai_jax.search import Search
 from verifai_jax.statistics.confidence_sequences import safe_at
+from verifai_jax.statistics.stopping import Stop
 
 ROUND, FINAL, COMPARED, ATTACK, RETURNS = range(5)
 """Numbers of the purposes for which random numbers are drawn."""
@@ -82,16 +84,15 @@ class Plan:
     seed: int
 
     def __post_init__(self) -> None:
-        for name in ("rounds", "further_steps", "added", "episodes", "seed"):
+        for name in ("rounds", "episodes", "seed"):
             check_count(name, getattr(self, name), 0 if name == "seed" else 1)
-        for name in ("p", "confidence"):
-            check_fraction(name, getattr(self, name))
-        for name in ("own", "failing", "tolerance"):
-            check_fraction(name, getattr(self, name), zero=True)
-        if self.own + self.failing > 1:
-            raise ValueError(
-                f"own and failing are shares of all episodes; got {self.own} + {self.failing} > 1"
-            )
+        check_fraction("p", self.p)
+
+    def certification(self) -> Certification:
+        """Return the certification of each round."""
+        return Certification(
+            self.samples, self.confidence, None, self.attack, self.attack_simulations
+        )
 
     def seed_for(self, purpose: int, stage: int = 0) -> int:
         """Return the seed for a purpose; different purposes get different samples."""
@@ -106,25 +107,16 @@ def harden(
     study: Study | Trainer | object,
     problem: Callable[[Any], Problem] | None = None,
     *,
-    algorithm: Algorithm | None = None,
-    start: Start | None = None,
     hyperparameters: Mapping[str, object] | None = None,
     rounds: int = 8,
     steps: int | None = None,
-    further_steps: int | None = None,
+    further: FurtherTraining | None = None,
     p: float | None = None,
-    confidence: float = 0.95,
-    samples: int = 512,
-    attack: str | Search = "cross_entropy",
-    attack_simulations: int = 512,
-    added: int = 64,
-    own: float = 0.25,
-    failing: float = 0.5,
-    tolerance: float = 0.02,
+    certification: Certification | None = None,
     episodes: int = 256,
     baseline: bool = False,
     seed: int = 0,
-    max_seconds: float | None = None,
+    stop: Stop | None = None,
     folder: str | Path | None = None,
     even_if_changed: bool = False,
     progress: bool | None = None,
@@ -142,31 +134,24 @@ def harden(
     covers the policies before and after together, and is made after the choice.
 
     **Arguments:**
-    - `study`: a `Study`, a `Trainer`, or a task. A task needs a method `start(key, features) ->
-      state` that starts an episode with the problem's features; tasks of `ode_task` have it. A
-      training function gets the argument `starts`, a list from which each episode takes one entry
-      at random: features, or `None` for an episode of the task's own. In the first training all
-      entries are `None`.
+    - `study`: a `Study`, a `Trainer`, or a task, which `PPO` trains. A task needs a method
+      `start(key, features) -> state` that starts an episode with the problem's features; tasks of
+      `ode_task` have it. A training function gets the argument `starts`, a list from which each
+      episode takes one entry at random: features, or `None` for an episode of the task's own. In
+      the first training all entries are `None`.
     - `problem`: a function from a policy to the problem of its closed loop; by default the study's.
-    - `algorithm`: the algorithm of a task; `PPO()` when left out.
-    - `start`: a function `(key, features) -> state` for a task without such a method.
     - `hyperparameters`: a dictionary of the trainer's hyper-parameters.
     - `rounds`: the maximum number of rounds of attack and further training.
     - `steps`: environment steps of the first training; by default the trainer's.
-    - `further_steps`: steps of each round; an eighth of `steps` when left out.
+    - `further`: the training of a round: its length, and where its episodes begin.
     - `p`: failure probability below which the policy is safe; by default the study's, or 0.01.
-    - `confidence`: the joint confidence of the intervals before and after.
-    - `samples`, `attack`, `attack_simulations`: options of each certificate, as in `certify`.
-    - `added`: the maximum number of failures, as points to train around, that a round adds.
-    - `own`, `failing`: share of the task's own episodes, and share of episodes that begin near
-      failures, including those drawn from the prior that fail; all others come from the prior. The
-      share of own episodes grows after a round that loses return, and shrinks after other rounds.
-    - `tolerance`: the share of the first policy's return that the result may lose.
+    - `certification`: the attack and the samples of each certificate; its confidence is that of
+      the intervals before and after together.
     - `episodes`: number of the task's own episodes that measure returns, the same for all policies.
     - `baseline`: whether to train a second arm with plain domain randomisation: the same seed, own
       episodes and environment steps, but episodes from the prior instead of failures.
     - `seed`: the seed of training, attacks and samples.
-    - `max_seconds`: wall-clock seconds after which no round begins.
+    - `stop`: the seconds after which no round begins.
     - `folder`: the folder of finished work; the same call continues an interrupted hardening.
     - `even_if_changed`: whether to continue in a folder although files of the model have changed.
     - `progress`: whether to show one line of progress; see `core.display.progress` for the default.
@@ -175,13 +160,18 @@ def harden(
     features; `ValueError` for numbers out of range; the errors of `Trainer.configuration`;
     `CacheError` for a folder of another hardening; `FolderInUse` if another process writes there.
     """
-    made = _as_study(study, problem, algorithm, p)
+    how = options_of("harden", FurtherTraining, further)
+    used = ("samples", "confidence", "attack", "attack_simulations")
+    certified = options_of("harden", Certification, certification, *used)
+    max_seconds = options_of("harden", Stop, stop, "seconds").seconds
+    made = _as_study(study, problem, p)
     trainer, values = made.trainer, dict(hyperparameters or {})
     first_steps = check_count("steps", trainer.steps if steps is None else steps)
-    further = max(1, first_steps // 8) if further_steps is None else further_steps
     plan = Plan(
-        rounds, first_steps, further, made.p if p is None else p, confidence, samples, attack,
-        attack_simulations, added, own, failing, tolerance, episodes, baseline, seed,
+        rounds, first_steps, max(1, first_steps // 8) if how.steps is None else how.steps,
+        made.p if p is None else p, certified.confidence, certified.samples, certified.attack,
+        certified.attacks(512), how.added, how.own, how.failing, how.tolerance,
+        episodes, baseline, seed,
     )  # fmt: skip
     untrained = made.untrained_problem()
     untrained.check()
@@ -189,7 +179,7 @@ def harden(
         options = {name: stable_text(each) for name, each in vars(plan).items()}
         options["hyperparameters"] = stable_text(sorted(values.items()))
         cache.claim(fingerprint(made, options), untrained.sources(), even_if_changed)
-        result = Work(made, plan, values, untrained, start, cache).run(max_seconds)
+        result = Work(made, plan, values, untrained, how.start, cache).run(max_seconds)
     if folder is not None:
         with cache.writing(folder):
             result.save(folder)
@@ -252,9 +242,8 @@ class Work:
         plan, began = self.plan, time.perf_counter()
         policies = self.arms.policies(stage)
         certificates = certify(
-            self.study.problem, policies, p=plan.p, confidence=plan.confidence,
-            samples=plan.samples, seed=plan.seed_for(ROUND, stage), attack=plan.attack,
-            attack_simulations=plan.attack_simulations, tie=plan.p, progress=False,
+            self.study.problem, policies, p=plan.p, certification=plan.certification(),
+            seed=plan.seed_for(ROUND, stage), tie=plan.p, progress=False,
             remember=self.cache.remember,
         )  # fmt: skip
         end_if_interrupted(certificates.stopped)
@@ -342,9 +331,9 @@ class Work:
         start = self.policies[HARDENED, 0]
         finalists = [start, *(self.policies[arm, at] for arm, at in chosen.items())]
         final = certify(
-            self.study.problem, finalists, p=plan.p, confidence=plan.confidence,
-            samples=4 * plan.samples, seed=plan.seed_for(FINAL), attack_simulations=0,
-            tie=plan.p, progress=False, remember=self.cache.remember,
+            self.study.problem, finalists, p=plan.p,
+            certification=Certification(4 * plan.samples, plan.confidence, attack_simulations=0),
+            seed=plan.seed_for(FINAL), tie=plan.p, progress=False, remember=self.cache.remember,
         )  # fmt: skip
         end_if_interrupted(final.stopped)
         returns = {arm: self.returns[arm, at] for arm, at in chosen.items()}
@@ -363,11 +352,8 @@ class Work:
 def _as_study(
     given: object,
     problem: Callable[[Any], Problem] | None,
-    algorithm: Algorithm | None,
     p: float | None,
 ) -> Study:
-    if isinstance(given, Study | Trainer) and algorithm is not None:
-        raise ValueError(f"a {type(given).__name__} has its own algorithms; leave out algorithm=")
     if isinstance(given, Study):
         if problem is not None:
             raise ValueError("a Study has its own problem; leave out problem=")
@@ -377,7 +363,7 @@ def _as_study(
             "harden needs problem=, a function from a policy to the Problem of its closed loop"
         )
     else:
-        trainer = given if isinstance(given, Trainer) else Trainer(given, algorithm or PPO())
+        trainer = given if isinstance(given, Trainer) else Trainer(given, PPO())
         space = {"steps": Categorical(trainer.steps)}
         study = Study(trainer.name, space, trainer, problem, p=0.01 if p is None else p)
     trainer = study.trainer
