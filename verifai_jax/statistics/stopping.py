@@ -1,4 +1,4 @@
-"""What ends a run before its budget, such as a failure rate that is known well enough.
+"""Conditions that end a run before its budget: counterexamples, seconds, a known failure rate.
 
     falsify(problem, stop=Stop(after=1, seconds=60))
     falsify(problem, "uniform", stop=Stop(when=Within(0.005)))

@@ -1,4 +1,4 @@
-"""What the parameters of a synthesis or a repair are chosen for, and how that is checked.
+"""The aim for which `synthesize` and `repair` choose parameters, and its check.
 
 Aim(margin=0.2, held_out=0)
 Aim("probability")                              # the same as aim="probability"
@@ -16,7 +16,7 @@ AIMS = ("robustness", "probability")
 
 @dataclass(frozen=True)
 class Aim:
-    """What parameters are chosen for.
+    """The aim of a choice of parameters.
 
     - `of`: `"robustness"`: the formula must hold in all environments that an attack finds, as
       robustly as possible. `"probability"`: the lowest failure probability, counted in samples of

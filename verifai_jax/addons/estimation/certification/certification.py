@@ -1,4 +1,4 @@
-"""How policies are certified, by `certify` and in a sweep or a hardening.
+"""The options of a certification, for `certify`, `sweep` and `harden`.
 
 Certification(samples=32, attack_simulations=0)
 """

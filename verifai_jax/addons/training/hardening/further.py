@@ -1,4 +1,4 @@
-"""How the rounds of a hardening train a policy further.
+"""The further training in the rounds of a hardening.
 
 FurtherTraining(steps=50_000, own=0.5)
 """
