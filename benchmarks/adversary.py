@@ -5,7 +5,7 @@
 The disturbance is one standard normal number for each of 20 periods. The adversary is a policy that
 sees the state and chooses it (PPO of `vj.rl`); its reward is that of adaptive stress testing: the
 log-density of each disturbance, and at the end of an episode without a failure a penalty that grows
-with the distance from one. Cross-entropy (`objective="likelihood"`) does not see the state. Both
+with the distance from one. Cross-entropy (`search.Likeliest`) does not see the state. Both
 simulate equally often; of each the likeliest failure counts, all episodes of training included.
 """
 
