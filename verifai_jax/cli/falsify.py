@@ -94,15 +94,11 @@ def falsify(
     goes_on = partial(arguments.resuming, "falsify", target=target, options=ends)
     if resume is not None:
         problem = arguments.load_problem(target, only)
-        kept = {
-            name: given[name] for name in ("max_seconds", "stop_after", "progress", "keep_going")
-        }
+        kept = ("max_seconds", "stop_after", "progress", "keep_going")
         with given_or_next(resume, "runs", "", goes_on), arguments.on_cluster(cluster) as executor:
-            asked = {name: given[name] for name in kept}
+            asked = {name: given[name] for name in kept} | {"budget": budget}
             asked = arguments.values_of(asked, stop_when, executor)
-            run = falsification.resume(
-                resume, problem, budget=budget, even_if_changed=even_if_changed, **asked
-            )
+            run = falsification.resume(resume, problem, even_if_changed=even_if_changed, **asked)
     else:
         likely = given.pop("objective") == "likelihood"
         usual = "cross_entropy" if likely and not options else "portfolio"
@@ -123,13 +119,9 @@ def falsify(
             arguments.on_cluster(cluster) as executor,
         ):
             start = falsification.Start("auto" if auto else chosen, run=earlier, proved=proved)
-            run = falsification.falsify(
-                problem,
-                start,
-                10_000 if budget is None else budget,
-                folder=path,
-                **arguments.values_of(given, stop_when, executor),
-            )
+            asked = arguments.values_of(given, stop_when, executor)
+            number = 10_000 if budget is None else budget
+            run = falsification.falsify(problem, start, number, folder=path, **asked)
     print_run(run, pictures, ends)
     check_run(run, fail_on)
 

@@ -5,10 +5,10 @@ run = resume(run, budget=50_000)
 """
 
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, cast
 
 import numpy as np
 
@@ -22,6 +22,7 @@ from verifai_jax.core.messages.errors import suggests_options
 from verifai_jax.core.store.locks import write_lock, writing
 from verifai_jax.core.user_code.callbacks import Callback, check_callbacks
 from verifai_jax.evaluation.backends import resolved
+from verifai_jax.evaluation.engine import Wanted
 from verifai_jax.evaluation.run_on import RunOn
 from verifai_jax.falsification import cheap as cheaply
 from verifai_jax.falsification.derived import as_simulated
@@ -37,8 +38,6 @@ from verifai_jax.falsification.table import ErrorTable
 from verifai_jax.falsification.validation import (
     AUTO,
     adapt_search,
-    as_wanted,
-    batch_size,
     can_be_slow,
     check_first,
     check_gradient,
@@ -53,13 +52,13 @@ from verifai_jax.falsification.validation import (
     recorded_search,
     rows_of_first,
     slow_search,
+    usual_batch,
 )
 from verifai_jax.problem.problem import Problem
 from verifai_jax.search import Search
 from verifai_jax.statistics.stopping import Stop
 
 if TYPE_CHECKING:
-    from verifai_jax.core.compute.executors import Executor
     from verifai_jax.features.given import Rows
 
 
@@ -150,7 +149,8 @@ def falsify(
 
     def batch_for(search: Search) -> int:
         alone = ends.only_budget and not problem.black_box
-        return batch_size(batch, search, budget, stop.after, alone)
+        usual = usual_batch(search, budget, stop.after, alone) if batch is None else batch
+        return min(usual, budget)
 
     size = batch_for(search)
     choice = resolved(
@@ -165,10 +165,12 @@ def falsify(
         notes = notes_before(problem, search)
     with new_folder(folder) as path:
         table = ErrorTable(tuple(problem.space.columns), path)
-        portable = ends.may_be_early or search.learns
+        engine = where.engine or "auto"
+        if engine == "auto" and (ends.may_be_early or search.learns):
+            engine = "xla"  # Rounding may change the next proposals, and few rows may end the run.
         rounds = Rounds(
             problem, search, size, seed, table, precision, path, confirm, where.executor, given,
-            budget=budget, engine=as_wanted(where.engine or "auto", portable),
+            budget=budget, engine=engine,
         )  # fmt: skip
 
         def prepare() -> None:
@@ -281,84 +283,67 @@ def resume(
         elif run.folder is not None:
             check_not_continued(run, run.folder)
         called = check_callbacks(callbacks)
-        return as_made(
-            _resume(run, problem, search, budget, ends, progress, called, executor, even_if_changed)
-        )
-
-
-def _resume(
-    run: Run,
-    problem: Problem | None,
-    search: Search | None,
-    budget: int | None,
-    ends: Ending,
-    progress: bool | None,
-    callbacks: Sequence[Callback],
-    executor: "Executor | None",
-    even_if_changed: bool,
-) -> Run:
-    """Continue a run whose folder is locked; missing conditions in `ends` come from the run."""
-    made = {"derived": run.derived, "space_data": run.space_data}
-    problem = run.problem if problem is None else as_simulated(problem, made)
-    if problem is None:
-        raise ValueError(f"resuming {run.name!r} needs its problem: resume(folder, problem)")
-    if search is None:
-        if run.search_data is None:
+        made = {"derived": run.derived, "space_data": run.space_data}
+        problem = run.problem if problem is None else as_simulated(problem, made)
+        if problem is None:
+            raise ValueError(f"resuming {run.name!r} needs its problem: resume(folder, problem)")
+        if search is None:
+            if run.search_data is None:
+                raise ValueError(
+                    f"search {run.search} is not one of verifai_jax.search; give it: resume(..., "
+                    "search=)"
+                )
+            search = recorded_search(run)
+        search = check_search(problem, search)
+        check_same_space(run, problem)
+        check_same_guide(run, problem)
+        check_rule(search, ends.stop.when)
+        budget = run.budget if budget is None else budget
+        check_options(budget, run.batch, run.seed)
+        if run.damage:
+            raise ValueError(f"the run of {run.name!r} cannot go on: {run.damage}")
+        checkpoint = run.checkpoint or {}
+        rows = int(checkpoint.get("rows", 0))
+        # Those of a round that the budget cut are simulated again, with the rest of the round.
+        done = len(run.table) if run.stopped == "budget" else rows
+        if budget <= done:
             raise ValueError(
-                f"search {run.search} is not one of verifai_jax.search; give it: resume(..., "
-                "search=)"
+                f"the run of {run.name!r} has {done} simulations already; resume it with a larger "
+                f"budget than {budget}"
             )
-        search = recorded_search(run)
-    search = check_search(problem, search)
-    check_same_space(run, problem)
-    check_same_guide(run, problem)
-    check_rule(search, ends.stop.when)
-    budget = run.budget if budget is None else budget
-    check_options(budget, run.batch, run.seed)
-    if run.damage:
-        raise ValueError(f"the run of {run.name!r} cannot go on: {run.damage}")
-    checkpoint = run.checkpoint or {}
-    rows = int(checkpoint.get("rows", 0))
-    # Those of a round that the budget cut are simulated again, with the rest of the round.
-    done = len(run.table) if run.stopped == "budget" else rows
-    if budget <= done:
-        raise ValueError(
-            f"the run of {run.name!r} has {done} simulations already; resume it with a larger "
-            f"budget than {budget}"
-        )
-    if not checkpoint and len(run.table) and run.stopped != "running":
-        raise ValueError(f"the run of {run.name!r} was saved without the state of its search")
-    sources, changed = continued_with(run.name, run.sources, problem, rows, even_if_changed)
-    choice = resolved(problem, wanted=run.backend)
-    problem = choice.problem
-    if run.target not in (None, problem.target):
-        problem = replace(problem, target=run.target)
-    check_gradient(problem, search)
-    problem.check()
-    with writing(run.folder):
-        table = run.table.resumed(rows, run.folder)
-    rounds = Rounds(
-        problem, search, run.batch, run.seed, table, run.precision, run.folder, run.confirm,
-        executor, rows_of_first(run.first, problem),
-        engine=as_wanted(run.engine), budget=run.budget,
-    )  # fmt: skip
-    rounds.checks = tuple(run.checks)
+        if not checkpoint and len(run.table) and run.stopped != "running":
+            raise ValueError(f"the run of {run.name!r} was saved without the state of its search")
+        sources, changed = continued_with(run.name, run.sources, problem, rows, even_if_changed)
+        choice = resolved(problem, wanted=run.backend)
+        problem = choice.problem
+        if run.target not in (None, problem.target):
+            problem = replace(problem, target=run.target)
+        check_gradient(problem, search)
+        problem.check()
+        with writing(run.folder):
+            table = run.table.resumed(rows, run.folder)
+        rounds = Rounds(
+            problem, search, run.batch, run.seed, table, run.precision, run.folder, run.confirm,
+            executor, rows_of_first(run.first, problem),
+            engine=cast(Wanted, "xla" if run.engine == "host" else run.engine), budget=run.budget,
+        )  # fmt: skip
+        rounds.checks = tuple(run.checks)
 
-    def prepare() -> None:
-        if checkpoint:
-            rounds.resume(checkpoint)
+        def prepare() -> None:
+            if checkpoint:
+                rounds.resume(checkpoint)
 
-    ends = ends._replace(budget=budget, earlier=_seconds_of(run))
-    lasting = (*run.lasting_notes, *([changed] if changed else []))
-    notes = [*notes_before(problem, search)]
-    usual = batch_size(None, search, budget, ends.stop.after)
-    if search.learns and usual != run.batch:
-        notes.append(
-            f"resumed in batches of {run.batch}: a run of {budget} simulations from the start "
-            f"would use batches of {usual} by default, and so simulate other points"
-        )
-    running = Running(rounds, ends, choice, run.seed, notes, lasting, sources, resumed=True)
-    return running.play(progress, prepare, callbacks)
+        ends = ends._replace(budget=budget, earlier=_seconds_of(run))
+        lasting = (*run.lasting_notes, *([changed] if changed else []))
+        notes = [*notes_before(problem, search)]
+        usual = min(usual_batch(search, budget, ends.stop.after), budget)
+        if search.learns and usual != run.batch:
+            notes.append(
+                f"resumed in batches of {run.batch}: a run of {budget} simulations from the start "
+                f"would use batches of {usual} by default, and so simulate other points"
+            )
+        running = Running(rounds, ends, choice, run.seed, notes, lasting, sources, resumed=True)
+        return as_made(running.play(progress, prepare, called))
 
 
 def _seconds_of(run: Run) -> dict[str, float]:

@@ -58,20 +58,11 @@ class Rounds:
     """
 
     def __init__(
-        self,
-        problem: Problem,
-        search: Search,
-        batch: int,
-        seed: int,
-        table: ErrorTable,
-        precision: str = "float32",
-        folder: Path | None = None,
-        confirm: bool = False,
-        executor: "Executor | None" = None,
-        first: Float[np.ndarray, "n row"] | None = None,
-        engine: Wanted = "xla",
-        budget: int = 0,
-    ) -> None:
+        self, problem: Problem, search: Search, batch: int, seed: int, table: ErrorTable,
+        precision: str = "float32", folder: Path | None = None, confirm: bool = False,
+        executor: "Executor | None" = None, first: Float[np.ndarray, "n row"] | None = None,
+        engine: Wanted = "xla", budget: int = 0,
+    ) -> None:  # fmt: skip
         self.problem, self.batch, self.table = problem, batch, table
         self.precision, self.folder = precision, folder
         self.first = np.zeros((0, problem.space.dim), np.float32) if first is None else first

@@ -51,32 +51,15 @@ class Simulations:
     """
 
     def __init__(
-        self,
-        problem: Problem,
-        search: Search,
-        batch: int,
-        seed: int,
-        *,
-        precision: str,
-        journal: "Journal | None",
-        executor: "Executor | None",
-        guidance: Guidance,
-        keep_traces: bool,
-        given: bool = False,
-        engine: Wanted = "xla",
-        budget: int = 0,
-    ) -> None:
+        self, problem: Problem, search: Search, batch: int, seed: int, *, precision: str,
+        journal: "Journal | None", executor: "Executor | None", guidance: Guidance,
+        keep_traces: bool, given: bool = False, engine: Wanted = "xla", budget: int = 0,
+    ) -> None:  # fmt: skip
         self.batch, self.keep_traces, self._journals = batch, keep_traces, True
         evaluator = partial(
-            Evaluator,
-            problem,
-            precision=precision,
-            seed=seed,
-            executor=executor,
-            guidance=guidance,
-            engine=engine,
-            budget=budget,
-        )
+            Evaluator, problem, precision=precision, seed=seed, executor=executor,
+            guidance=guidance, engine=engine, budget=budget,
+        )  # fmt: skip
         self.evaluate = evaluator(
             batch,
             gradient=search.wants.gradient,

@@ -3,16 +3,14 @@
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import Float
 
 from verifai_jax import search as searches
-from verifai_jax.core.messages.errors import unknown_name
 from verifai_jax.core.messages.text import format_error, one_line
 from verifai_jax.core.store.locks import LOCK, write_lock
-from verifai_jax.evaluation.engine import WANTED, Wanted
 from verifai_jax.falsification.run import Run
 from verifai_jax.falsification.run_folder import RECORD
 from verifai_jax.features.given import Rows, given_features, given_rows
@@ -54,38 +52,6 @@ def usual_batch(search: Search, budget: int, after: int | None = None, whole: bo
         return max(search.wants.max_batch, min(MAX_AT_ONCE, eighth) if whole else 0)
     maximum = search.wants.max_batch if after is None else min(search.wants.max_batch, 16 * after)
     return min(1 << (maximum.bit_length() - 1), 1 << max(3, (int(budget) // 20).bit_length() - 1))
-
-
-def batch_size(
-    asked: int | None,
-    search: Search,
-    budget: int,
-    after: int | None = None,
-    whole: bool = False,
-) -> int:
-    """Return the number of simulations in a round.
-
-    **Arguments:**
-    - `asked`: the user's choice; the default when left out.
-    - `search`, `budget`, `after`, `whole`: as in `usual_batch`.
-    """
-    usual = usual_batch(search, budget, after, whole) if asked is None else asked
-    return min(usual, budget)
-
-
-def as_wanted(engine: object, portable: bool = False) -> Wanted:
-    """Return the requested or recorded engine; a host system has only one.
-
-    - `portable`: whether `"auto"` means XLA: if few simulations may end the run, or if rounding may
-      change the next proposals of a search that learns.
-
-    **Raises:** `UnknownNameError`.
-    """
-    if engine == "host" or (portable and engine == "auto"):
-        return "xla"
-    if engine not in WANTED:
-        raise unknown_name("engine", str(engine), WANTED)
-    return cast(Wanted, engine)
 
 
 def check_search(problem: object, search: object) -> Search:

@@ -90,15 +90,11 @@ def estimate(
     - `method`: `"monte_carlo"`, `"importance"`, `"splitting"` or `"surrogate"`; when left out, it
       is chosen from the first samples.
     - `budget`: maximum number of simulations, including those of pilot runs and fits.
-    - `batch`: number of simulations at once; by default what the method needs.
-    - `seed`: the same seed gives the same estimate on the same machine.
     - `confidence`: the confidence of the interval and of the bound, between 0 and 1.
     - `p0`: an upper limit between 0 and 1. The result says whether the probability is shown to lie
       below it, and if not, how many more simulations without a failure would show that.
     - `stop`: the seconds after which the estimate is made from finished simulations.
-    - `precision`: as in `falsify`.
     - `run_on`: backend and workers of the simulations; with workers the estimate is the same.
-    - `progress`: True draws a bar, False none; None draws one on a terminal and in a notebook.
     - `simulations_are`: `"slow"` if only a few hundred simulations are affordable: the method is
       then `"surrogate"`, which computes more to simulate less. `"auto"` assumes this for a black
       box whose simulation takes at least half a second, if the budget is 200 or more.
@@ -109,6 +105,7 @@ def estimate(
       `simulations_are` is then `"slow"`, and `within` 1.5 by default.
     - `proved`: the result of `verify` for this problem, or its file. Proved parts of the space,
       safe or failing, are not simulated; all simulations are in the rest.
+    - all other arguments: as in `falsify`.
     **Returns:** the estimate with its interval and a guaranteed bound. Ctrl-C gives the estimate
     from the finished simulations. A simulation without a verdict (not finite, raised, out of time)
     counts as safe in the estimate, and as a failure at the upper ends of interval and bound.

@@ -82,7 +82,6 @@ def repair(
     - `gradient`: whether to follow gradients; by default if the present backend has them.
     - `stop`: the seconds of the work, a fifth of which is reserved for the check.
     - `run_on`: the backend of the simulations.
-    - `progress`: whether to show one line of progress; see `core.display.progress` for the default.
     - all other arguments: as in `falsify`.
     **Returns:** a `Repair`; after Ctrl-C the finished part, without the check.
     **Raises:** `ValueError` before anything compiles for unknown features, parameters without a

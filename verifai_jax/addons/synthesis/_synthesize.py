@@ -82,10 +82,8 @@ def synthesize(
       method of `verify`: for all parameters in it, and all environments of that part of the prior,
       the formula holds. No proof when left out.
     - `gradient`: whether to follow gradients; by default if the present backend has them.
-    - `batch`: simulations at once.
     - `stop`: the seconds of the work, a fifth of which is reserved for the check.
     - `run_on`: the backend of the simulations.
-    - `progress`: whether to show one line of progress; see `core.display.progress` for the default.
     - all other arguments: as in `falsify`.
     **Returns:** a `Synthesis`; after Ctrl-C the finished part, without the check.
     **Raises:** `ValueError` before anything compiles for unknown features and options out of range.

@@ -108,7 +108,7 @@ def certify(
         )
     policies = list(policies)
     certified = options_of("certify", Certification, certification)
-    samples, confidence, attacks = certified.samples, certified.confidence, certified.attacks(256)
+    samples, confidence = certified.samples, certified.confidence
     budget = _check(policies, p, certified, seed, tie)
     lanes = LANES if samples >= LANES else max(8, power_of_two(samples))
     enable_compile_cache()  # Before the search compiles, too.
@@ -122,7 +122,7 @@ def certify(
         executor=options_of("certify", RunOn, run_on, "executor").executor,
     )
     attacker = check_attack(blocks.problem, certified.attack)
-    rounds = -(-attacks // lanes)
+    rounds = -(-certified.attack_simulations // lanes)
     if tie is None:
         tie = min(p / 10, SETTLED / (len(policies) * samples))
     allocation = Allocation(p, confidence, samples, budget, lanes, tie)
@@ -301,11 +301,7 @@ class _Report:
 
 
 def _check(
-    policies: list[Any],
-    p: float,
-    certified: Certification,
-    seed: int,
-    tie: float | None,
+    policies: list[Any], p: float, certified: Certification, seed: int, tie: float | None
 ) -> int:
     """Refuse values out of range, and return the budget."""
     if not policies:

@@ -19,8 +19,7 @@ class Certification:
     - `budget`: samples of all policies together; four times the minimum when left out. Samples
       beyond the minimum go to policies whose verdict is open, and to those that may be the safest.
     - `attack`: the search that looks for failures first; its failures are not part of any rate.
-    - `attack_simulations`: simulations of each attack, rounded up to whole blocks, 0 for none; 256
-      by default, and 512 in `harden`.
+    - `attack_simulations`: simulations of each attack, rounded up to whole blocks, 0 for none.
 
     **Raises:** `ValueError` for numbers out of range.
     """
@@ -29,17 +28,12 @@ class Certification:
     confidence: float = 0.95
     budget: int | None = None
     attack: str | Search = "cross_entropy"
-    attack_simulations: int | None = None
+    attack_simulations: int = 256
 
     def __post_init__(self) -> None:
         check_count("samples", self.samples)
         check_fraction("confidence", self.confidence)
-        if self.attack_simulations is not None:
-            check_count("attack_simulations", self.attack_simulations, 0)
-
-    def attacks(self, usual: int) -> int:
-        """Return the simulations of each attack, `usual` by default."""
-        return usual if self.attack_simulations is None else self.attack_simulations
+        check_count("attack_simulations", self.attack_simulations, 0)
 
     def check_budget(self, policies: int) -> None:
         """Refuse a budget that is too small for this number of policies."""

@@ -75,11 +75,9 @@ def compare(
     - `margin`: the largest difference of failure probabilities that does not matter, at least 0.
     - `confidence`: the probability that all verdicts hold.
     - `budget`: maximum number of simulations of all problems together.
-    - `seed`: the seed of the samples; the same seed gives the same pairs.
     - `stop`: the seconds after which the verdict is made from finished pairs.
-    - `precision`: as in `falsify`.
     - `run_on`: the workers of the simulations; with them the comparison is the same.
-    - `progress`: whether to show one line of progress; see `core.display.progress` for the default.
+    - all other arguments: as in `falsify`.
     **Returns:** the comparison; after Ctrl-C that of the finished pairs.
     **Raises:** before anything is simulated, `TypeError` for anything but a `Problem`;
     `ProblemError` if other features vary; `ValueError` for numbers out of range, and for targets
@@ -116,17 +114,10 @@ def compare(
 
 
 def _compare(
-    baseline: Problem,
-    named: Mapping[str, Problem],
-    target: str | None,
-    margin: float,
-    confidence: float,
-    budget: int,
-    seed: int,
-    max_seconds: float | None,
-    precision: str,
+    baseline: Problem, named: Mapping[str, Problem], target: str | None, margin: float,
+    confidence: float, budget: int, seed: int, max_seconds: float | None, precision: str,
     executor: Executor | None,
-) -> Comparison:
+) -> Comparison:  # fmt: skip
     """Compare problems; see `compare`."""
     started = time.perf_counter()
     _check(baseline, named, margin, confidence, budget)

@@ -87,14 +87,11 @@ def modes(
     **Arguments:**
     - `source`: a problem, or a run of one; failures of the run are then used too.
     - `budget`: maximum number of simulations; one with its gradient counts as 2.
-    - `batch`: simulations at once.
-    - `seed`: the same seed gives the same modes on the same machine.
     - `confidence`: the confidence of all intervals, between 0 and 1.
     - `min_share`: regions with a smaller share of the failure probability are not listed.
     - `stop`: the seconds after which the finished simulations are divided into modes.
-    - `precision`: as in `falsify`.
     - `run_on`: the backend of the simulations.
-    - `progress`: True draws a progress bar, False none; None draws one on a terminal.
+    - all other arguments: as in `falsify`.
     **Returns:** the modes, the most probable first. If no failure was found, or failures could not
     be weighted, the result is empty and a note says why. If the system draws random numbers,
     probabilities cover these too, and each mode holds a random key under which its likeliest

@@ -66,11 +66,10 @@ def fmea(
       if few samples fail; 0 switches off all three.
     - `pairs`: whether to try pairs of the faults that cause no failure alone.
     - `confidence`: the confidence of each interval.
-    - `seed`: the seed of everything that is drawn at random.
     - `folder`: the folder of the counterexamples (a run) and of finished simulations; the same call
       continues an interrupted table there.
     - `run_on`: the workers of the simulations.
-    - `progress`: whether to show one line of progress; see `core.display.progress` for the default.
+    - all other arguments: as in `falsify`.
     **Returns:** the table, the most probable failure first. Ctrl-C ends the call; with `folder` it
     may be repeated.
     **Raises:** `ValueError` without faults, for a fault that cannot be switched off, for rates out

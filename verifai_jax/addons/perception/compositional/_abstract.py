@@ -98,10 +98,9 @@ def abstract(
     - `stop`: the number of confirmed failures after which it ends; 1 when left out.
     - `samples`: number of samples of the prior, to sample the region of uncertainty.
     - `batch`: number of images in a round.
-    - `seed`: the same seed gives the same result, bit for bit, on the same machine.
     - `images_per_simulation`: number of images in a simulation; by default one for each sample of a
       trace.
-    - `progress`: whether to show a progress bar; by default on a terminal or in a notebook.
+    - all other arguments: as in `falsify`.
     **Returns:** the region, the images, the candidates and which of them fail in the loop, with the
     number of rendered images of each stage.
     **Raises:** before anything is rendered, `ProblemError` for parts that do not fit; `ValueError`
@@ -199,16 +198,9 @@ class _Stages:
     """Images and simulations by turns, until something ends them."""
 
     def __init__(
-        self,
-        problem: Problem,
-        image: Problem,
-        search: str | Search,
-        budget: int,
-        wanted: int,
-        batch: int,
-        seed: int,
-        per: int,
-    ) -> None:
+        self, problem: Problem, image: Problem, search: str | Search, budget: int, wanted: int,
+        batch: int, seed: int, per: int,
+    ) -> None:  # fmt: skip
         self.problem, self.image, self.search = problem, image, search
         self.budget, self.wanted, self.batch = budget, wanted, batch
         self.seed, self.per = seed, per

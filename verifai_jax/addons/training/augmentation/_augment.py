@@ -90,9 +90,7 @@ def augment(
     - `confidence`: the confidence of each single interval.
     - `folder`: the folder that stores finished work: the same call resumes after an interruption,
       and one with more seeds or arms computes only the new ones.
-    - `progress`: show a progress bar; by default on a terminal or in a notebook.
-    - `even_if_changed`: whether to continue with finished work of a folder although files of the
-      task have changed since it began.
+    - `progress`, `even_if_changed`: as in `falsify` and `resume`.
     **Returns:** the result: a table with a row for each arm and seed, and comparisons. After an
     interruption (Ctrl-C) it has the finished rows, and `complete` is False.
     **Raises:** before anything is trained, `UnknownNameError` for unknown arms, searches and

@@ -12,7 +12,7 @@ randomization for transferring deep neural networks, IROS 2017 (the baseline).
 import inspect
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -48,7 +48,6 @@ from verifai_jax.core.store.cache import Cache, locked_cache
 from verifai_jax.features import Categorical
 from verifai_jax.problem.problem import Problem
 from verifai_jax.problem.silent_mistakes import formula_notes
-from verifai_jax.search import Search
 from verifai_jax.statistics.confidence_sequences import safe_at
 from verifai_jax.statistics.stopping import Stop
 
@@ -69,16 +68,9 @@ class Plan:
 
     rounds: int
     steps: int
-    further_steps: int
+    further: FurtherTraining
     p: float
-    confidence: float
-    samples: int
-    attack: str | Search
-    attack_simulations: int
-    added: int
-    own: float
-    failing: float
-    tolerance: float
+    certification: Certification
     episodes: int
     baseline: bool
     seed: int
@@ -88,11 +80,14 @@ class Plan:
             check_count(name, getattr(self, name), 0 if name == "seed" else 1)
         check_fraction("p", self.p)
 
-    def certification(self) -> Certification:
-        """Return the certification of each round."""
-        return Certification(
-            self.samples, self.confidence, None, self.attack, self.attack_simulations
-        )
+    def options(self) -> dict[str, Any]:
+        """Return all options by name, as plain data."""
+        further, certified = dict(vars(self.further)), dict(vars(self.certification))
+        named = {"further_steps": further.pop("steps"), **further, **certified, **vars(self)}
+        named["attack"] = stable_text(certified["attack"])
+        return {
+            n: one for n, one in named.items() if n not in ("further", "certification", "start")
+        }
 
     def seed_for(self, purpose: int, stage: int = 0) -> int:
         """Return the seed for a purpose; different purposes get different samples."""
@@ -150,33 +145,28 @@ def harden(
     - `episodes`: number of the task's own episodes that measure returns, the same for all policies.
     - `baseline`: whether to train a second arm with plain domain randomisation: the same seed, own
       episodes and environment steps, but episodes from the prior instead of failures.
-    - `seed`: the seed of training, attacks and samples.
     - `stop`: the seconds after which no round begins.
     - `folder`: the folder of finished work; the same call continues an interrupted hardening.
-    - `even_if_changed`: whether to continue in a folder although files of the model have changed.
-    - `progress`: whether to show one line of progress; see `core.display.progress` for the default.
+    - all other arguments: as in `falsify` and `resume`.
     **Returns:** the result. Ctrl-C ends the call; with `folder` it may be repeated.
     **Raises:** before anything is trained, `HardeningError` for a task that cannot start with the
     features; `ValueError` for numbers out of range; the errors of `Trainer.configuration`;
     `CacheError` for a folder of another hardening; `FolderInUse` if another process writes there.
     """
     how = options_of("harden", FurtherTraining, further)
-    used = ("samples", "confidence", "attack", "attack_simulations")
-    certified = options_of("harden", Certification, certification, *used)
+    usual = Certification(attack_simulations=512)
+    certified = options_of("harden", Certification, certification or usual)
     max_seconds = options_of("harden", Stop, stop, "seconds").seconds
     made = _as_study(study, problem, p)
     trainer, values = made.trainer, dict(hyperparameters or {})
     first_steps = check_count("steps", trainer.steps if steps is None else steps)
-    plan = Plan(
-        rounds, first_steps, max(1, first_steps // 8) if how.steps is None else how.steps,
-        made.p if p is None else p, certified.confidence, certified.samples, certified.attack,
-        certified.attacks(512), how.added, how.own, how.failing, how.tolerance,
-        episodes, baseline, seed,
-    )  # fmt: skip
+    how = replace(how, steps=max(1, first_steps // 8) if how.steps is None else how.steps)
+    p = made.p if p is None else p
+    plan = Plan(rounds, first_steps, how, p, certified, episodes, baseline, seed)
     untrained = made.untrained_problem()
     untrained.check()
     with locked_cache(folder, "hardening") as cache:
-        options = {name: stable_text(each) for name, each in vars(plan).items()}
+        options = {name: stable_text(each) for name, each in plan.options().items()}
         options["hyperparameters"] = stable_text(sorted(values.items()))
         cache.claim(fingerprint(made, options), untrained.sources(), even_if_changed)
         result = Work(made, plan, values, untrained, how.start, cache).run(max_seconds)
@@ -200,7 +190,9 @@ class Work:
     def __post_init__(self) -> None:
         study, plan, untrained = self.study, self.plan, self.untrained
         self.arms_named = (HARDENED, BASELINE) if plan.baseline else (HARDENED,)
-        stages = [plan.steps + stage * plan.further_steps for stage in range(plan.rounds + 1)]
+        stages = [
+            plan.steps + stage * (plan.further.steps or 0) for stage in range(plan.rounds + 1)
+        ]
         trainer, space = study.trainer, untrained.space
         self.task, self.stages = trainer.nominal, stages
         known = study, self.values, stages, plan.seed, self.cache, self.arms_named
@@ -214,7 +206,7 @@ class Work:
                 *known, configured, mixture_of(configured.task, untrained, self.start)
             )
         self.points, self.radii = np.zeros((0, space.dim), np.float32), np.zeros(0)
-        self.own = dict.fromkeys(self.arms_named, plan.own)
+        self.own = dict.fromkeys(self.arms_named, plan.further.own)
         self.rows: list[dict[str, Any]] = []
         self.added: list[pd.DataFrame] = []
         self.policies: dict[tuple[str, int], Any] = {}
@@ -242,7 +234,7 @@ class Work:
         plan, began = self.plan, time.perf_counter()
         policies = self.arms.policies(stage)
         certificates = certify(
-            self.study.problem, policies, p=plan.p, certification=plan.certification(),
+            self.study.problem, policies, p=plan.p, certification=plan.certification,
             seed=plan.seed_for(ROUND, stage), tie=plan.p, progress=False,
             remember=self.cache.remember,
         )  # fmt: skip
@@ -266,7 +258,8 @@ class Work:
             found = collect(
                 self.study.problem(self.policies[HARDENED, stage]),
                 certificates.counterexamples(0), self.points,
-                seed=plan.seed_for(ATTACK, stage), added=plan.added, table=TABLE, shrunk=SHRUNK,
+                seed=plan.seed_for(ATTACK, stage), added=plan.further.added, table=TABLE,
+                shrunk=SHRUNK,
             )  # fmt: skip
             return {name: np.asarray(value) for name, value in found._asdict().items()}
 
@@ -284,9 +277,9 @@ class Work:
         rate, mixtures = certificates[0].rate.estimate if certificates[0].rate else 0.0, []
         for arm, count in zip(self.arms_named, (len(self.points), 0), strict=False):
             change = -OWN_STEP if self._keeps_return(arm, stage) else OWN_STEP
-            own = self.own[arm] = max(plan.own, min(self.own[arm] + change, OWN_LIMIT))
+            own = self.own[arm] = max(plan.further.own, min(self.own[arm] + change, OWN_LIMIT))
             # The more of the prior fails, the more of its episodes begin at failures anyway.
-            wanted = plan.failing * (1 - own) / max(1 - plan.own, 1e-9)
+            wanted = plan.further.failing * (1 - own) / max(1 - plan.further.own, 1e-9)
             failing = min(max((wanted - (1 - own) * rate) / max(1 - rate, 1e-9), 0.0), wanted)
             shares = (own, 1 - own - failing, failing)
             mixtures.append(Mixture.of(space, shares, self.points[:count], self.radii[:count]))
@@ -301,7 +294,7 @@ class Work:
 
     def _keeps_return(self, arm: str, stage: int) -> bool:
         before, now = (float(self.returns[arm, at].mean()) for at in (0, stage))
-        return not now < before - self.plan.tolerance * abs(before)
+        return not now < before - self.plan.further.tolerance * abs(before)
 
     def _choice(self, arm: str) -> int:
         """Return the stage that fails least among those that keep the return, else the first."""
@@ -313,12 +306,13 @@ class Work:
     def _result(self, stopped: str, began: float) -> Hardening:
         """Choose a policy, certify it and the first on fresh samples, and compare both in pairs."""
         plan, notes = self.plan, [*formula_notes(self.untrained)]
+        sampled = plan.certification
         chosen = {arm: self._choice(arm) for arm in self.arms_named}
         comparison: Comparison | None = None
         if at := chosen[HARDENED]:
             comparison = compare(
                 *(self.study.problem(self.policies[HARDENED, stage]) for stage in (0, at)),
-                confidence=plan.confidence, budget=16 * plan.samples,
+                confidence=sampled.confidence, budget=16 * sampled.samples,
                 seed=plan.seed_for(COMPARED), progress=False,
             )  # fmt: skip
             end_if_interrupted(comparison.stopped)
@@ -332,7 +326,9 @@ class Work:
         finalists = [start, *(self.policies[arm, at] for arm, at in chosen.items())]
         final = certify(
             self.study.problem, finalists, p=plan.p,
-            certification=Certification(4 * plan.samples, plan.confidence, attack_simulations=0),
+            certification=replace(
+                sampled, samples=4 * sampled.samples, budget=None, attack_simulations=0
+            ),
             seed=plan.seed_for(FINAL), tie=plan.p, progress=False, remember=self.cache.remember,
         )  # fmt: skip
         end_if_interrupted(final.stopped)
@@ -344,7 +340,7 @@ class Work:
             certificates=final, comparison=comparison,
             returns={"start": self.returns[HARDENED, 0], **returns},
             stopped=stopped, seconds=time.perf_counter() - began,
-            options={**vars(plan), "attack": stable_text(plan.attack)},
+            options=plan.options(),
             notes=tuple(notes), version=__version__,
         )  # fmt: skip
 

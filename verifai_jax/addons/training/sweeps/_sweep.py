@@ -71,15 +71,13 @@ def sweep(
     - `episodes`: number of episodes over which the nominal return is averaged.
     - `folder`: the folder that caches finished work; passing it again resumes an interrupted sweep.
     - `stop`: the seconds of the sweep; no training begins after two thirds of them.
-    - `progress`: True draws bars, False none; None draws them on a terminal and in a notebook.
     - `note`: plain data that is stored in the folder next to the work.
     - `callbacks`: functions called for each policy when its return is known, and again when its
       safety is, with the number of calls so far and a dictionary of plain numbers; cached work
       counts too.
     - `run_on`: the workers that train and simulate; the table is the same. With `halving`,
       configurations that continue after a checkpoint are trained from the start.
-    - `even_if_changed`: whether to continue with finished work of a folder although files of the
-      study have changed since it began; the record then says so.
+    - `progress`, `even_if_changed`: as in `falsify` and `resume`.
     **Returns:** the policies with their returns and certificates. An interrupted sweep (Ctrl-C, out
     of time) returns its finished part; `record.complete` is False.
     **Raises:** before anything trains, the `StudyError` and `UnknownNameError` of `Study.check`;
@@ -105,7 +103,7 @@ def sweep(
         "confidence": certified.confidence,
         "budget": certified.budget,
         "attack": attack if isinstance(attack, str) else repr(attack),
-        "attack_simulations": certified.attacks(256),
+        "attack_simulations": certified.attack_simulations,
         "halving": None if halving is None else {"reduction": halving.reduction, "by": halving.by},
         "episodes": episodes,
     }
@@ -126,14 +124,9 @@ def sweep(
 
 
 def check_options(
-    study: object,
-    certified: Certification,
-    configurations: int,
-    seed: int,
-    halving: object,
-    batch: int | None,
-    episodes: int,
-) -> None:
+    study: object, certified: Certification, configurations: int, seed: int, halving: object,
+    batch: int | None, episodes: int,
+) -> None:  # fmt: skip
     """Check the options of a sweep, separately and against its study.
 
     **Raises:** `TypeError` for an argument that is not a study or a `Halving`; `ValueError` for a
@@ -148,11 +141,8 @@ def check_options(
     for name, value in counts.items():
         check_count(name, value)
     check_count("seed", seed, 0)
-    if halving is not None:
-        _check_halving(study, halving)
-    certified.check_budget(
-        count_policies(study, configurations, halving if isinstance(halving, Halving) else None)
-    )
+    halved = None if halving is None else _check_halving(study, halving)
+    certified.check_budget(count_policies(study, configurations, halved))
 
 
 def count_policies(study: Study, configurations: int, halving: Halving | None) -> int:
@@ -166,7 +156,7 @@ def count_policies(study: Study, configurations: int, halving: Halving | None) -
     return total * len(study.training_seeds)
 
 
-def _check_halving(study: Study, halving: object) -> None:
+def _check_halving(study: Study, halving: object) -> Halving:
     if not isinstance(halving, Halving):
         raise TypeError(f"halving must be a Halving; got {halving!r}")
     if STEPS in study.space.domains:
@@ -179,3 +169,4 @@ def _check_halving(study: Study, halving: object) -> None:
             "halving stops trainings at checkpoints; the study has none before the end at "
             f"{study.trainer.steps} steps"
         )
+    return halving
