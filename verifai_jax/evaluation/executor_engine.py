@@ -64,18 +64,10 @@ class ExecutorEngine:
     """
 
     def __init__(
-        self,
-        problem: Problem,
-        batch: int,
-        executor: executors.Executor,
-        *,
-        gradient: bool = False,
-        clauses: bool = False,
-        precision: str = "float32",
-        journal: Journal | None = None,
-        guidance: Guidance = NOTHING,
-        given: bool = False,
-    ) -> None:
+        self, problem: Problem, batch: int, executor: executors.Executor, *, gradient: bool = False,
+        clauses: bool = False, precision: str = "float32", journal: Journal | None = None, guidance:
+        Guidance = NOTHING, given: bool = False,
+    ) -> None:  # fmt: skip
         executors.check_executor(executor)
         self.problem, self.executor, self.precision = problem, executor, precision
         self.compile_seconds = 0.0

@@ -303,10 +303,7 @@ class HostReplays:
 
 
 def finest_replays(
-    problem: Problem,
-    run: str,
-    key: Key[Any, ""],
-    executor: "Executor | None" = None,
+    problem: Problem, run: str, key: Key[Any, ""], executor: "Executor | None" = None
 ) -> tuple[Replays | HostReplays | None, list[str], str]:
     """Return replays of a problem's rows in the highest precision in which it can be traced.
 

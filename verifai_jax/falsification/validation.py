@@ -263,11 +263,9 @@ def points_of(problem: Problem, rows: Rows, precision: str) -> Float[np.ndarray,
 
 
 def check_first(
-    problem: Problem,
-    first: "Rows | Float[np.ndarray, 'n row'] | None",
-    rule: "StoppingRule | None",
-    precision: str,
-) -> Float[np.ndarray, "n row"]:
+    problem: Problem, first: "Rows | Float[np.ndarray, 'n row'] | None",
+    rule: "StoppingRule | None", precision: str,
+) -> Float[np.ndarray, "n row"]:  # fmt: skip
     """Return the rows that are simulated before the search begins; empty if none are given.
 
     **Raises:** the errors of `points_of`; `ValueError` together with a rule that needs independent

@@ -21,15 +21,9 @@ ATTACK = 20_000
 
 
 def feature_parameters(
-    problem: Problem,
-    parameters: Sequence[str] | str | None,
-    gradient: bool | None,
-    batch: int,
-    budget: int,
-    precision: str,
-    backend: str | None,
-    seed: int,
-) -> FeatureParameters:
+    problem: Problem, parameters: Sequence[str] | str | None, gradient: bool | None, batch: int,
+    budget: int, precision: str, backend: str | None, seed: int,
+) -> FeatureParameters:  # fmt: skip
     """Return the checked problem on its backend, with these features as parameters.
 
     **Raises:** `ValueError` for invalid arguments, before anything compiles.
@@ -87,15 +81,9 @@ def attack_search(problem: Problem, search: str | Search, loop: Parametric) -> S
 
 
 def repaired_arrays(
-    problem: Any,
-    parameters: Any,
-    system_of: Any,
-    nominal: Any,
-    gradient: Any,
-    batch: int,
-    precision: str,
-    seed: int,
-) -> ArrayParameters:
+    problem: Any, parameters: Any, system_of: Any, nominal: Any, gradient: Any, batch: int,
+    precision: str, seed: int,
+) -> ArrayParameters:  # fmt: skip
     """Return the problem with these arrays as parameters of a repair.
 
     **Raises:** `TypeError` or `ValueError` for invalid arguments.
@@ -116,16 +104,9 @@ def repaired_arrays(
 
 
 def repaired_features(
-    problem: Any,
-    names: Any,
-    nominal: Any,
-    gradient: Any,
-    batch: int,
-    budget: int,
-    precision: str,
-    backend: Any,
-    seed: int,
-) -> tuple[Any, Float[np.ndarray, " p"]]:
+    problem: Any, names: Any, nominal: Any, gradient: Any, batch: int, budget: int, precision: str,
+    backend: Any, seed: int,
+) -> tuple[Any, Float[np.ndarray, " p"]]:  # fmt: skip
     """Return the problem with these features as parameters of a repair, and their nominal values.
 
     **Raises:** `ValueError` for invalid arguments, before anything compiles.

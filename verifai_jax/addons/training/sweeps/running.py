@@ -298,12 +298,9 @@ class RunningSweep:
         return certificates
 
     def _certify_policies(
-        self,
-        policies: Sequence[record.TrainedPolicy],
-        certification: Certification,
-        seed: int,
+        self, policies: Sequence[record.TrainedPolicy], certification: Certification, seed: int,
         progress: Callable[[int, int, str], None] | None,
-    ) -> Certificates:
+    ) -> Certificates:  # fmt: skip
         def remember(name: str, compute: Callable[[], Arrays]) -> Arrays:
             try:
                 self.clock.check()
