@@ -203,8 +203,8 @@ _METHODS = {
 
 
 def _result(
-    problem: Problem, backend: str | None, answer: answers.Answer, limit_state: LimitState, plan:
-    answers.Plan, seed: int, precision: str, p0: float | None, seconds: float,
+    problem: Problem, backend: str | None, answer: answers.Answer, limit_state: LimitState,
+    plan: answers.Plan, seed: int, precision: str, p0: float | None, seconds: float,
 ) -> Estimate:  # fmt: skip
     notes = [text for text in (limit_state.own_chance, *formula_notes(problem)) if text]
     notes += answer.notes
