@@ -11,6 +11,7 @@ imports pytest and nothing else until a test of a problem is collected.
 import shlex
 import sys
 from collections.abc import Generator, Iterator
+from dataclasses import replace
 from fnmatch import fnmatch
 from pathlib import Path
 from typing import Any
@@ -80,7 +81,7 @@ class SpecFile(pytest.File):
         place = _place(self)
         for name, problem in problems_of(place).items():
             yield ProblemItem.from_parent(
-                self, name=name, problem=problem, target=f"{place}:{name}"
+                self, name=name, problem=replace(problem, target=f"{place}:{name}")
             )
 
     def repr_failure(self, excinfo: pytest.ExceptionInfo[BaseException], style: Any = None) -> Any:
@@ -95,9 +96,9 @@ class SpecFile(pytest.File):
 class ProblemItem(pytest.Item):
     """A problem as a test."""
 
-    def __init__(self, *, problem: Any, target: str, **options: Any) -> None:
+    def __init__(self, *, problem: Any, **options: Any) -> None:
         super().__init__(**options)
-        self.problem, self.target = problem, target
+        self.problem = problem
         if self.config.pluginmanager.hasplugin("xdist"):
             # Problems of one file share what they compile, so they stay with one worker.
             self.add_marker(pytest.mark.xdist_group(str(self.path)))
@@ -124,7 +125,7 @@ class ProblemItem(pytest.Item):
             raise pytest.UsageError("vj_rename: give OLD=NEW for each feature")
         with session(_session(self)) as now:
             try:
-                run_check(self.problem, Check(**chosen), target=self.target)
+                run_check(self.problem, Check(**chosen))
             finally:
                 _tell(self, now)
 
@@ -133,7 +134,7 @@ class ProblemItem(pytest.Item):
         from verifai_jax.addons.checking import CounterexampleFound
 
         if isinstance(excinfo.value, CounterexampleFound):
-            return _failure(self, excinfo.value, self.target)
+            return _failure(self, excinfo.value, self.problem.target)
         return super().repr_failure(excinfo)
 
     def reportinfo(self) -> tuple[Path, int | None, str]:

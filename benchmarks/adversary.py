@@ -5,7 +5,7 @@
 The disturbance is one standard normal number for each of 20 periods. The adversary is a policy that
 sees the state and chooses it (PPO of `vj.rl`); its reward is that of adaptive stress testing: the
 log-density of each disturbance, and at the end of an episode without a failure a penalty that grows
-with the distance from one. Cross-entropy (`objective="likelihood"`) does not see the state. Both
+with the distance from one. Cross-entropy (`search.Likeliest`) does not see the state. Both
 simulate equally often; of each the likeliest failure counts, all episodes of training included.
 """
 
@@ -158,7 +158,7 @@ def by_cross_entropy(game, simulations, seed):
     """Return the greatest log-density of a failure that cross-entropy found."""
     space = {f"w{k}": vj.Normal(0.0, 1.0) for k in range(PERIODS)}
     problem = vj.Problem("game", space, game.simulate, "always margin >= 0")
-    run = vj.falsify(problem, "cross_entropy", simulations, objective="likelihood", seed=seed,
+    run = vj.falsify(problem, vj.search.Likeliest(vj.search.CrossEntropy()), simulations, seed=seed,
                      confirm=False, progress=False)  # fmt: skip
     failing = run.table.counterexamples
     points = failing[list(space)].to_numpy()

@@ -102,7 +102,9 @@ def falsified_one_by_one(problem: vj.Problem, search: str, budget: int, seeds: i
     """Return the first claimed failure of each seed, infinite without one, in batches of two."""
     first = np.full(seeds, np.inf)
     for seed in range(seeds):
-        run = vj.falsify(problem, search, budget, batch=2, seed=seed, stop_after=1, progress=False)
+        run = vj.falsify(
+            problem, search, budget, batch=2, seed=seed, stop=vj.Stop(after=1), progress=False
+        )
         claimed = np.flatnonzero(run.table.all["verdict"] == "confirmed")
         if len(claimed):
             first[seed] = claimed[0] + 1

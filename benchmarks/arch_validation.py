@@ -115,7 +115,9 @@ def as_matrix(rows: Float[np.ndarray, "lines columns"]) -> str:
 def line(problem: vj.Problem, budget: int, seed: int) -> dict[str, Any]:
     """Falsify a requirement from one seed, and return its line of the table."""
     began = time.perf_counter()
-    run = vj.falsify(problem, "portfolio", budget, batch=1, seed=seed, stop_after=1, progress=False)
+    run = vj.falsify(
+        problem, "portfolio", budget, batch=1, seed=seed, stop=vj.Stop(after=1), progress=False
+    )
     seconds = time.perf_counter() - began
     name = problem.name.removesuffix("_instance1")
     system = system_of(name)

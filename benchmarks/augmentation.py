@@ -19,7 +19,7 @@ from augmentation_scene import smallest_gaps, task
 import verifai_jax as vj
 from verifai_jax.addons.training.paired import paired_difference
 
-OPTIONS = {"initial": 1000, "added": 200, "steps": 600, "further_steps": 300}
+OPTIONS = {"initial": 1000, "added": 200, "steps": (600, 300)}
 
 
 def compare(result, metric):

@@ -119,8 +119,13 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=10)
     parser.add_argument("--budget", type=int, default=1000)
     arguments = parser.parse_args()
-    settings = {"plain": False, "inputs": True, "behaviour": "behaviour"}
+    settings = {"plain": None, "inputs": "inputs", "behaviour": "behaviour"}
     searches = ("cross_entropy", "portfolio")
+
+    def looking(search: str, by: Any) -> vj.search.Search:
+        inner = vj.search.named(search)
+        return inner if by is None else vj.search.Diverse(inner, by=by)
+
     print(f"| problem | search | {' | '.join(settings)} |")
     print(f"|---|---|{'---|' * len(settings)}")
     for make in (bands, boxes, balance):
@@ -132,7 +137,7 @@ def main() -> None:
                 for seed in range(arguments.seeds):
                     # In batches of 16 as the others, which learn once a round.
                     run = vj.falsify(
-                        problem, search, arguments.budget, batch=16, seed=seed, diverse=diverse,
+                        problem, looking(search, diverse), arguments.budget, batch=16, seed=seed,
                         confirm=False, progress=False,
                     )  # fmt: skip
                     counts.append(len(kinds(run)))
@@ -144,8 +149,8 @@ def main() -> None:
         for diverse in settings.values():
             runs = [
                 vj.falsify(
-                    problem, search, maximum, batch=16, seed=seed, diverse=diverse, stop_after=1,
-                    confirm=False, progress=False,
+                    problem, looking(search, diverse), maximum, batch=16, seed=seed,
+                    stop=vj.Stop(after=1), confirm=False, progress=False,
                 )
                 for seed in range(arguments.seeds)
             ]  # fmt: skip

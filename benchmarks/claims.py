@@ -127,7 +127,7 @@ def rare() -> float:
     """Count the simulations up to the first failure of what one sample in a thousand breaks."""
     from specs.cartpole import rare as problem
 
-    return float(vj.falsify(problem, stop_after=1, progress=False).simulations)
+    return float(vj.falsify(problem, stop=vj.Stop(after=1), progress=False).simulations)
 
 
 def rare_median() -> float:
@@ -135,7 +135,7 @@ def rare_median() -> float:
     from specs.cartpole import rare as problem
 
     def first(seed: int) -> int:
-        run = vj.falsify(problem, stop_after=1, seed=seed, confirm=False, progress=False)
+        run = vj.falsify(problem, stop=vj.Stop(after=1), seed=seed, confirm=False, progress=False)
         return int(run.table.counterexamples.index[0]) + 1
 
     return statistics.median(map(first, range(50)))
@@ -145,7 +145,7 @@ def shrunk() -> float:
     """Count the features away from nominal that are enough for it."""
     from specs.cartpole import rare as problem
 
-    return float(vj.shrink(vj.falsify(problem, stop_after=1, progress=False)).count)
+    return float(vj.shrink(vj.falsify(problem, stop=vj.Stop(after=1), progress=False)).count)
 
 
 def rules_covered() -> float:

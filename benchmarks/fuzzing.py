@@ -21,14 +21,22 @@ MAX_SIMULATIONS = 100_000
 
 def fuzzed(seed: int) -> int:
     """Return the number of simulations until `vj.fuzz` finds the fault."""
-    run = vj.fuzz(handover, MAX_SIMULATIONS, cells=MODES, seed=seed, stop_after=1, progress=False)
+    run = vj.fuzz(
+        handover, MAX_SIMULATIONS, cells=MODES, seed=seed, stop=vj.Stop(after=1), progress=False
+    )
     return first_failure(run)
 
 
 def sampled(seed: int) -> int:
     """Return the number of simulations until uniform sequences have it."""
     run = vj.falsify(
-        handover, "uniform", MAX_SIMULATIONS, seed=seed, stop_after=1, batch=1024, progress=False
+        handover,
+        "uniform",
+        MAX_SIMULATIONS,
+        seed=seed,
+        stop=vj.Stop(after=1),
+        batch=1024,
+        progress=False,
     )
     return first_failure(run)
 
@@ -56,7 +64,7 @@ def main() -> None:
     lengths = []
     for seed in seeds:
         run = vj.fuzz(
-            handover, MAX_SIMULATIONS, cells=MODES, seed=seed, stop_after=1, progress=False
+            handover, MAX_SIMULATIONS, cells=MODES, seed=seed, stop=vj.Stop(after=1), progress=False
         )
         small = vj.shrink(run)
         lengths.append(int(small.features["events"].length))

@@ -179,7 +179,8 @@ def sweep(tiny):
     from specs import mountain_car
 
     study = mountain_car.safe_training
-    options = {"configurations": 1 if tiny else 6, "samples": 64 if tiny else 512}
+    options = {"configurations": 1 if tiny else 6}
+    options["certification"] = vj.Certification(samples=64 if tiny else 512)
     if tiny:
         from dataclasses import replace
 

@@ -89,7 +89,8 @@ CASES = {
     ),
     "hopper": (HopperTask(), upright_with, HOPPER_PPO, {"steps": 1_500_000, "p": 0.001}),
     "reacher": (
-        REACHER, reach_with, REACHING, {"steps": 400_000, "p": 0.001, "start": start_with(REACHER)},
+        REACHER, reach_with, REACHING, {"steps": 400_000, "p": 0.001,
+         "further": vj.FurtherTraining(start=start_with(REACHER))},
     ),
 }  # fmt: skip
 
@@ -122,8 +123,9 @@ def main():
     logs, seconds, count = [], 0.0, FRESH.get(args.case, 40_000)
     for seed in range(args.first, args.first + args.seeds):
         folder = None if args.folder is None else args.folder / args.case / str(seed)
+        trainer = task if algorithm is None else vj.Trainer(task, algorithm)
         result = vj.harden(
-            task, problem, algorithm=algorithm, seed=seed, baseline=True, folder=folder,
+            trainer, problem, seed=seed, baseline=True, folder=folder,
             progress=False, **options,
         )  # fmt: skip
         print(result, flush=True)

@@ -156,7 +156,13 @@ def compositional(seeds: int) -> None:
     for seed in range(seeds):
         for search in ("uniform", "cross_entropy"):
             run = vj.falsify(
-                COLLISIONS, search, 50_000, seed=seed, batch=64, stop_after=1, confirm=False
+                COLLISIONS,
+                search,
+                50_000,
+                seed=seed,
+                batch=64,
+                stop=vj.Stop(after=1),
+                confirm=False,
             )
             counts.setdefault(search, []).append(per * (first_failure(run) + 1))
         for search in ("uniform", "cross_entropy"):
@@ -228,7 +234,13 @@ def gradient(seeds: int) -> None:
             spent, seconds, compiled, found = [], [], 0.0, 0
             for seed in range(seeds):
                 run = vj.falsify(
-                    problem, search, BUDGET, seed=seed, batch=16, stop_after=1, confirm=False
+                    problem,
+                    search,
+                    BUDGET,
+                    seed=seed,
+                    batch=16,
+                    stop=vj.Stop(after=1),
+                    confirm=False,
                 )
                 compiled = max(compiled, run.compile_seconds)
                 found += len(run.table.counterexamples) > 0

@@ -81,7 +81,9 @@ def simulations_to_a_failure() -> None:
     print(f"failure rate: {failed / total:.2e} ({rate}) of {total:,} scenes")
     searched = []
     for seed in range(SEEDS):
-        run = vj.falsify(braking, budget=MAX_SIMULATIONS, stop_after=1, seed=seed, confirm=False)
+        run = vj.falsify(
+            braking, budget=MAX_SIMULATIONS, stop=vj.Stop(after=1), seed=seed, confirm=False
+        )
         rows = run.table.all
         broken = np.flatnonzero(rows["violated"].to_numpy(bool))
         searched.append(int(broken[0]) + 1 if len(broken) else len(rows))

@@ -120,7 +120,9 @@ def on_landscapes(options):
 
 def first_failure(problem, search, batch, seed, budget):
     """Number of the first failing simulation of a run; the budget where there is none."""
-    run = vj.falsify(problem, search, budget, batch=batch, seed=seed, stop_after=1, progress=False)
+    run = vj.falsify(
+        problem, search, budget, batch=batch, seed=seed, stop=vj.Stop(after=1), progress=False
+    )
     failing = np.flatnonzero(run.table.all["violated"])
     return (int(failing[0]) + 1, True) if len(failing) else (budget, False)
 

@@ -51,7 +51,7 @@ def first_failures(
     number, cost, points = [], [], []
     for seed in seeds:
         run = vj.falsify(
-            problem, search, budget, batch=batch, seed=seed, stop_after=1, confirm=False,
+            problem, search, budget, batch=batch, seed=seed, stop=vj.Stop(after=1), confirm=False,
             progress=False,
         )  # fmt: skip
         rows = run.table.all

@@ -89,8 +89,8 @@ def problems():
 def first_failure(what, search, seed, budget):
     """Return the number of the first simulation that fails, and whether there is one."""
     run = vj.falsify(
-        what, search, budget, batch=512 if search == "uniform" else 8, seed=seed, stop_after=1,
-        progress=False,
+        what, search, budget, batch=512 if search == "uniform" else 8, seed=seed,
+        stop=vj.Stop(after=1), progress=False,
     )  # fmt: skip
     failing = np.flatnonzero(run.table.all["violated"])
     return (int(failing[0]) + 1, True) if len(failing) else (budget, False)

@@ -250,7 +250,7 @@ def main() -> None:
         print(name)
         make, threshold, sign = PROBLEMS[name]()
         problem = tightened(make, threshold, sign)
-        result = vj.verify(problem, options.seconds, progress=False)
+        result = vj.verify(problem, stop=vj.Stop(seconds=options.seconds), progress=False)
         print(result)
         print(f"  decided      {result.proved.mass + result.throughout.mass:.2%}")
         begun = time.perf_counter()

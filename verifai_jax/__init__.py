@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from verifai_jax.addons.estimation import estimate as estimate
     from verifai_jax.addons.estimation import sequence as sequence
     from verifai_jax.addons.estimation.certification import Certificates as Certificates
+    from verifai_jax.addons.estimation.certification import Certification as Certification
     from verifai_jax.addons.estimation.certification import certify as certify
     from verifai_jax.addons.estimation.comparison import Comparison as Comparison
     from verifai_jax.addons.estimation.comparison import compare as compare
@@ -65,6 +66,7 @@ if TYPE_CHECKING:
     from verifai_jax.addons.simulators.mujoco import mujoco as mujoco
     from verifai_jax.addons.simulators.mujoco import native as native
     from verifai_jax.addons.simulators.remote import remote as remote
+    from verifai_jax.addons.synthesis import Aim as Aim
     from verifai_jax.addons.synthesis import Repair as Repair
     from verifai_jax.addons.synthesis import Synthesis as Synthesis
     from verifai_jax.addons.synthesis import repair as repair
@@ -73,6 +75,7 @@ if TYPE_CHECKING:
     from verifai_jax.addons.training.augmentation import Augmentation as Augmentation
     from verifai_jax.addons.training.augmentation import SupervisedTask as SupervisedTask
     from verifai_jax.addons.training.augmentation import augment as augment
+    from verifai_jax.addons.training.hardening import FurtherTraining as FurtherTraining
     from verifai_jax.addons.training.hardening import Hardening as Hardening
     from verifai_jax.addons.training.hardening import harden as harden
     from verifai_jax.addons.training.sweeps import Halving as Halving
@@ -96,10 +99,12 @@ if TYPE_CHECKING:
     from verifai_jax.counterexamples import confirm as confirm
     from verifai_jax.counterexamples import explain as explain
     from verifai_jax.counterexamples import shrink as shrink
+    from verifai_jax.evaluation.run_on import RunOn as RunOn
     from verifai_jax.falsification import ErrorTable as ErrorTable
     from verifai_jax.falsification import Replay as Replay
     from verifai_jax.falsification import Run as Run
     from verifai_jax.falsification import RunError as RunError
+    from verifai_jax.falsification import Start as Start
     from verifai_jax.falsification import falsify as falsify
     from verifai_jax.falsification import load as load
     from verifai_jax.falsification import resume as resume
@@ -143,6 +148,7 @@ if TYPE_CHECKING:
     )
     from verifai_jax.statistics.confidence_sequences import anytime_interval as anytime_interval
     from verifai_jax.statistics.stopping import Decided as Decided
+    from verifai_jax.statistics.stopping import Stop as Stop
     from verifai_jax.statistics.stopping import Within as Within
     from verifai_jax.systems.base import System as System
     from verifai_jax.systems.blackbox import blackbox as blackbox

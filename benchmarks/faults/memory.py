@@ -70,7 +70,7 @@ def soak(seconds: float) -> Report:
             "cross_entropy",
             1_000_000_000,
             batch=256,
-            max_seconds=seconds,
+            stop=vj.Stop(seconds=seconds),
             folder=Path(root) / "run",
             progress=False,
         )

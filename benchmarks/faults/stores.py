@@ -27,7 +27,11 @@ def _study() -> Study:
 
 def _sweep(folder: Path) -> vj.Sweep:
     return vj.sweep(
-        _study(), configurations=CONFIGURATIONS, samples=SAMPLES, folder=folder, progress=False
+        _study(),
+        configurations=CONFIGURATIONS,
+        certification=vj.Certification(samples=SAMPLES),
+        folder=folder,
+        progress=False,
     )
 
 

@@ -335,7 +335,7 @@ def test_exit_codes(call, tmp_path, monkeypatch):
         "ended after 64 of 96 simulations, since none succeeds: each raised RuntimeError: no road"
     )
     assert f"{ended} (specs/broken.py, line 6" in output
-    assert output.rstrip().endswith("keep_going=True, or --keep-going, simulates all")
+    assert output.rstrip().endswith("Stop(keep_going=True), or --keep-going, simulates all")
     output = call(*broken, "--keep-going", code=3)
     assert "96 error. The first says: RuntimeError: no road (specs/broken.py, line 6" in output
     for command in ("analyze", "confirm", "shrink", "explain", "replay"):

@@ -63,7 +63,7 @@ def test_a_gradient_needs_the_backend_that_jax_traces():
     assert run.notes == ("backend mjx: the search needs gradients",)
     assert "note         backend mjx: the search needs gradients" in run.summary()
     with pytest.raises(ValueError, match="is a black box, which has no gradient"):
-        vj.falsify(problem(), "gradient", 32, backend="native")
+        vj.falsify(problem(), "gradient", 32, run_on=vj.RunOn(backend="native"))
     alone = problem(backend="native", backends=("native",))
     with pytest.raises(ValueError, match="does not run on mjx: no mjx for hills"):
         vj.falsify(alone, "gradient", 32)
@@ -125,8 +125,8 @@ def test_a_model_that_mjx_cannot_do_is_simulated_natively(monkeypatch):
 @pytest.mark.thorough
 def test_runs_remember_their_backend(tmp_path):
     two = problem()
-    whole = vj.falsify(two, "uniform", 64, batch=16, backend="native")
-    vj.falsify(two, "uniform", 32, batch=16, backend="native", folder=tmp_path)
+    whole = vj.falsify(two, "uniform", 64, batch=16, run_on=vj.RunOn(backend="native"))
+    vj.falsify(two, "uniform", 32, batch=16, run_on=vj.RunOn(backend="native"), folder=tmp_path)
     loaded = vj.load(tmp_path, two)
     assert loaded.backend == "native"
     assert loaded.problem is not None
@@ -137,7 +137,7 @@ def test_runs_remember_their_backend(tmp_path):
 
 def test_names_that_do_not_exist():
     with pytest.raises(ValueError, match="backend 'brax' is not possible: no brax for hills"):
-        vj.falsify(problem(), "uniform", 8, backend="brax")
+        vj.falsify(problem(), "uniform", 8, run_on=vj.RunOn(backend="brax"))
     plain = vj.Problem("one", SPACE, ramp, "always x <= 0.9")
     with pytest.raises(ValueError, match="has no backends to choose from; got backend 'native'"):
-        vj.falsify(plain, "uniform", 8, backend="native")
+        vj.falsify(plain, "uniform", 8, run_on=vj.RunOn(backend="native"))

@@ -55,7 +55,7 @@ def test_artefacts_of_the_step_are_not_claimed(artefact):
 
 @pytest.mark.thorough
 def test_a_search_goes_on_where_nothing_is_confirmed(artefact):
-    run = vj.falsify(artefact, "mutation", 48, batch=8, stop_after=1)
+    run = vj.falsify(artefact, "mutation", 48, batch=8, stop=vj.Stop(after=1))
     assert (run.simulations, run.stopped) == (48, "budget")
     assert len(run.table.unconfirmed)
 
@@ -63,7 +63,7 @@ def test_a_search_goes_on_where_nothing_is_confirmed(artefact):
 @pytest.mark.thorough
 def test_true_failures_are_claimed():
     problem = vj.Problem("slow", SPACE, Decay(0.125), "eventually[0, 4] x <= 0.3")
-    run = vj.falsify(problem, budget=64, batch=1, stop_after=1)
+    run = vj.falsify(problem, budget=64, batch=1, stop=vj.Stop(after=1))
     assert len(run.table.counterexamples) == 1
     row = run.best
     assert row["verdict"] == "confirmed"
@@ -85,7 +85,7 @@ def test_slopes_are_left_out_where_there_are_none():
     search, notes = adapt_search(counted, Portfolio())
     assert search == Portfolio(gradients=False)
     assert notes == ("portfolio without gradients: the robustness is constant almost everywhere",)
-    run = vj.falsify(counted, budget=64, batch=8, stop_after=1)
+    run = vj.falsify(counted, budget=64, batch=8, stop=vj.Stop(after=1))
     assert len(run.table.counterexamples) >= 1
     assert "differentiated" not in run.table.all
     assert notes[0] in run.notes
@@ -100,7 +100,9 @@ def test_diverse_failures_are_of_both_kinds():
 
     space = {"x": vj.Box(0, 1), "y": vj.Box(0, 1)}
     problem = vj.Problem("two", space, system, "far > 0")
-    run = vj.falsify(problem, budget=2000, batch=16, stop_after=4, diverse=True, confirm=False)
+    run = vj.falsify(
+        problem, "diverse", budget=2000, batch=16, stop=vj.Stop(after=4), confirm=False
+    )
     failing = run.table.counterexamples
     assert run.stopped == "stop_after"
     assert (failing["x"] < 0.5).any()

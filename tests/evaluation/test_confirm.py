@@ -639,7 +639,7 @@ def test_mujoco_on_both_engines(backend):
         "uniform",
         256,
         batch=256,
-        backend=backend,
+        run_on=vj.RunOn(backend=backend),
         progress=False,
         confirm=False,
     )

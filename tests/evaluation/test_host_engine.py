@@ -109,7 +109,9 @@ def test_rows_come_in_any_order_and_are_told_apart(traced):
     ],
 )
 def test_what_goes_wrong_is_a_row(system, message):
-    run = vj.falsify(problem_of(vj.blackbox(system)), "uniform", 40, batch=40, keep_going=True)
+    run = vj.falsify(
+        problem_of(vj.blackbox(system)), "uniform", 40, batch=40, stop=vj.Stop(keep_going=True)
+    )
     table = run.table.all
     assert len(table) == 40
     assert (table["status"] == "error").all()

@@ -243,9 +243,7 @@ def test_certificates_show_what_came_again():
         lambda policy: problem(systems[float(policy)]),
         [0.0, 1.0],
         p=0.2,
-        samples=16,
-        attack_simulations=16,
-        budget=32,
+        certification=vj.Certification(samples=16, attack_simulations=16, budget=32),
     )
     wavering, steady = certificates
     assert len(wavering.counterexamples["rho"]) == wavering.attack_failures == 0

@@ -207,7 +207,7 @@ def test_rows_that_are_not_those_of_the_checkpoint_are_told(problem, folders, tm
     with pytest.raises(ValueError, match=f"no report .* run of 'ramp', .* evidence: {told}"):
         run.report(tmp_path / "report.html")
     with pytest.warns(UserWarning, match=f"the error table is damaged: {told}"):
-        again = vj.falsify(problem, budget=32, warm_start=run, **OPTIONS)
+        again = vj.falsify(problem, vj.Start("cross_entropy", run=run), 32, batch=16)
     assert len(again.table) == 32
     # The checkpoint of another run, and the record of another one.
     shutil.copy(folders / "short" / FINISHED, folder / FINISHED)

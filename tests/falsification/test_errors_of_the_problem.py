@@ -58,20 +58,20 @@ def test_the_run_ends_after_its_first_simulations(name, search, tmp_path):
         vj.falsify(asked, search, 1000, folder=folder, progress=False)
     said = str(caught.value)
     assert said.startswith("the run of 'p' ended after 64 of 1,000 simulations, since none ")
-    assert said.endswith("keep_going=True, or --keep-going, simulates all")
+    assert said.endswith("Stop(keep_going=True), or --keep-going, simulates all")
     run = caught.value.run
     assert len(CALLS) == run.simulations == 64
     assert run.stopped == "an error of every simulation"
     assert list(run.table.all["status"]) == ["error"] * 64
     # The finished part is on disk, and the run can go on.
     assert len(vj.load(folder).table) == 64
-    run = vj.resume(folder, asked, budget=90, keep_going=True, progress=False)
+    run = vj.resume(folder, asked, budget=90, stop=vj.Stop(keep_going=True), progress=False)
     assert run.simulations == 90
 
 
 @pytest.mark.thorough
 def test_whoever_asks_gets_all(tmp_path):
-    run = vj.falsify(problem(_raises), "uniform", 40, keep_going=True, progress=False)
+    run = vj.falsify(problem(_raises), "uniform", 40, stop=vj.Stop(keep_going=True), progress=False)
     assert run.simulations == 40
     assert vj.simulate(problem(_raises), [{"x": 0.1}] * 20, progress=False).simulations == 20
     few = vj.falsify(problem(_raises), "uniform", 8, progress=False)
@@ -83,7 +83,12 @@ def test_whoever_asks_gets_all(tmp_path):
 def test_where_some_succeed_the_run_goes_on_with_the_same_rows(function):
     first = vj.falsify(problem(function), "cross_entropy", 64, progress=False, confirm=False)
     again = vj.falsify(
-        problem(function), "cross_entropy", 64, keep_going=True, progress=False, confirm=False
+        problem(function),
+        "cross_entropy",
+        64,
+        stop=vj.Stop(keep_going=True),
+        progress=False,
+        confirm=False,
     )
     assert first.simulations == len(CALLS) == 64
     assert first.table.all.equals(again.table.all)
@@ -143,7 +148,7 @@ def _of_policy(policy):
 
 @pytest.mark.thorough
 def test_policies_of_which_all_raise_are_not_certified():
-    options = {"samples": 64, "attack_simulations": 64, "progress": False}
+    options = {"certification": vj.Certification(64, attack_simulations=64), "progress": False}
     CALLS.clear()
     with pytest.raises(RuntimeError, match=r"each of the first 66 simulations .* no road at"):
         vj.certify(_of_policy, [0.0, 1.0, 2.0], **options)

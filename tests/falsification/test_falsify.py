@@ -53,7 +53,7 @@ def test_the_usual_batch_leaves_a_search_time_to_learn(problem):
     batches = [usual_batch(vj.search.Uniform(), n, whole=True) for n in (10_000, 131_072, 10**7)]
     assert batches == [1024, 16_384, 131_072]
     # One that ends with the first failure has small rounds, but not a great many of them.
-    batches = [usual_batch(vj.search.Halton(), n, stop_after=1) for n in (10_000, 100_000, 10**7)]
+    batches = [usual_batch(vj.search.Halton(), n, after=1) for n in (10_000, 100_000, 10**7)]
     assert batches == [16, 128, 1024]
     assert vj.falsify(problem, "cross_entropy", 1000).batch == 32
     assert vj.falsify(problem, "cross_entropy", 5).batch == 5
@@ -107,7 +107,7 @@ def test_random_systems_replay_and_do_not_depend_on_the_batch():
 
 
 def test_stops_after_counterexamples_at_once(problem):
-    run = vj.falsify(problem, "uniform", 10_000, batch=16, stop_after=5)
+    run = vj.falsify(problem, "uniform", 10_000, batch=16, stop=vj.Stop(after=5))
     assert run.stopped == "stop_after"
     assert 5 <= len(run.table.counterexamples) < 5 + 16
     before_last = run.table.all.iloc[: run.simulations - 16]
@@ -119,7 +119,7 @@ def test_stops_after_counterexamples_at_once(problem):
 
 def test_stops_in_time(problem):
     vj.falsify(problem, "uniform", 64, batch=64)
-    run = vj.falsify(problem, "uniform", 10**9, batch=64, max_seconds=0.3)
+    run = vj.falsify(problem, "uniform", 10**9, batch=64, stop=vj.Stop(seconds=0.3))
     assert run.stopped == "max_seconds"
     assert 0 < run.simulations < 10**9
 
@@ -380,8 +380,8 @@ class TestRefusedBeforeAnythingCompiles:
             ({"batch": -1}, "batch must be an integer of at least 1; got -1"),
             ({"budget": 1.5}, "budget must be an integer of at least 1; got 1.5"),
             ({"seed": -1}, "seed must be an integer"),
-            ({"stop_after": 0}, "stop_after must be an integer of at least 1; got 0"),
-            ({"max_seconds": 0}, "max_seconds must be positive; got 0"),
+            ({"stop": 3}, r"falsify needs a vj\.Stop; got 3"),
+            ({"run_on": "native"}, r"falsify needs a vj\.RunOn; got 'native'"),
             ({"search": "cros_entropy"}, "did you mean 'cross_entropy'"),
             ({"search": 3}, "search must be a name or a search like"),
         ],
@@ -391,8 +391,8 @@ class TestRefusedBeforeAnythingCompiles:
             vj.falsify(problem, **options)
 
     def test_a_misspelt_option_names_itself(self, problem):
-        with pytest.raises(ValueError, match="'max_second'; did you mean 'max_seconds'"):
-            vj.falsify(problem, max_second=3)
+        with pytest.raises(ValueError, match="'run_in'; did you mean 'run_on'"):
+            vj.falsify(problem, run_in=3)
         with pytest.raises(ValueError, match=r"'elit'.*did you mean 'elite"):
             vj.search.named("cross_entropy", elit=0.1)
         with unchecked(), pytest.raises(ValueError, match="'controler'; did you mean 'controller'"):

@@ -22,7 +22,7 @@ PROBLEM = vj.Problem(
 @pytest.mark.thorough
 def test_first_points_come_first_and_the_search_goes_on_as_ever():
     plain = vj.falsify(PROBLEM, "uniform", 32, batch=16)
-    run = vj.falsify(PROBLEM, "uniform", 35, batch=16, first=FIRST)
+    run = vj.falsify(PROBLEM, vj.Start("uniform", rows=FIRST), 35, batch=16)
     table = run.table.all
     np.testing.assert_array_equal(table["a"][:3], np.float32([0.1, 0.95, 0.4]))
     assert table["rho"][1] == pytest.approx(-0.05, abs=1e-6)
@@ -30,21 +30,21 @@ def test_first_points_come_first_and_the_search_goes_on_as_ever():
     assert run.failure_rate is None
     assert plain.failure_rate is not None
     rows = pd.DataFrame(FIRST)
-    again = vj.falsify(PROBLEM, "uniform", 35, batch=16, first=rows)
+    again = vj.falsify(PROBLEM, vj.Start("uniform", rows=rows), 35, batch=16)
     assert again.table.all.equals(table)
     # More points than the budget, and than a batch.
-    many = vj.falsify(PROBLEM, "uniform", 2, batch=1, first=FIRST)
+    many = vj.falsify(PROBLEM, vj.Start("uniform", rows=FIRST), 2, batch=1)
     assert many.table.all["a"].tolist() == table["a"][:2].tolist()
-    with pytest.raises(ValueError, match="stop_when needs independent samples"):
-        vj.falsify(PROBLEM, "uniform", stop_when=Within(0.1), first=FIRST)
+    with pytest.raises(ValueError, match=r"Stop\(when=\) needs independent samples"):
+        vj.falsify(PROBLEM, vj.Start("uniform", rows=FIRST), stop=vj.Stop(when=Within(0.1)))
     space = vj.FeatureSpace(PROBLEM.space.domains, where=lambda f: f["a"] > 0.2)
     narrow = vj.Problem("ramp", space, system, "always x < 0.7")
     with pytest.raises(ValueError, match="breaks the constraint of this space"):
-        vj.falsify(narrow, first=FIRST)
+        vj.falsify(narrow, vj.Start(rows=FIRST))
     with pytest.raises(ValueError, match="row 0: it breaks the constraint of this space"):
-        vj.falsify(narrow, first=pd.DataFrame(FIRST))
+        vj.falsify(narrow, vj.Start(rows=pd.DataFrame(FIRST)))
     with pytest.raises(ValueError, match="a"):
-        vj.falsify(PROBLEM, first=[{"a": 2.0, "b": 0.0}])
+        vj.falsify(PROBLEM, vj.Start(rows=[{"a": 2.0, "b": 0.0}]))
 
 
 @pytest.mark.slow
@@ -71,7 +71,7 @@ def test_a_search_learns_from_them_and_resuming_keeps_them(search, tmp_path):
     if search == "cross_entropy":
         # Its first proposals are drawn near the elite of what it was told.
         told = [{"a": 0.98, "b": 0.02 * i} for i in range(8)]
-        near = vj.falsify(PROBLEM, search, 16, batch=8, first=told).table.all[8:]
+        near = vj.falsify(PROBLEM, vj.Start(search, rows=told), 16, batch=8).table.all[8:]
         assert near["a"].mean() > 0.8
 
 

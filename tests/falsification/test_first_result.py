@@ -26,7 +26,7 @@ def problem(bound=1.0):
 
 @pytest.mark.slow
 def test_a_first_run_compiles_only_what_it_needs(compiled):
-    run = vj.falsify(problem(), budget=64, stop_after=1)
+    run = vj.falsify(problem(), budget=64, stop=vj.Stop(after=1))
     assert len(run.table.counterexamples)
     # The search: init, ask, plan, tell. Simulations, gradients, the nominal point, two replays.
     assert len(compiled) <= 9, compiled

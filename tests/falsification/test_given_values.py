@@ -125,7 +125,7 @@ def test_what_is_outside_is_refused_in_every_form(change, message):
     with pytest.raises(ValueError, match=message):
         vj.Problem("given", SPACE, system, "side < 2", nominal=ROW | change)
     with pytest.raises(ValueError, match=message):
-        vj.falsify(PROBLEM, warm_start=pd.DataFrame(rows).assign(rho=1.0))
+        vj.falsify(PROBLEM, vj.Start(run=pd.DataFrame(rows).assign(rho=1.0)))
 
 
 def test_other_forms_are_refused():
@@ -207,7 +207,7 @@ def test_a_frame_without_rows_is_as_a_list_without():
     for rows in ([], frame):
         with pytest.raises(ValueError, match="got no rows"):
             vj.simulate(BLACK_BOX, rows)
-        run = vj.falsify(BLACK_BOX, "uniform", 2, first=rows, progress=False)
+        run = vj.falsify(BLACK_BOX, vj.Start("uniform", rows=rows), 2, progress=False)
         assert run.failure_rate is not None
     with pytest.raises(ValueError, match="unknown column 'size'"):
         vj.simulate(BLACK_BOX, frame.drop(columns="size"))

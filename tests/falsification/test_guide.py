@@ -33,7 +33,7 @@ GUIDED = replace(PLAIN, guide=vj.Guide("always heat < 0.9", weight=0.8, scale=0.
 
 @pytest.mark.thorough
 def test_it_finds_what_the_robustness_says_nothing_of():
-    options = {"budget": 600, "batch": 16, "seed": 0, "stop_after": 1}
+    options = {"budget": 600, "batch": 16, "seed": 0, "stop": vj.Stop(after=1)}
     assert vj.falsify(PLAIN, "cross_entropy", **options).table.counts.claimed == 0
     run = vj.falsify(GUIDED, "cross_entropy", **options)
     assert run.table.counts.claimed > 0
@@ -124,13 +124,13 @@ def test_a_black_box_is_guided_too_and_goes_on_as_it_was(tmp_path):
 
     guide = vj.Guide(distance, scale=0.2)
     problem = vj.Problem("box", SPACE, box, "always tripped < 0.5", guide=guide)
-    options = {"batch": 16, "seed": 0, "stop_after": 1}
+    options = {"batch": 16, "seed": 0, "stop": vj.Stop(after=1)}
     whole = vj.falsify(problem, "cross_entropy", 600, **options)
     assert whole.table.counts.claimed > 0
     vj.falsify(problem, "cross_entropy", 64, folder=tmp_path / "run", **options)
     with pytest.raises(ValueError, match=r"was steered by the guide .*distance.* by no guide"):
         vj.resume(tmp_path / "run", replace(problem, guide=None), budget=600)
-    resumed = vj.resume(tmp_path / "run", problem, budget=600, stop_after=1)
+    resumed = vj.resume(tmp_path / "run", problem, budget=600, stop=vj.Stop(after=1))
     assert resumed.table.all.equals(whole.table.all)
     assert vj.load(tmp_path / "run").guide["weight"] == 0.5
 
@@ -141,7 +141,7 @@ def test_workers_of_an_executor_tell_the_same():
     options = {"budget": 96, "batch": 16, "seed": 0, "diverse": "behaviour"}
     here = vj.falsify(GUIDED, "cross_entropy", **options)
     with ThreadPoolExecutor(2) as pool:
-        there = vj.falsify(GUIDED, "cross_entropy", executor=pool, **options)
+        there = vj.falsify(GUIDED, "cross_entropy", run_on=vj.RunOn(executor=pool), **options)
     assert there.table.all.equals(here.table.all)
 
 

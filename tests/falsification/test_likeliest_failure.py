@@ -7,7 +7,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from checked_types import unchecked
 
 import verifai_jax as vj
 from verifai_jax.features.density import NoDensityError, log_density
@@ -80,7 +79,7 @@ def test_it_is_that_of_dynamic_programming(name):
     world = WORLDS[name]
     problem = grid_world(name, *world)
     best = by_dynamic_programming(*world)
-    run = vj.falsify(problem, objective="likelihood", budget=4000, progress=False)
+    run = vj.falsify(problem, "likeliest", budget=4000, progress=False)
     assert run.search.startswith("Likeliest(search=CrossEntropy(")
     small = vj.shrink(run, by="likelihood", budget=3000, progress=False)
     assert small.log_densities is not None
@@ -107,7 +106,7 @@ HALF = vj.Problem(
 
 @pytest.mark.slow
 def test_it_is_the_nearest_point_of_a_half_space():
-    run = vj.falsify(HALF, objective="likelihood", budget=1024, progress=False)
+    run = vj.falsify(HALF, "likeliest", budget=1024, progress=False)
     small = vj.shrink(run, by="likelihood", budget=800, progress=False)
     # The even feature costs nothing: at its end the half space begins at 2.9 of sqrt(2) sigma.
     assert small.distance == pytest.approx(2.9 / math.sqrt(2), rel=2e-3)
@@ -149,10 +148,11 @@ def test_searches_for_likely_failures_are_checked():
     assert from_json(data) == search
     with pytest.raises(ValueError, match="only a search that learns"):
         Likeliest(Uniform())
-    with unchecked(), pytest.raises(ValueError, match="unknown objective 'likely'"):
-        vj.falsify(HALF, objective="likely")  # pyright: ignore[reportArgumentType]
     with pytest.raises(ValueError, match="leave out one of them"):
-        vj.falsify(HALF, objective="likelihood", diverse=True)
+        vj.search.Likeliest(vj.search.Diverse())
+    with pytest.raises(ValueError, match="leave out one of them"):
+        vj.search.Diverse(vj.search.Likeliest())
+    assert vj.search.named("likeliest") == Likeliest(CrossEntropy())
 
 
 @pytest.mark.addons

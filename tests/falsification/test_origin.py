@@ -58,7 +58,7 @@ def runs():
     rows = [{"a": 0.1 * i, "b": 0.5} for i in range(11)]
     return {
         "prior": vj.falsify(problem, "uniform", 48, batch=16),
-        "first": vj.falsify(problem, "uniform", 48, batch=16, first=rows[:2]),
+        "first": vj.falsify(problem, vj.Start("uniform", rows=rows[:2]), 48, batch=16),
         "given": vj.simulate(problem, rows),
         "sequence": vj.falsify(problem, "halton", 48, batch=16),
         "learned": vj.falsify(problem, "cross_entropy", 48, batch=16),
@@ -80,7 +80,7 @@ def test_every_text_gives_the_reason(runs, tmp_path):
             wanted = {OTHERS[origin]} if origin != "first" else set()
             assert said == wanted, (origin, said)
         assert ("by what it had found before" in report) == (origin == "learned")
-    assert "its first 2 rows were given; leave out first=" in runs["first"].summary()
+    assert "its first 2 rows were given; leave out Start(rows=)" in runs["first"].summary()
 
 
 @pytest.mark.thorough

@@ -84,21 +84,21 @@ def test_resuming_keeps_the_gravest(ordered):
 
 class TestStopWhen:
     def test_a_run_ends_when_the_rate_is_known_within_a_width(self, plain):
-        run = vj.falsify(plain, "uniform", 100_000, batch=256, stop_when=vj.Within(0.05))
+        run = vj.falsify(plain, "uniform", 100_000, batch=256, stop=vj.Stop(when=vj.Within(0.05)))
         assert run.stopped == "stop_when"
         assert run.failure_rate.high - run.failure_rate.low <= 0.1
         assert run.failure_rate.low <= 1 - 0.97 * 0.25 <= run.failure_rate.high
         assert 256 < run.simulations < 4096
 
     def test_a_run_ends_when_the_rate_is_decided(self, plain):
-        run = vj.falsify(plain, "uniform", 100_000, batch=256, stop_when=vj.Decided(0.5))
+        run = vj.falsify(plain, "uniform", 100_000, batch=256, stop=vj.Stop(when=vj.Decided(0.5)))
         assert run.failure_rate.low > 0.5
 
     def test_only_for_prior_samples(self, plain):
-        with pytest.raises(ValueError, match="stop_when needs independent samples"):
-            vj.falsify(plain, "cross_entropy", stop_when=vj.Within(0.05))
+        with pytest.raises(ValueError, match=r"Stop\(when=\) needs independent samples"):
+            vj.falsify(plain, "cross_entropy", stop=vj.Stop(when=vj.Within(0.05)))
         with (
             unchecked(),
             pytest.raises(TypeError, match=r"a rule such as Within\(0.005\); got 0.05"),
         ):
-            vj.falsify(plain, "uniform", stop_when=0.05)
+            vj.falsify(plain, "uniform", stop=vj.Stop(when=0.05))

@@ -81,7 +81,7 @@ def test_a_budget_in_the_middle_of_a_round_that_was_reached_is_spent(problem):
 def test_rounds_simulated_ahead_are_those_in_turn(problem):
     """Only where the budget alone ends a run are rounds simulated before the last one is stored."""
     ahead = vj.falsify(problem, "uniform", 70, batch=16)
-    assert same(ahead, vj.falsify(problem, "uniform", 70, batch=16, max_seconds=3600.0))
+    assert same(ahead, vj.falsify(problem, "uniform", 70, batch=16, stop=vj.Stop(seconds=3600.0)))
 
     def interrupts(simulations, numbers):
         if simulations == 32:
@@ -208,32 +208,32 @@ class TestWarmStart:
         assert len(earlier.table.counterexamples) > 5
         cold = vj.falsify(problem, "cross_entropy", 16, batch=16)
         for start in (earlier, earlier.table, earlier.table.all):
-            warm = vj.falsify(problem, "cross_entropy", 16, batch=16, warm_start=start)
+            warm = vj.falsify(problem, vj.Start("cross_entropy", run=start), 16, batch=16)
             assert len(warm.table.counterexamples) >= 6 > len(cold.table.counterexamples)
         assert len(warm.table) == 16
 
     @pytest.mark.thorough
     def test_a_gradient_search_starts_from_the_nearest(self, problem):
         earlier = vj.falsify(problem, "uniform", 64, batch=64)
-        warm = vj.falsify(problem, "gradient", 16, batch=16, warm_start=earlier)
+        warm = vj.falsify(problem, vj.Start("gradient", run=earlier), 16, batch=16)
         nearest = earlier.table.safe.nsmallest(4, "rho")
         np.testing.assert_allclose(warm.table.all["rho"][:4], nearest["rho"], atol=1e-5)
 
     def test_rows_without_a_verdict_do_not_count(self, problem):
         earlier = vj.falsify(problem, "uniform", 32, batch=16).table.all.copy()
         earlier.loc[5, ["rho", "status"]] = [np.nan, "nonfinite"]
-        run = vj.falsify(problem, "cross_entropy", 16, batch=16, warm_start=earlier)
+        run = vj.falsify(problem, vj.Start("cross_entropy", run=earlier), 16, batch=16)
         assert np.all(np.isfinite(run.table.all["rho"]))
         nothing = earlier.loc[earlier["status"] != "ok"]
         cold = vj.falsify(problem, "cross_entropy", 16, batch=16)
-        assert same(vj.falsify(problem, "cross_entropy", 16, batch=16, warm_start=nothing), cold)
+        assert same(vj.falsify(problem, vj.Start("cross_entropy", run=nothing), 16, batch=16), cold)
 
     def test_bad_tables(self, problem):
         table = vj.falsify(problem, "uniform", 16, batch=16).table.all
-        with pytest.raises(ValueError, match="unknown column of warm_start 'kind'"):
-            vj.falsify(problem, warm_start=table.drop(columns="kind"))
+        with pytest.raises(ValueError, match="unknown column of the earlier run 'kind'"):
+            vj.falsify(problem, vj.Start(run=table.drop(columns="kind")))
         with (
             unchecked(),
             pytest.raises(TypeError, match="a run, an error table or a DataFrame; got 3"),
         ):
-            vj.falsify(problem, warm_start=3)
+            vj.falsify(problem, vj.Start(run=3))

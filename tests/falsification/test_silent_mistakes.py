@@ -197,7 +197,7 @@ class TestRuns:
         nominal = {"a": 0.5, "b": 0.5}
         problem = vj.Problem("p", SPACE, both, "always (x < 0.25 & y < 2)", nominal=nominal)
         first = [{"a": 0.125, "b": 0.75}]
-        run = vj.falsify(problem, "uniform", 8, batch=8, first=first, precision=precision)
+        run = vj.falsify(problem, vj.Start("uniform", rows=first), 8, batch=8, precision=precision)
         assert run.notes[0].startswith("the nominal features fail themselves, with robustness -0.2")
         assert run.table.all["a"][0] == 0.125
 

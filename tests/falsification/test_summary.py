@@ -95,7 +95,9 @@ def run(request):
     if request.param == "resumed":
         first = vj.falsify(problem, "uniform", 32, batch=32, progress=False)
         return vj.resume(first, budget=64, progress=False)
-    return vj.falsify(problem, "uniform", 64, batch=64, progress=False, keep_going=True)
+    return vj.falsify(
+        problem, "uniform", 64, batch=64, progress=False, stop=vj.Stop(keep_going=True)
+    )
 
 
 def numbers(text):

@@ -332,7 +332,7 @@ def test_numbers_of_numpy_are_as_good_as_pythons(tmp_path):
     problem = vj.Problem("t", {"x": vj.Box(0.0, 1.0)}, vj.blackbox(simulator), "a < 0.5")
     numbers = {"budget": np.int64(32), "batch": np.int32(8), "seed": np.uint8(3)}
     run = vj.falsify(
-        problem, "uniform", folder=tmp_path / "run", max_seconds=np.float32(60),
+        problem, "uniform", folder=tmp_path / "run", stop=vj.Stop(seconds=np.float32(60)),
         progress=False, **numbers,
     )  # fmt: skip
     assert vj.load(tmp_path / "run", problem).budget == run.simulations == 32

@@ -100,7 +100,7 @@ class TestFalsifier:
         np.testing.assert_allclose((rate.low, rate.high), (0.24486321636655, 0.91476658586264))
 
     def test_stops_simulating_at_the_wanted_number(self):
-        run = vj.falsify(self.PROBLEM, "halton", 8, batch=1, stop_after=2, confirm=False)
+        run = vj.falsify(self.PROBLEM, "halton", 8, batch=1, stop=vj.Stop(after=2), confirm=False)
         assert (run.simulations, len(run.table.counterexamples), len(run.table.safe)) == (2, 2, 0)
 
     def test_a_margin_of_zero_counts_where_the_comparator_says_so(self):

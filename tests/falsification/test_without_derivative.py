@@ -88,7 +88,9 @@ def test_what_is_never_read_lacks_nothing():
 
 @pytest.mark.thorough
 def test_the_default_search_goes_on_and_says_so_once():
-    run = vj.falsify(problem(on_host), budget=200, stop_after=1, progress=False, confirm=False)
+    run = vj.falsify(
+        problem(on_host), budget=200, stop=vj.Stop(after=1), progress=False, confirm=False
+    )
     said = [note for note in run.notes if "pure_callback" in note]
     assert len(said) == 1
     assert said[0].startswith("portfolio without gradients: pure_callback of road (")

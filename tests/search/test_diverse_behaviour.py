@@ -136,11 +136,16 @@ def kinds(run):
 @pytest.mark.proves
 def test_it_finds_more_that_happens_where_inputs_say_little():
     options = {"budget": 500, "seed": 0, "confirm": False}
-    assert kinds(vj.falsify(BANDED, "cross_entropy", diverse=True, **options)) <= 4
-    run = vj.falsify(BANDED, "cross_entropy", diverse="behaviour", **options)
+    assert kinds(vj.falsify(BANDED, vj.search.Diverse(vj.search.CrossEntropy()), **options)) <= 4
+    run = vj.falsify(BANDED, vj.search.Diverse(vj.search.CrossEntropy(), by="behaviour"), **options)
     assert kinds(run) >= 8
     # Failures that are alike count once.
-    some = vj.falsify(BANDED, "cross_entropy", diverse="behaviour", stop_after=3, **options)
+    some = vj.falsify(
+        BANDED,
+        vj.search.Diverse(vj.search.CrossEntropy(), by="behaviour"),
+        stop=vj.Stop(after=3),
+        **options,
+    )
     assert some.stopped == "stop_after"
     assert kinds(some) >= 3
 
@@ -169,10 +174,15 @@ def staged(f, key):
 def test_what_is_new_leads_on_where_the_robustness_says_nothing():
     space = {name: vj.Box(0, 1) for name in "abcdef"}
     problem = vj.Problem("staged", space, staged, "always alarm < 0.5")
-    options = {"budget": 3000, "batch": 16, "stop_after": 1, "seed": 0}
-    plain = vj.falsify(problem, "cross_entropy", diverse=True, **options)
+    options = {"budget": 3000, "batch": 16, "stop": vj.Stop(after=1), "seed": 0}
+    plain = vj.falsify(problem, vj.search.Diverse(vj.search.CrossEntropy()), **options)
     assert plain.table.counts.claimed == 0
-    assert vj.falsify(problem, "cross_entropy", diverse="behaviour", **options).simulations < 3000
+    assert (
+        vj.falsify(
+            problem, vj.search.Diverse(vj.search.CrossEntropy(), by="behaviour"), **options
+        ).simulations
+        < 3000
+    )
 
 
 @pytest.mark.slow
@@ -186,5 +196,7 @@ def test_a_black_box_tells_what_happens_too():
         return vj.Trace({"x": np.full(16, 2.0 if b > 0.6 else b), "y": y}, dt=1.0)
 
     problem = vj.Problem("box", BANDED.space, box, "always (x < 1 & y < 1)")
-    run = vj.falsify(problem, "cross_entropy", 400, diverse="behaviour", seed=0)
+    run = vj.falsify(
+        problem, vj.search.Diverse(vj.search.CrossEntropy(), by="behaviour"), 400, seed=0
+    )
     assert kinds(run) >= 7

@@ -68,13 +68,13 @@ def test_around_any_search_a_wrapper_is_what_that_one_is(name):
     )
 
 
-@pytest.mark.parametrize("name", names())
+@pytest.mark.parametrize("name", [name for name in names() if name != "likeliest"])
 def test_a_search_kept_away_from_failures_wants_what_it_is_around_wants(name):
     wants = named(name).wants
     for by in ("inputs", "behaviour"):
         around = Diverse(named(name), by=by).wants
         assert around.no_verdict_rows == wants.no_verdict_rows
-        assert around.max_batch == wants.max_batch
+        assert around.max_batch == min(wants.max_batch, 16)
         assert around.outcomes == (by == "behaviour")
         assert around.traces is None
         assert around.only(FULL)._fields == wants.only(FULL)._fields

@@ -5,6 +5,7 @@ import json
 import shlex
 import warnings
 from collections.abc import Callable, Container, Iterator, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -17,6 +18,7 @@ from verifai_jax.cli.json_output import say
 
 if TYPE_CHECKING:
     from verifai_jax.core.compute.executors import Executor
+    from verifai_jax.statistics.stopping import StoppingRule
 Command = TypeVar("Command", bound=Callable[..., object])
 COMMON = ("as_json", "pictures", "progress", "keep_going")
 """Options for output and resumption, which do not affect the result of a command."""
@@ -126,7 +128,7 @@ PARAMETER_CHOICE = all_of(
     MAX_SECONDS,
     BACKEND,
 )
-"""Options of `synthesize` and `repair`: keywords of both functions."""
+"""Options of `synthesize` and `repair`, for `values_of`."""
 NAMES = all_of(
     option("--const", "constants", multiple=True, metavar="NAME=NUMBER"),
     option("--define", "definitions", multiple=True, metavar="NAME=FORMULA"),
@@ -168,8 +170,24 @@ def load_problem(target: str, only: str | None = None) -> "vj.Problem":
     """Load the problem FILE.py:NAME, with only some of its features varied."""
     from verifai_jax.core.user_code.targets import load_target
 
-    problem = load_target(target, vj.Problem)
+    problem = replace(load_target(target, vj.Problem), target=target)
     return problem if only is None else problem.only(*split_names(only))
+
+
+def values_of(
+    options: Mapping[str, Any],
+    when: "StoppingRule | None" = None,
+    executor: "Executor | None" = None,
+) -> dict[str, Any]:
+    """Return the options of a command as arguments of its verb, with the values that join some."""
+    left = dict(options)
+    if "aim" in left:
+        aim = ("margin", "attack", "mass", "held_out")
+        left["aim"] = vj.Aim(left["aim"], **{name: left.pop(name) for name in aim})
+    after, seconds = left.pop("stop_after", None), left.pop("max_seconds", None)
+    stop = vj.Stop(after, seconds, when, left.pop("keep_going", False))
+    where = vj.RunOn(left.pop("engine", None), left.pop("backend", None), executor)
+    return {**left, "stop": stop, "run_on": where}
 
 
 def load_judged_run(folder: Path, target: str | None) -> "vj.Run":

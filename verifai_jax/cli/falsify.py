@@ -72,13 +72,13 @@ def falsify(
     only: str | None, within: float | None, decide: float | None, warm_start: Path | None,
     resume: Path | None, even_if_changed: bool, cluster: str | None, diverse: bool,
     diverse_by: Literal["inputs", "behaviour"] | None, folder: Path | None, pictures: bool,
-    fail_on: Gate | None, **given: Any,
+    proved: Path | None, fail_on: Gate | None, **given: Any,
 ) -> None:  # fmt: skip
     """Search for inputs under which TARGET (specs/FILE.py:NAME) breaks its property."""
     from verifai_jax import falsification
     from verifai_jax.core.compute.compilation import while_compiling
     from verifai_jax.core.display import figure
-    from verifai_jax.search import named
+    from verifai_jax.search import Diverse, Likeliest, named
 
     if pictures:
         while_compiling(figure.load)
@@ -96,12 +96,18 @@ def falsify(
         problem = arguments.load_problem(target, only)
         kept = ("max_seconds", "stop_after", "progress", "keep_going")
         with given_or_next(resume, "runs", "", goes_on), arguments.on_cluster(cluster) as executor:
-            asked: dict[str, Any] = {name: given[name] for name in kept}
-            asked |= {"even_if_changed": even_if_changed}
-            asked |= {"budget": budget, "stop_when": stop_when, "executor": executor}
-            run = falsification.resume(resume, problem, **asked)
+            asked = {name: given[name] for name in kept} | {"budget": budget}
+            asked = arguments.values_of(asked, stop_when, executor)
+            run = falsification.resume(resume, problem, even_if_changed=even_if_changed, **asked)
     else:
-        chosen = named(search or "portfolio", **arguments.plain_values("--set", options))
+        likely = given.pop("objective") == "likelihood"
+        usual = "cross_entropy" if likely and not options else "portfolio"
+        chosen = named(search or usual, **arguments.plain_values("--set", options))
+        if diverse or diverse_by:
+            chosen = Diverse(chosen, by=diverse_by or "inputs")
+        if likely:
+            chosen = Likeliest(chosen)
+        auto = not (search or options or diverse or diverse_by or likely)
         if fail_on is not None and fail_on.name == RATE and not chosen.samples_prior:
             raise click.UsageError(
                 f"--fail-on {fail_on} needs independent samples of the space; give --search uniform"
@@ -112,18 +118,10 @@ def falsify(
             given_or_next(folder, "runs", problem.name, goes_on) as path,
             arguments.on_cluster(cluster) as executor,
         ):
-            run = falsification.falsify(
-                problem,
-                chosen if search or options else "auto",
-                10_000 if budget is None else budget,
-                stop_when=stop_when,
-                warm_start=earlier,
-                folder=path,
-                diverse=diverse_by or diverse,
-                target=target,
-                executor=executor,
-                **given,
-            )
+            start = falsification.Start("auto" if auto else chosen, run=earlier, proved=proved)
+            asked = arguments.values_of(given, stop_when, executor)
+            number = 10_000 if budget is None else budget
+            run = falsification.falsify(problem, start, number, folder=path, **asked)
     print_run(run, pictures, ends)
     check_run(run, fail_on)
 

@@ -74,8 +74,8 @@ class Confirmer:
     - `precision`: the precision of the run.
     - `seed`: the seed of the run; each simulation gets its original random key.
     - `engines`: engines that have to agree, as in `engines_for`.
-    - `executor`, `target`: an executor whose workers simulate a host system again, and the name
-      with which they find the problem; this process when left out.
+    - `executor`: an executor whose workers simulate a host system again; this process when left
+      out.
 
     After rows were examined, `check_names` names the checks that a confirmed row has passed, and
     `raised` is a note on the first replay that raised, if any. `wavers` is true if a host system
@@ -92,11 +92,10 @@ class Confirmer:
         *,
         engines: Engines = None,
         executor: "Executor | None" = None,
-        target: str | None = None,
     ) -> None:
         in_precision(precision)
         self.problem, self.precision, self.seed = problem, precision, seed
-        self.executor, self.target = executor, target
+        self.executor = executor
         self.others = engines_for(problem, engines)
         self.examined, self.worst = 0, np.inf
         self.wavers = self.flips = self._came_again = False
@@ -214,7 +213,7 @@ class Confirmer:
         problem, run = self.problem, self.precision
         checks: dict[str, Check] = {}
         key = run_keys(self.seed)[1]
-        base, notes, raised = finest_replays(problem, run, key, self.executor, self.target)
+        base, notes, raised = finest_replays(problem, run, key, self.executor)
         if base is not None and raised:
             self.raised, raised = tuple(notes), ""
         if base is not None:

@@ -70,7 +70,6 @@ class Evaluator:
     - `executor`: an executor with the `submit` of `concurrent.futures`, whose workers simulate;
       this process when left out.
     - `guidance`: additional results for a search.
-    - `target`: the name `FILE.py:NAME` of the problem, for an executor that cannot pickle it.
     - `keep_traces`: whether verdicts include traces, in this process; or names of signals that
       these should have in addition to the monitored ones.
     - `given`: whether points may include rows of user-given features (`given_rows`).
@@ -90,7 +89,6 @@ class Evaluator:
         seed: int = 0,
         journal: "Journal | None" = None,
         executor: "Executor | None" = None,
-        target: str | None = None,
         guidance: Guidance = NOTHING,
         keep_traces: bool | tuple[str, ...] = False,
         given: bool = False,
@@ -110,8 +108,7 @@ class Evaluator:
         if executor is not None:
             self.engine = self.sender = extension(ENGINES, EXECUTOR)(
                 problem, batch, executor, gradient=gradient, clauses=clauses,
-                precision=precision, journal=journal, target=target, guidance=guidance,
-                given=self.given,
+                precision=precision, journal=journal, guidance=guidance, given=self.given,
             )  # fmt: skip
         elif problem.black_box:
             from verifai_jax.evaluation import host_engine

@@ -252,19 +252,14 @@ class HostReplays:
 
 
 def finest_replays(
-    problem: Problem,
-    run: str,
-    key: Key[Any, ""],
-    executor: "Executor | None" = None,
-    target: str | None = None,
+    problem: Problem, run: str, key: Key[Any, ""], executor: "Executor | None" = None
 ) -> tuple[Replays | HostReplays | None, list[str], str]:
     """Return replays of a problem's rows in the highest precision in which it can be traced.
 
     **Arguments:**
     - `run`: precision of the run.
     - `key`: as in `HostReplays`.
-    - `executor`, `target`: an executor whose workers simulate the rows of a black box, and the name
-      of the problem for one that cannot pickle it.
+    - `executor`: an executor whose workers simulate the rows of a black box.
     **Returns:** the replays, None if they cannot be traced; notes on checks that are left out; the
     error raised in tracing, empty if there was none.
     """
@@ -272,7 +267,7 @@ def finest_replays(
         if executor is None:
             replays = HostReplays(problem, run, key)
         else:
-            replays = verb("replays")(problem, run, key, executor, target)
+            replays = verb("replays")(problem, run, key, executor)
         return replays, ["not checked in float64: a black box"], ""
     note = "not checked in float64: in it the system would draw other random numbers"
     if run != "float64" and problem.system.can_refine:

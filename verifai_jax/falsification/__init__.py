@@ -12,5 +12,6 @@ if TYPE_CHECKING:
     from verifai_jax.falsification.run import Run as Run
     from verifai_jax.falsification.run_folder import load as load
     from verifai_jax.falsification.running import RunError as RunError
+    from verifai_jax.falsification.start import Start as Start
     from verifai_jax.falsification.table import ErrorTable as ErrorTable
 __getattr__, __dir__, __all__ = attach(__name__)

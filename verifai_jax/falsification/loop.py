@@ -58,21 +58,11 @@ class Rounds:
     """
 
     def __init__(
-        self,
-        problem: Problem,
-        search: Search,
-        batch: int,
-        seed: int,
-        table: ErrorTable,
-        precision: str = "float32",
-        folder: Path | None = None,
-        confirm: bool = False,
-        executor: "Executor | None" = None,
-        target: str | None = None,
-        first: Float[np.ndarray, "n row"] | None = None,
-        engine: Wanted = "xla",
-        budget: int = 0,
-    ) -> None:
+        self, problem: Problem, search: Search, batch: int, seed: int, table: ErrorTable,
+        precision: str = "float32", folder: Path | None = None, confirm: bool = False,
+        executor: "Executor | None" = None, first: Float[np.ndarray, "n row"] | None = None,
+        engine: Wanted = "xla", budget: int = 0,
+    ) -> None:  # fmt: skip
         self.problem, self.batch, self.table = problem, batch, table
         self.precision, self.folder = precision, folder
         self.first = np.zeros((0, problem.space.dim), np.float32) if first is None else first
@@ -85,14 +75,14 @@ class Rounds:
         self._journal_without_traces()
         self._simulations = Simulations(
             problem, search, batch, seed, precision=precision, journal=self._journal,
-            executor=executor, target=target, guidance=self.learning.guidance,
+            executor=executor, guidance=self.learning.guidance,
             keep_traces=self.learning.surrogate is not None,
             given=self.first.shape[1] > problem.space.dim,
             engine=engine, budget=budget,
         )  # fmt: skip
         self._confirmer = None
         if confirm:
-            self._confirmer = Confirmer(problem, precision, seed, executor=executor, target=target)
+            self._confirmer = Confirmer(problem, precision, seed, executor=executor)
         self.tally = Tally()
         self.stop_after = 0
         self.watch = Stopwatch(COMPILE)

@@ -15,7 +15,7 @@ _WHY: dict[str, str] = {
 }
 _UNIFORM = "use search='uniform' for a rate"
 _REMEDY: dict[str, str] = {
-    "first": "leave out first= for a rate",
+    "first": "leave out Start(rows=) for a rate",
     "given": "use vj.falsify(problem, 'uniform') for a rate",
 }
 _BETWEEN: dict[str, str] = {

@@ -1,4 +1,4 @@
-"""A proof about a part of a feature space, as `falsify(proved=)` uses it."""
+"""A proof about a part of a feature space, as `Start(proved=)` uses it."""
 
 from typing import TYPE_CHECKING, Protocol, runtime_checkable
 

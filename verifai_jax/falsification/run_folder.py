@@ -158,7 +158,7 @@ def as_made(run: Run) -> Run:
     )
 
 
-ANEW = "begin anew, from what it has found: vj.falsify(problem, warm_start=run)"
+ANEW = "begin anew, from what it has found: vj.falsify(problem, vj.Start(run=run))"
 """Advice for a run that cannot be resumed."""
 
 

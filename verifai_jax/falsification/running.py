@@ -1,6 +1,6 @@
 """A run from its first compilation to its result: rounds until something ends them.
 
-    running = Running(rounds, Ending(started, budget), choice, seed)
+    running = Running(rounds, Ending(started, budget, Stop()), choice, seed)
     run = running.play(progress=True)
 
 The finished part is always returned, or available as the `run` of the error. A run in a folder can
@@ -12,7 +12,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 from verifai_jax import search as searches
 from verifai_jax._version import __version__
@@ -33,9 +33,8 @@ from verifai_jax.falsification.summary import first_message
 from verifai_jax.falsification.validation import space_as_data
 from verifai_jax.problem.model_digest import digest_of_model
 from verifai_jax.search import Search
+from verifai_jax.statistics.stopping import Stop
 
-if TYPE_CHECKING:
-    from verifai_jax.statistics.stopping import StoppingRule
 Origin = Literal["prior", "first", "given", "sequence", "coverage", "learned"]
 """Where rows come from: as the points of a search (`search/base.py`), and `"first"` for samples of
 the prior after rows that were given."""
@@ -68,21 +67,19 @@ class Ending(NamedTuple):
 
     started: float
     budget: int
-    max_seconds: float | None
-    stop_after: int | None
-    stop_when: "StoppingRule | None"
+    stop: Stop
     earlier: Mapping[str, float] = MappingProxyType({})
     """Seconds that earlier parts of the run have taken, by activity."""
 
     @property
     def only_budget(self) -> bool:
         """True if only the budget can end the run."""
-        return not self.may_be_early and self.max_seconds is None
+        return not self.may_be_early and self.stop.seconds is None
 
     @property
     def may_be_early(self) -> bool:
         """True if results of simulations can end the run before its budget."""
-        return self.stop_after is not None or self.stop_when is not None
+        return self.stop.after is not None or self.stop.when is not None
 
     @property
     def seconds(self) -> float:
@@ -90,9 +87,10 @@ class Ending(NamedTuple):
 
     def reached(self, rounds: Rounds) -> str | None:
         """Return the condition that ends the run after this round; None if it goes on."""
-        if self.stop_after is not None and rounds.distinct >= self.stop_after:
+        stop = self.stop
+        if stop.after is not None and rounds.distinct >= stop.after:
             return "stop_after"
-        if self.stop_when is not None and self.stop_when.done(
+        if stop.when is not None and stop.when.done(
             rounds.tally.violating, len(rounds.table), rounds.tally.without_verdict
         ):
             return "stop_when"
@@ -100,7 +98,7 @@ class Ending(NamedTuple):
             return "budget"
         if rounds.exhausted:
             return "exhausted"
-        if self.max_seconds is not None and self.seconds >= self.max_seconds:
+        if stop.seconds is not None and self.seconds >= stop.seconds:
             return "max_seconds"
         return None
 
@@ -114,26 +112,22 @@ class Running:
     - `ends`: the conditions that end it.
     - `choice`: the choice of its backend.
     - `seed`: the seed of its search and its simulations.
-    - `target`: name of the problem on the command line.
     - `notes`: notes on likely mistakes.
     - `lasting`: notes that stay true when the run is resumed.
     - `sources`: the files of the model for each part of the run; read now when left out.
     - `resumed`: whether it goes on from a checkpoint.
     - `warm`: whether the search starts from the rows of an earlier run.
-    - `keep_going`: whether to go on if the first simulations all raise.
     """
 
     rounds: Rounds
     ends: Ending
     choice: Choice
     seed: int
-    target: str | None = None
     notes: Sequence[str] = ()
     lasting: Sequence[str] = ()
     sources: Sequence[Mapping[str, Any]] | None = None
     resumed: bool = False
     warm: bool = False
-    keep_going: bool = False
     _models: Sequence[Mapping[str, Any]] = field(default=(), init=False)
     _model: str = field(default="", init=False)
 
@@ -210,7 +204,7 @@ class Running:
     def _play_rounds(self, bar: SimulationProgress, callbacks: Sequence[Callback]) -> str:
         """Run rounds; return the condition that ended them."""
         rounds, budget = self.rounds, self.ends.budget
-        rounds.stop_after = self.ends.stop_after or 0
+        rounds.stop_after = self.ends.stop.after or 0
         stopped = "exhausted" if rounds.exhausted else None
         if self._is_hopeless:
             rounds.take_in_measured()
@@ -230,7 +224,7 @@ class Running:
     @property
     def _is_hopeless(self) -> bool:
         """Whether more simulations would only raise the same, and nobody wants them."""
-        return self.rounds.hopeless is not None and not self.keep_going
+        return self.rounds.hopeless is not None and not self.ends.stop.keep_going
 
     def _write_record(self) -> None:
         """Write the current record of the run, so that it can be resumed."""
@@ -278,7 +272,7 @@ class Running:
             origin=origin,
             first=rounds.first.tolist(),
             folder=rounds.folder,
-            target=self.target,
+            target=problem.target,
             problem=problem,
             budget=int(self.ends.budget),
             search_data=searches.to_json(search),
@@ -307,7 +301,7 @@ def _hopeless_message(run: Run, said: str, budget: int) -> str:
     return (
         f"the run of {run.name!r} ended after {run.simulations:,} of {budget:,} simulations, since "
         f"none succeeds: each raised{f' {said}' if said else ' an error'}. They are in the .run of "
-        f"this error{where}. keep_going=True, or --keep-going, simulates all"
+        f"this error{where}. Stop(keep_going=True), or --keep-going, simulates all"
     )
 
 

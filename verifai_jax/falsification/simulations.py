@@ -44,41 +44,22 @@ class Simulations:
     - `search`: the search; it determines what is computed in addition to the robustness.
     - `batch`: maximum number of simulations in a round.
     - `seed`: the seed of the run.
-    - `precision`, `journal`, `executor`, `target`, `guidance`, `keep_traces`, `given`,
+    - `precision`, `journal`, `executor`, `guidance`, `keep_traces`, `given`,
       `engine`, `budget`: as for `Evaluator`.
 
     `hopeless` is the error that all timed rows raised; None if one of them did not.
     """
 
     def __init__(
-        self,
-        problem: Problem,
-        search: Search,
-        batch: int,
-        seed: int,
-        *,
-        precision: str,
-        journal: "Journal | None",
-        executor: "Executor | None",
-        target: str | None,
-        guidance: Guidance,
-        keep_traces: bool,
-        given: bool = False,
-        engine: Wanted = "xla",
-        budget: int = 0,
-    ) -> None:
+        self, problem: Problem, search: Search, batch: int, seed: int, *, precision: str,
+        journal: "Journal | None", executor: "Executor | None", guidance: Guidance,
+        keep_traces: bool, given: bool = False, engine: Wanted = "xla", budget: int = 0,
+    ) -> None:  # fmt: skip
         self.batch, self.keep_traces, self._journals = batch, keep_traces, True
         evaluator = partial(
-            Evaluator,
-            problem,
-            precision=precision,
-            seed=seed,
-            executor=executor,
-            target=target,
-            guidance=guidance,
-            engine=engine,
-            budget=budget,
-        )
+            Evaluator, problem, precision=precision, seed=seed, executor=executor,
+            guidance=guidance, engine=engine, budget=budget,
+        )  # fmt: skip
         self.evaluate = evaluator(
             batch,
             gradient=search.wants.gradient,

@@ -3,20 +3,17 @@
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import Float
 
 from verifai_jax import search as searches
-from verifai_jax.core.messages.errors import check_names, unknown_name
 from verifai_jax.core.messages.text import format_error, one_line
 from verifai_jax.core.store.locks import LOCK, write_lock
-from verifai_jax.evaluation.engine import WANTED, Wanted
 from verifai_jax.falsification.run import Run
 from verifai_jax.falsification.run_folder import RECORD
-from verifai_jax.falsification.table import ErrorTable
-from verifai_jax.features.given import Rows, check_columns, given_features, given_rows
+from verifai_jax.features.given import Rows, given_features, given_rows
 from verifai_jax.problem.dependence import has_gradient, without_derivative
 from verifai_jax.problem.problem import Problem
 from verifai_jax.search import Search
@@ -24,8 +21,6 @@ from verifai_jax.search.contract import check_contract
 from verifai_jax.systems.base import System
 
 if TYPE_CHECKING:
-    import pandas as pd
-
     from verifai_jax.core.compute.executors import Executor
     from verifai_jax.statistics.stopping import StoppingRule
 MAX_AT_ONCE = 131_072
@@ -33,9 +28,7 @@ MAX_AT_ONCE = 131_072
 that rounds of 32 768 take, as less is confirmed; larger rounds were not tried."""
 
 
-def usual_batch(
-    search: Search, budget: int, stop_after: int | None = None, whole: bool = False
-) -> int:
+def usual_batch(search: Search, budget: int, after: int | None = None, whole: bool = False) -> int:
     """Return the default batch: at least twenty rounds for a search that learns.
 
     It is a power of two, so that there are few shapes. It is small if the run stops at few
@@ -45,59 +38,20 @@ def usual_batch(
     **Arguments:**
     - `search`: the search of the run.
     - `budget`: number of simulations of the run.
-    - `stop_after`: number of counterexamples that ends the run, or None.
+    - `after`: number of counterexamples that ends the run, or None.
     - `whole`: whether only the budget can end the run. A search that does not learn then has eight
       rounds, or more if these would be too large.
     """
-    if not search.learns and stop_after is not None:
-        few = 1 << (min(search.wants.max_batch, 16 * stop_after).bit_length() - 1)
+    if not search.learns and after is not None:
+        few = 1 << (min(search.wants.max_batch, 16 * after).bit_length() - 1)
         return max(
             few, min(search.wants.max_batch, 1 << (max(int(budget) // 512, 1).bit_length() - 1))
         )
     if not search.learns:
         eighth = 1 << max(0, (int(budget) // 8).bit_length() - 1)
         return max(search.wants.max_batch, min(MAX_AT_ONCE, eighth) if whole else 0)
-    maximum = (
-        search.wants.max_batch
-        if stop_after is None
-        else min(search.wants.max_batch, 16 * stop_after)
-    )
+    maximum = search.wants.max_batch if after is None else min(search.wants.max_batch, 16 * after)
     return min(1 << (maximum.bit_length() - 1), 1 << max(3, (int(budget) // 20).bit_length() - 1))
-
-
-def batch_size(
-    asked: int | None,
-    search: Search,
-    budget: int,
-    stop_after: int | None = None,
-    whole: bool = False,
-    small: int | None = None,
-) -> int:
-    """Return the number of simulations in a round.
-
-    **Arguments:**
-    - `asked`: the user's choice; the default when left out.
-    - `search`, `budget`, `stop_after`, `whole`: as in `usual_batch`.
-    - `small`: the default if many small rounds are wanted.
-    """
-    usual = usual_batch(search, budget, stop_after, whole)
-    usual = usual if small is None else min(usual, small)
-    return min(usual if asked is None else asked, budget)
-
-
-def as_wanted(engine: object, portable: bool = False) -> Wanted:
-    """Return the requested or recorded engine; a host system has only one.
-
-    - `portable`: whether `"auto"` means XLA: if few simulations may end the run, or if rounding may
-      change the next proposals of a search that learns.
-
-    **Raises:** `UnknownNameError`.
-    """
-    if engine == "host" or (portable and engine == "auto"):
-        return "xla"
-    if engine not in WANTED:
-        raise unknown_name("engine", str(engine), WANTED)
-    return cast(Wanted, engine)
 
 
 def check_search(problem: object, search: object) -> Search:
@@ -160,23 +114,6 @@ def check_guide(problem: Problem, search: Search) -> None:
     )
 
 
-def with_objective(search: Search, objective: str, diverse: bool) -> Search:
-    """Return the search with the objective of this name.
-
-    **Raises:** `UnknownNameError`; `ValueError` for a search or an option with another objective.
-    """
-    if objective not in OBJECTIVES:
-        raise unknown_name("objective", objective, OBJECTIVES)
-    if objective == "likelihood" and not search.wants.likelihood:
-        search = searches.Likeliest(search)
-    if search.wants.likelihood and diverse:
-        raise ValueError(
-            "diverse= looks for failures far from each other, and objective='likelihood' for the "
-            "likeliest one; leave out one of them"
-        )
-    return search
-
-
 def check_objective(problem: Problem, search: Search) -> None:
     """Refuse a search for likely failures if another order exists or the prior has no density.
 
@@ -187,8 +124,8 @@ def check_objective(problem: Problem, search: Search) -> None:
     other = "a guide" if problem.guide is not None else "a priority"
     if problem.guide is not None or problem.rulebook is not None:
         raise ValueError(
-            f"problem {problem.name!r} has {other}, which orders simulations, and "
-            "objective='likelihood' is another order; leave out one of them"
+            f"problem {problem.name!r} has {other}, which orders simulations, and the likelihood "
+            f"that {search!r} looks for is another order; leave out one of them"
         )
     from verifai_jax.features.improbability import Improbability
 
@@ -228,7 +165,7 @@ def adapt_search(
             "or 'cross_entropy', or give the operation a derivative by jax.custom_jvp"
         )
     fallback = search.fallback
-    if fallback is None:
+    if fallback is None or not (search.wants.derivatives or search.wants.traces):
         return search, ()
     if search.wants.traces is not None:
         why = _why_no_traces(problem, executor)
@@ -241,7 +178,9 @@ def adapt_search(
 
 def _label(search: Search) -> str:
     """Return the name of a search, or its text where it has none."""
-    return str((searches.to_json(search) or {}).get("name", search))
+    inner = isinstance(search, searches.Diverse | searches.Likeliest)
+    named = search.search if inner else search
+    return str((searches.to_json(named) or {}).get("name", named))
 
 
 def _why_no_derivatives(problem: Problem) -> str | None:
@@ -268,7 +207,6 @@ def _why_no_traces(problem: Problem, executor: "Executor | None") -> str | None:
     return None
 
 
-OBJECTIVES = ("robustness", "likelihood")
 AUTO = "auto"
 """The default search, which depends on the seconds of a simulation."""
 SLOW = 0.5
@@ -307,17 +245,13 @@ def slow_search(problem: Problem, seconds: float) -> tuple[Search, str] | None:
 
 
 def check_rule(search: Search, rule: "StoppingRule | None") -> None:
-    """Refuse a stopping rule that is invalid, or that does not fit the samples of this search.
+    """Refuse a stopping rule that does not fit the samples of this search.
 
-    **Raises:** `TypeError`, `ValueError`.
+    **Raises:** `ValueError`.
     """
-    if rule is None:
-        return
-    if not hasattr(rule, "done"):
-        raise TypeError(f"stop_when must be a rule such as Within(0.005); got {rule!r}")
-    if not search.samples_prior:
+    if rule is not None and not search.samples_prior:
         raise ValueError(
-            f"stop_when needs independent samples of the space, which search {search!r} does not "
+            f"Stop(when=) needs independent samples of the space, which search {search!r} does not "
             "give; use search='uniform'"
         )
 
@@ -331,11 +265,9 @@ def points_of(problem: Problem, rows: Rows, precision: str) -> Float[np.ndarray,
 
 
 def check_first(
-    problem: Problem,
-    first: "Rows | Float[np.ndarray, 'n row'] | None",
-    rule: "StoppingRule | None",
-    precision: str,
-) -> Float[np.ndarray, "n row"]:
+    problem: Problem, first: "Rows | Float[np.ndarray, 'n row'] | None",
+    rule: "StoppingRule | None", precision: str,
+) -> Float[np.ndarray, "n row"]:  # fmt: skip
     """Return the rows that are simulated before the search begins; empty if none are given.
 
     **Raises:** the errors of `points_of`; `ValueError` together with a rule that needs independent
@@ -347,7 +279,7 @@ def check_first(
     rows = first if isinstance(first, np.ndarray) else points_of(problem, first, precision)
     if rule is not None and len(rows):
         raise ValueError(
-            "stop_when needs independent samples of the space, which those of first= are not"
+            "Stop(when=) needs independent samples of the space, which given rows are not"
         )
     return rows
 
@@ -403,24 +335,6 @@ def check_same_space(run: Run, problem: Problem) -> None:
         raise ValueError(
             f"the run of {run.name!r} was over a space with another order or constraint"
         )
-
-
-def earlier_rows(warm_start: object, problem: Problem) -> "pd.DataFrame | None":
-    """Return the rows of an earlier table as a DataFrame with the columns needed here."""
-    if warm_start is None:
-        return None
-    table = warm_start.table if isinstance(warm_start, Run) else warm_start
-    frame = table.all if isinstance(table, ErrorTable) else table
-    columns = getattr(frame, "columns", None)
-    if columns is None:
-        raise TypeError(f"warm_start must be a run, an error table or a DataFrame; got {frame!r}")
-    check_names("column of warm_start", (*problem.space.columns, "rho"), map(str, columns))
-    try:
-        rows = cast("pd.DataFrame", frame)
-        check_columns(problem.space, {str(name): rows[name] for name in columns}, held=False)
-    except ValueError as error:
-        raise ValueError(f"warm_start does not fit this space: {error}") from error
-    return cast("pd.DataFrame", frame)
 
 
 @contextmanager

@@ -82,6 +82,8 @@ class Problem(InNotebook):
       `trace_matrix`.
     - `made_in`: the modules whose code defines the problem, recorded with its runs. By default the
       modules on the call stack, or those of the problem from which this one was derived.
+    - `target`: the name `FILE.py:NAME` of the problem on the command line, recorded with its runs.
+      Workers of an executor that cannot pickle the problem load it by this name.
 
     `formulas` holds the parsed spec by name; `rulebook` the order of the formulas, None without a
     priority; `programs` the programs compiled for this problem.
@@ -107,6 +109,7 @@ class Problem(InNotebook):
     guide: Guide | None
     requirements: tuple[Requirement, ...]
     made_in: Sequence[Maker] | None = field(repr=False)
+    target: str | None = field(repr=False)
     formulas: Mapping[str, Formula] = field(init=False, repr=False)
     rulebook: Rulebook | None = field(init=False, repr=False)
     programs: ProgramCache = field(init=False, repr=False)
@@ -126,6 +129,7 @@ class Problem(InNotebook):
         guide: Guide | Formula | str | Term | None = None,
         requirements: str | Path | Iterable[Requirement] | None = None,
         made_in: Sequence[Maker] | None = None,
+        target: str | None = None,
     ) -> None:
         if not isinstance(name, str) or not name.strip():
             raise ProblemError(f"a problem needs a name; got {shorten(repr(name))}{ORDER}")
@@ -163,6 +167,7 @@ class Problem(InNotebook):
             "guide": guide if guide is None or isinstance(guide, Guide) else Guide(guide),
             "requirements": _requirements(requirements),
             "made_in": made_here() if made_in is None else tuple(made_in),
+            "target": target,
             "formulas": formulas,
             "rulebook": None if priority is None else _rulebook(priority, formulas),
             "programs": ProgramCache(),

@@ -42,6 +42,8 @@ _SEARCHES = {
     "gradient": "Gradient",
     "descent": "Descent",
     "portfolio": "Portfolio",
+    "diverse": "Diverse",
+    "likeliest": "Likeliest",
 }
 GROUP = "verifai_jax.searches"
 """Entry points of searches of other packages, by name."""

@@ -20,7 +20,7 @@ through the search for novelty alone, Evolutionary Computation 19(2), 2011).
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import ClassVar, Literal, NamedTuple
 
 import jax
@@ -34,11 +34,16 @@ from verifai_jax.core.values.cube import Cube
 from verifai_jax.search.base import Observations, Search, Wants, check_options
 from verifai_jax.search.behaviour import SeenBehaviour, is_known
 from verifai_jax.search.clause_values import NOTHING
+from verifai_jax.search.portfolio import Portfolio
 from verifai_jax.search.wrapper import Learn, Wrapper
 
 AT_ONCE = 16
-"""Maximum number of failures archived in a round, each by one step of a loop: as many as the rounds
-of a diverse run have points by default."""
+"""Maximum number of failures archived in a round, each by one step of a loop, and the default size
+of a round."""
+EITHER = (
+    "Diverse looks for failures far from each other, and Likeliest for the likeliest one; "
+    "leave out one of them"
+)
 MOVES = ("inputs", "behaviour")
 """What failures can be far from each other in."""
 
@@ -71,19 +76,20 @@ class Diverse(Wrapper[DiverseState]):
     """A wrapper that keeps another search away from earlier failures.
 
     **Arguments:**
-    - `search`: the wrapped search.
+    - `search`: the wrapped search; it may not look for likely failures.
     - `radius`: initial minimum distance of distinct failures: root mean square over the unit
       coordinates, in which two random points are 0.41 apart; choices differ by 0 or 1.
     - `min_radius`: minimum radius.
     - `shrink`: factor by which the radius shrinks, and the search restarts, after
     - `patience` rounds without a new failure or progress towards one.
-    - `capacity`: size of the archive, the maximum number of distinct failures.
+    - `capacity`: size of the archive, the maximum number of distinct failures. A run that stops
+      after more failures gets more.
     - `by`: the distance that separates failures: `"inputs"`, or `"behaviour"`, for which the radius
       is a share of the possible difference (`search.behaviour.unlike`).
     **Raises:** `TypeError` for anything that is not a search; `ValueError` for values out of range.
     """
 
-    search: Search
+    search: Search = field(default_factory=Portfolio)
     radius: float = 0.25
     min_radius: float = 0.01
     shrink: float = 0.8
@@ -94,6 +100,8 @@ class Diverse(Wrapper[DiverseState]):
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        if self.search.wants.likelihood:
+            raise ValueError(EITHER)
         check_options(self, {"patience": 1, "capacity": 1}, ["radius", "min_radius", "shrink"])
         if self.by not in MOVES:
             raise unknown_name("way of being diverse", self.by, MOVES)
@@ -107,7 +115,8 @@ class Diverse(Wrapper[DiverseState]):
         inner = self.search.wants
         outcomes = inner.outcomes or self.by == "behaviour"
         # A model of the traces knows nothing of archived failures, and would lead back to them.
-        return replace(inner, outcomes=outcomes, traces=None)
+        batch = min(inner.max_batch, AT_ONCE)
+        return replace(inner, outcomes=outcomes, traces=None, max_batch=batch)
 
     @staticmethod
     def count(state: DiverseState) -> Int[Array, ""]:

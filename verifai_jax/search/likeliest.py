@@ -1,18 +1,23 @@
 """Search for likely failures: the objective includes the likelihood of the features.
 
     Likeliest(CrossEntropy())
-    vj.falsify(problem, objective="likelihood")         # the same, around the default search
+    vj.falsify(problem, "likeliest")                    # around `cross_entropy`
 
 The loop replaces the robustness by another objective (`falsification/likelihood.py`); the wrapped
 search is unchanged.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 from jaxtyping import PyTree
 
 from verifai_jax.search.base import Search, Wants
+from verifai_jax.search.cross_entropy import CrossEntropy
+from verifai_jax.search.diverse import EITHER, Diverse
 from verifai_jax.search.wrapper import Wrapper
+
+MAX_BATCH = 64
+"""Default size of a round at most."""
 
 
 @dataclass(frozen=True)
@@ -25,10 +30,12 @@ class Likeliest(Wrapper[PyTree]):
     learn, or that cannot use this objective.
     """
 
-    search: Search
+    search: Search = field(default_factory=CrossEntropy)
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        if isinstance(self.search, Diverse):
+            raise ValueError(EITHER)
         if not self.search.learns or self.search.wants.outcomes or self.search.wants.coverage_ids:
             raise ValueError(
                 "only a search that learns from the robustness alone can look for likely failures, "
@@ -38,4 +45,5 @@ class Likeliest(Wrapper[PyTree]):
     @property
     def wants(self) -> Wants:
         # A model of the traces would propose what fails by most.
-        return replace(self.search.wants, likelihood=True, traces=None)
+        batch = min(self.search.wants.max_batch, MAX_BATCH)
+        return replace(self.search.wants, likelihood=True, traces=None, max_batch=batch)

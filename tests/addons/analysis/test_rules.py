@@ -247,7 +247,7 @@ def test_what_precision_means_depends_on_the_search():
     other = vj.falsify(problem, "cross_entropy", 256, batch=256)
     assert "no rate of failure: this search does not sample the prior" in str(rules(other))
     assert "may not be samples of the prior" in str(rules(run.table))
-    stopped = vj.falsify(problem, "uniform", 256, batch=256, stop_after=20)
+    stopped = vj.falsify(problem, "uniform", 256, batch=256, stop=vj.Stop(after=20))
     assert "was stopped by its own counterexamples" in str(rules(stopped))
     assert str(rules(run)) == str(rules(run))
 

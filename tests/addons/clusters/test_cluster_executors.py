@@ -103,7 +103,7 @@ quiet = pytest.mark.filterwarnings("ignore")
 def test_dask_gives_the_table_of_one_machine_also_when_a_worker_is_killed(dask, name, request):
     problem, expected = request.getfixturevalue(name)
     executor = dask.get_executor()
-    whole = vj.falsify(problem, "uniform", len(expected), executor=executor)
+    whole = vj.falsify(problem, "uniform", len(expected), run_on=vj.RunOn(executor=executor))
     pd.testing.assert_frame_equal(whole.table.all, expected, check_exact=True)
     pids = dask.run(os.getpid)
 
@@ -112,7 +112,7 @@ def test_dask_gives_the_table_of_one_machine_also_when_a_worker_is_killed(dask, 
         return next((pid for pid in working if pid is not None), None)
 
     watching = kill_when(busy)
-    run = vj.falsify(problem, "uniform", len(expected), executor=executor)
+    run = vj.falsify(problem, "uniform", len(expected), run_on=vj.RunOn(executor=executor))
     watching.join()
     assert watching.killed
     pd.testing.assert_frame_equal(run.table.all, expected, check_exact=True)
@@ -123,9 +123,10 @@ def test_dask_gives_the_table_of_one_machine_also_when_a_worker_is_killed(dask, 
 def test_dask_gives_the_sweep_of_one_machine(dask):
     from drifting import drifting
 
-    options = {"configurations": 3, "samples": 128, "attack_simulations": 64}
+    options = {"configurations": 3}
+    options["certification"] = vj.Certification(samples=128, attack_simulations=64)
     here = vj.sweep(drifting(seeds=2), **options)
-    there = vj.sweep(drifting(seeds=2), **options, executor=dask.get_executor())
+    there = vj.sweep(drifting(seeds=2), **options, run_on=vj.RunOn(executor=dask.get_executor()))
     for name in set(here.record.columns) - {"training_seconds"}:
         np.testing.assert_array_equal(here.record.columns[name], there.record.columns[name], name)
 
@@ -136,7 +137,7 @@ def test_dask_gives_the_sweep_of_one_machine(dask):
 def test_ray_gives_the_table_of_one_machine_also_when_a_worker_is_killed(ray, name, request):
     problem, expected = request.getfixturevalue(name)
     executor = RayExecutor()
-    whole = vj.falsify(problem, "uniform", len(expected), executor=executor)
+    whole = vj.falsify(problem, "uniform", len(expected), run_on=vj.RunOn(executor=executor))
     pd.testing.assert_frame_equal(whole.table.all, expected, check_exact=True)
     import psutil
 
@@ -148,7 +149,7 @@ def test_ray_gives_the_table_of_one_machine_also_when_a_worker_is_killed(ray, na
         return None
 
     watching = kill_when(busy)
-    run = vj.falsify(problem, "uniform", len(expected), executor=executor)
+    run = vj.falsify(problem, "uniform", len(expected), run_on=vj.RunOn(executor=executor))
     watching.join()
     assert watching.killed
     pd.testing.assert_frame_equal(run.table.all, expected, check_exact=True)
@@ -160,7 +161,7 @@ def test_a_cluster_is_reached_by_its_address(dask, cartpole):
     problem, expected = cartpole
     address = dask.scheduler.address.removeprefix("tcp://")
     with connect(f"dask://{address}") as executor:
-        run = vj.falsify(problem, "uniform", 5000, batch=1024, executor=executor)
+        run = vj.falsify(problem, "uniform", 5000, batch=1024, run_on=vj.RunOn(executor=executor))
     pd.testing.assert_frame_equal(
         run.table.all.drop(columns="verdict"),
         expected.head(5000).drop(columns="verdict"),

@@ -17,12 +17,12 @@ from verifai_jax.addons.clusters.executor_engine import identity
 from verifai_jax.addons.clusters.executors import (
     Shipment,
     WorkerError,
-    check_executor,
     count_workers,
     gather,
     ship,
 )
 from verifai_jax.addons.clusters.worker import evaluate_block
+from verifai_jax.core.compute.executors import check_executor
 from verifai_jax.core.user_code.targets import load_target
 from verifai_jax.evaluation.evaluator import Evaluator
 
@@ -88,7 +88,7 @@ def equal(one, other):
     ("problem", "options"),
     [
         (LINE, {"search": "uniform", "budget": 5000, "batch": 512}),
-        (LINE, {"search": "uniform", "budget": 5000, "batch": 512, "stop_after": 40}),
+        (LINE, {"search": "uniform", "budget": 5000, "batch": 512, "stop": vj.Stop(after=40)}),
         pytest.param(
             LINE,
             {"search": "cross_entropy", "budget": 600, "batch": 128},
@@ -98,17 +98,26 @@ def equal(one, other):
     ],
 )
 def test_the_table_is_the_one_of_one_machine_whatever_the_order(problem, options):
-    equal(vj.falsify(problem, **options), vj.falsify(problem, **options, executor=Disorder(1)))
+    equal(
+        vj.falsify(problem, **options),
+        vj.falsify(problem, **options, run_on=vj.RunOn(executor=Disorder(1))),
+    )
 
 
 def test_a_run_that_was_stopped_goes_on_with_workers_and_without(tmp_path):
     whole = vj.falsify(LINE, "uniform", 4000, batch=512)
     begun = vj.falsify(
-        LINE, "uniform", 4000, batch=512, stop_after=1, folder=tmp_path / "run", executor=Disorder()
+        LINE,
+        "uniform",
+        4000,
+        batch=512,
+        stop=vj.Stop(after=1),
+        folder=tmp_path / "run",
+        run_on=vj.RunOn(executor=Disorder()),
     )
     assert 0 < begun.simulations < 4000
     assert begun.acceptance is None
-    vj.resume(tmp_path / "run", LINE, budget=2048, executor=Disorder(2))
+    vj.resume(tmp_path / "run", LINE, budget=2048, run_on=vj.RunOn(executor=Disorder(2)))
     done = vj.resume(tmp_path / "run", LINE, budget=4000)
     pd.testing.assert_frame_equal(done.table.all, whole.table.all, check_exact=True)
 
@@ -119,8 +128,10 @@ def test_a_constraint_is_kept_and_its_acceptance_is_that_of_the_rows_taken():
         {"a": vj.Box(0, 3), "b": vj.Box(-1, 1)}, where=lambda f: f["a"] > f["b"] + 1
     )
     problem = vj.Problem("where", space, line, "always x < 1.6")
-    options = {"search": "uniform", "budget": 3000, "batch": 256, "stop_after": 5}
-    one, other = (vj.falsify(problem, **options, executor=e) for e in (None, Disorder()))
+    options = {"search": "uniform", "budget": 3000, "batch": 256, "stop": vj.Stop(after=5)}
+    one, other = (
+        vj.falsify(problem, **options, run_on=vj.RunOn(executor=e)) for e in (None, Disorder())
+    )
     equal(one, other)
     assert one.acceptance == other.acceptance
 
@@ -130,9 +141,14 @@ def test_a_pool_that_loses_a_process_leaves_what_is_finished(tmp_path, monkeypat
     options = {"search": "uniform", "budget": 70, "batch": 20, "confirm": False}
     whole = vj.falsify(DECAY, **options)
     with pytest.raises(vj.RunError, match="a process pool does not replace it") as broken:
-        vj.falsify(DECAY, **options, folder=tmp_path / "run", executor=Disorder(3, dies_at=40))
+        vj.falsify(
+            DECAY,
+            **options,
+            folder=tmp_path / "run",
+            run_on=vj.RunOn(executor=Disorder(3, dies_at=40)),
+        )
     assert 0 < broken.value.run.simulations < 70
-    again = vj.resume(tmp_path / "run", DECAY, executor=Disorder(4))
+    again = vj.resume(tmp_path / "run", DECAY, run_on=vj.RunOn(executor=Disorder(4)))
     pd.testing.assert_frame_equal(again.table.all, whole.table.all, check_exact=True)
 
 
@@ -141,9 +157,14 @@ def test_finished_rows_of_a_slow_black_box_are_not_simulated_again(tmp_path, mon
     monkeypatch.setattr("verifai_jax.addons.clusters.executor_engine.WORTH_KEEPING", 0.0)
     options = {"search": "uniform", "budget": 70, "batch": 70, "confirm": False}
     with pytest.raises(vj.RunError):
-        vj.falsify(DECAY, **options, folder=tmp_path / "run", executor=Disorder(3, dies_at=30))
+        vj.falsify(
+            DECAY,
+            **options,
+            folder=tmp_path / "run",
+            run_on=vj.RunOn(executor=Disorder(3, dies_at=30)),
+        )
     second = Disorder(5)
-    run = vj.resume(tmp_path / "run", DECAY, executor=second)
+    run = vj.resume(tmp_path / "run", DECAY, run_on=vj.RunOn(executor=second))
     assert 0 < len(second.calls) < 70
     equal(run, vj.falsify(DECAY, **options))
 
@@ -158,7 +179,7 @@ def test_an_interruption_cancels_what_is_queued():
         Disorder.work(executor)
 
     executor.work = interrupted
-    run = vj.falsify(LINE, "uniform", 100_000, batch=512, executor=executor)
+    run = vj.falsify(LINE, "uniform", 100_000, batch=512, run_on=vj.RunOn(executor=executor))
     assert run.stopped == "interrupted"
     assert executor.queue
     assert all(future.cancelled() for future, _, _ in executor.queue)
@@ -166,12 +187,18 @@ def test_an_interruption_cancels_what_is_queued():
 
 @pytest.mark.thorough
 def test_estimates_and_comparisons_are_those_of_one_machine():
-    one, other = (vj.estimate(LINE, "monte_carlo", 2000, executor=e) for e in (None, Disorder()))
+    one, other = (
+        vj.estimate(LINE, "monte_carlo", 2000, run_on=vj.RunOn(executor=e))
+        for e in (None, Disorder())
+    )
     assert (one.probability, one.interval, one.simulations) == (
         other.probability, other.interval, other.simulations,
     )  # fmt: skip
     lower = vj.Problem("lower", LINE.space, line, "always x < 1.5")
-    compared = [vj.compare(LINE, lower, budget=2000, executor=e) for e in (None, Disorder())]
+    compared = [
+        vj.compare(LINE, lower, budget=2000, run_on=vj.RunOn(executor=e))
+        for e in (None, Disorder())
+    ]
     assert compared[0].simulations == compared[1].simulations
     assert compared[0]["lower"].rates == compared[1]["lower"].rates
 
@@ -179,7 +206,7 @@ def test_estimates_and_comparisons_are_those_of_one_machine():
 @pytest.mark.thorough
 def test_features_that_were_chosen_are_simulated_on_workers():
     rows = [{"a": 0.1 * i, "b": 0.0} for i in range(20)]
-    equal(vj.simulate(LINE, rows), vj.simulate(LINE, rows, executor=Disorder()))
+    equal(vj.simulate(LINE, rows), vj.simulate(LINE, rows, run_on=vj.RunOn(executor=Disorder())))
 
 
 def test_threads_are_workers_too():
@@ -187,7 +214,7 @@ def test_threads_are_workers_too():
         assert count_workers(executor) == 2
         equal(
             vj.falsify(LINE, "uniform", 3000, batch=512),
-            vj.falsify(LINE, "uniform", 3000, batch=512, executor=executor),
+            vj.falsify(LINE, "uniform", 3000, batch=512, run_on=vj.RunOn(executor=executor)),
         )
 
 
@@ -204,8 +231,8 @@ def test_what_is_no_executor_or_cannot_work_is_refused_before_anything_compiles(
         1, mp_context=multiprocessing.get_context("spawn")
     ) as pool:
         local = vj.Problem("local", LINE.space, lambda f, k: line(f, k), "always x < 1.6")
-        with pytest.raises(ValueError, match=r"name it, target='specs/FILE.py:NAME'"):
-            vj.falsify(local, executor=pool)
+        with pytest.raises(ValueError, match=r"name it, Problem\(..., target='specs/FILE.py:NAME'"):
+            vj.falsify(local, run_on=vj.RunOn(executor=pool))
 
 
 SPEC = """
@@ -280,13 +307,13 @@ def test_native_mujoco_gives_the_same_rows_from_workers():
     options["confirm"] = False
     equal(
         vj.falsify(mujoco_cartpole.balance, **options),
-        vj.falsify(mujoco_cartpole.balance, **options, executor=Disorder(1)),
+        vj.falsify(mujoco_cartpole.balance, **options, run_on=vj.RunOn(executor=Disorder(1))),
     )
     # In one process its batches of MuJoCo are used by one block at a time.
     with ThreadPoolExecutor(2) as executor:
         equal(
             vj.falsify(mujoco_cartpole.balance, **options),
-            vj.falsify(mujoco_cartpole.balance, **options, executor=executor),
+            vj.falsify(mujoco_cartpole.balance, **options, run_on=vj.RunOn(executor=executor)),
         )
 
 
@@ -352,6 +379,6 @@ class Confused(ThreadPoolExecutor):
 def test_an_answer_to_another_call_is_dropped_and_asked_again():
     options = {"search": "uniform", "budget": 64, "batch": 64, "confirm": False, "progress": False}
     alone = vj.falsify(DECAY, **options)
-    run = vj.falsify(DECAY, executor=Confused(), **options)
+    run = vj.falsify(DECAY, run_on=vj.RunOn(executor=Confused()), **options)
     assert run.table.all.equals(alone.table.all)
     assert "2 answers of workers belonged to other calls and were dropped" in run.notes

@@ -187,6 +187,6 @@ def test_a_row_is_the_same_simulation_in_any_batch():
 
 @pytest.mark.slow
 def test_replays_are_exact():
-    run = vj.falsify(specs.upright, "uniform", 70, batch=64, backend="native")
+    run = vj.falsify(specs.upright, "uniform", 70, batch=64, run_on=vj.RunOn(backend="native"))
     for row in (int(run.best.name), 69):
         assert run.replay(row).rho["spec"] == pytest.approx(run.table.all["rho"][row], abs=1e-6)

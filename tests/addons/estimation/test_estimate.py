@@ -115,7 +115,7 @@ def test_only_a_problem_can_be_estimated():
 
 
 def test_time_ends_with_what_is_there():
-    found = estimate(half_space(1e-3), budget=50_000, max_seconds=1e-6)
+    found = estimate(half_space(1e-3), budget=50_000, stop=vj.Stop(seconds=1e-6))
     assert found.probability is None
     assert any("max_seconds" in note for note in found.notes)
     assert found.upper_bound == 1.0

@@ -188,7 +188,7 @@ class TestProblems:
         assert "the surrogate knew the verdict of" in str(result)
 
     def test_falsify_begins_where_the_cheap_model_fails(self):
-        run = vj.falsify(SLOW, "uniform", 16, cheap=CHEAP, batch=8)
+        run = vj.falsify(SLOW, vj.Start("uniform", cheap=CHEAP), 16, batch=8)
         assert run.table.all["violated"][:4].any()
         assert "cheap" not in str(run.table.all.columns)
 
@@ -224,8 +224,8 @@ def test_what_does_not_fit_is_refused():
     with pytest.raises(vj.ProblemError, match=r"y is Normal\(.*in the cheap one Normal"):
         vj.estimate(SLOW, budget=400, cheap=other)
     with pytest.raises(vj.ProblemError, match="in the cheap one missing"):
-        vj.falsify(SLOW, budget=16, cheap=fewer)
+        vj.falsify(SLOW, vj.Start(cheap=fewer), budget=16)
     with pytest.raises(ValueError, match="either first, or a cheap model"):
-        vj.falsify(SLOW, budget=16, cheap=CHEAP, first=[{"x": 0.0, "y": 0.0}])
+        vj.falsify(SLOW, vj.Start(cheap=CHEAP, rows=[{"x": 0.0, "y": 0.0}]), budget=16)
     with pytest.raises(ValueError, match=r"within must be a factor above 1.*got 0\.5"):
         vj.estimate(SLOW, within=0.5)

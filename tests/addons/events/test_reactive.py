@@ -81,5 +81,5 @@ def test_reacting_breaks_what_no_plan_of_the_same_size_can():
         jax.vmap(lambda knots: sway.planned({"push": vj.Waveform(knots, "constant")}, None)["x"])
     )(jnp.asarray(corners))
     assert float(jnp.max(jnp.abs(traces))) < 9
-    run = vj.falsify(sway.reactive, "cross_entropy", 2048, stop_after=1, progress=False)
+    run = vj.falsify(sway.reactive, "cross_entropy", 2048, stop=vj.Stop(after=1), progress=False)
     assert len(run.table.counterexamples)

@@ -205,7 +205,9 @@ def test_a_fault_that_needs_three_events_is_found_many_times_sooner():
 
     found = []
     for seed in range(3):
-        run = vj.fuzz(handover, 20_000, cells=MODES, seed=seed, stop_after=1, progress=False)
+        run = vj.fuzz(
+            handover, 20_000, cells=MODES, seed=seed, stop=vj.Stop(after=1), progress=False
+        )
         found.append(run.simulations)
     uniform = vj.falsify(handover, "uniform", 60_000, progress=False).table.counts.violating
     # On few seeds, which scatter: the benchmark has twenty.

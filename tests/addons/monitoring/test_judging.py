@@ -102,7 +102,7 @@ def test_a_fleet_has_the_verdicts_of_its_recordings_alone(logs, tmp_path):
         assert own.sha256 == hashlib.sha256(content).hexdigest()
         assert own.sha256 in page
     with concurrent.futures.ThreadPoolExecutor(1) as executor:
-        assert judge(requirements, logs, executor=executor) == found
+        assert judge(requirements, logs, run_on=vj.RunOn(executor=executor)) == found
 
 
 def test_what_a_recording_lacks_is_said_for_the_requirement_alone():

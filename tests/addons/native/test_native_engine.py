@@ -146,7 +146,9 @@ def test_the_same_table_resumed_or_not(ending):
 
 def test_the_record_says_which_engine(ending, tmp_path):
     options = {"batch": 700, "progress": False, "confirm": False}
-    run = vj.falsify(ending, "halton", 1400, engine="native", folder=tmp_path / "run", **options)
+    run = vj.falsify(
+        ending, "halton", 1400, run_on=vj.RunOn(engine="native"), folder=tmp_path / "run", **options
+    )
     assert vj.load(tmp_path / "run").engine == run.engine == "native"
     small = vj.falsify(ending, "halton", 700, folder=tmp_path / "small", **options)
     assert vj.load(tmp_path / "small", ending).engine == small.engine == "xla"
@@ -164,23 +166,23 @@ def test_by_default_it_is_native_unless_few_simulations_may_do(ending, monkeypat
     options = {"batch": 700, "confirm": False, "progress": False}
     run = vj.falsify(ending, "uniform", 700, **options)
     assert run.engine == "native"
-    natively = vj.falsify(ending, "uniform", 700, engine="native", **options)
+    natively = vj.falsify(ending, "uniform", 700, run_on=vj.RunOn(engine="native"), **options)
     assert run.table.all.equals(natively.table.all)
-    assert vj.falsify(ending, "uniform", 700, stop_after=10**6, **options).engine == "xla"
+    assert vj.falsify(ending, "uniform", 700, stop=vj.Stop(after=10**6), **options).engine == "xla"
     assert vj.falsify(ending, "uniform", 300, **options).engine == "xla"
     assert vj.falsify(ending, "cross_entropy", 700, **options).engine == "xla"
 
 
 def test_given_features_are_simulated_natively(ending):
     rows = vj.falsify(ending, "uniform", 800, confirm=False, progress=False).table.all
-    run = vj.simulate(ending, rows, engine="native", progress=False)
+    run = vj.simulate(ending, rows, run_on=vj.RunOn(engine="native"), progress=False)
     assert run.engine == "native"
     assert np.allclose(run.table.all["rho"], rows["rho"], atol=1e-4)
 
 
 def test_an_unknown_engine(ending):
     with pytest.raises(UnknownNameError, match=r"unknown engine 'fast'.*auto, xla, native"):
-        vj.falsify(ending, "uniform", 10, engine="fast")
+        vj.falsify(ending, "uniform", 10, run_on=vj.RunOn(engine="fast"))
 
 
 def sorted_problem():
@@ -193,7 +195,9 @@ def sorted_problem():
 
 
 def fallback_note(problem, **options):
-    run = vj.falsify(problem, "uniform", 700, engine="native", progress=False, **options)
+    run = vj.falsify(
+        problem, "uniform", 700, run_on=vj.RunOn(engine="native"), progress=False, **options
+    )
     (note,) = [each for each in run.notes if "natively" in each]
     assert run.engine == "xla"
     assert run.simulations == 700
@@ -282,7 +286,13 @@ def test_a_program_that_computes_something_else_is_not_used(ending, monkeypatch,
 
 def test_double_precision_and_black_boxes_are_not_native(ending):
     run = vj.falsify(
-        ending, "uniform", 20, engine="native", precision="float64", confirm=False, progress=False
+        ending,
+        "uniform",
+        20,
+        run_on=vj.RunOn(engine="native"),
+        precision="float64",
+        confirm=False,
+        progress=False,
     )
     assert run.engine == "xla"
     assert any("single precision" in note for note in run.notes)

@@ -275,7 +275,7 @@ def test_the_chain_depends_on_every_input_and_their_order():
 
 def test_the_command_repeats_the_run():
     options = {"target": "specs/a b.py:c", "budget": 64, "precision": "float64"}
-    search = vj.search.named("cross_entropy")
+    search = vj.search.CrossEntropy()
     run = vj.Run(
         "c", {}, vj.ErrorTable(()), repr(search), 5, 32, "budget", 0, 0, "0", False,
         search_data=vj.search.to_json(search), confirm=True, **options,

@@ -46,7 +46,9 @@ def test_needs_half_of_the_simulations_of_others():
         name: np.median(
             [
                 first_failure(
-                    vj.falsify(rare, name, 200, batch=8, seed=s, stop_after=1, progress=False)
+                    vj.falsify(
+                        rare, name, 200, batch=8, seed=s, stop=vj.Stop(after=1), progress=False
+                    )
                 )
                 for s in range(5)
             ]
@@ -117,7 +119,9 @@ def test_compiled_systems_keep_the_monitored_signals():
 
 @pytest.mark.slow
 def test_a_system_that_jax_traces_is_learned_as_a_black_box_is():
-    run = vj.falsify(traced_problem(), SMALL, 64, batch=8, seed=1, progress=False, stop_after=1)
+    run = vj.falsify(
+        traced_problem(), SMALL, 64, batch=8, seed=1, progress=False, stop=vj.Stop(after=1)
+    )
     assert run.search.startswith("TraceSurrogate(")
     assert len(run.table.counterexamples)
     assert len(run.checkpoint["surrogate.rho"]) == len(run.table.all)
@@ -180,7 +184,12 @@ class TestDefault:
         monkeypatch.setattr(simulations, "SLOW", 0.0)
         monkeypatch.setattr("verifai_jax.falsification.validation.SLOW", 0.0)
         run = vj.falsify(
-            problem(), budget=16, stop_after=100, seed=2, folder=tmp_path / "run", progress=False
+            problem(),
+            budget=16,
+            stop=vj.Stop(after=100),
+            seed=2,
+            folder=tmp_path / "run",
+            progress=False,
         )
         assert run.search.startswith("TraceSurrogate(")
         assert run.batch == 8

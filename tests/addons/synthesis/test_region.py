@@ -72,7 +72,7 @@ def test_a_repair_is_found_where_the_prior_has_its_mass():
         "note: chose k, varied x, y, where the prior has a probability of 99.9 %: x, y within "
         "3.72 standard deviations together (mass=)"
     ) in str(repaired)
-    whole = vj.repair(PROBLEM, ["k"], budget=3000, seed=1, mass=1.0, held_out=0)
+    whole = vj.repair(PROBLEM, ["k"], budget=3000, seed=1, aim=vj.Aim(mass=1.0, held_out=0))
     assert whole.stopped == "no parameters"
     # Before and after can be compared: what is held is no part of what is sampled.
     compared = vj.compare(PROBLEM.only("x", "y"), {"repaired": repaired.problem}, budget=4000)
@@ -82,6 +82,6 @@ def test_a_repair_is_found_where_the_prior_has_its_mass():
 
 @pytest.mark.thorough
 def test_a_synthesis_says_what_it_varied():
-    found = vj.synthesize(PROBLEM, ["k"], budget=3000, environments=8, held_out=200)
+    found = vj.synthesize(PROBLEM, ["k"], budget=3000, environments=8, aim=vj.Aim(held_out=200))
     assert found.holds
     assert "chose k, varied x, y, where the prior has a probability of 99.9 %" in str(found)

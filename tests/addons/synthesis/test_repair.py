@@ -113,7 +113,7 @@ def test_nominal_parameters_that_hold_are_kept():
 
 
 def test_the_margin_is_kept():
-    result = repair(first_order, ["k"], 6000, margin=0.2, gradient=False)
+    result = repair(first_order, ["k"], 6000, aim=vj.Aim(margin=0.2), gradient=False)
     limit = brentq(lambda k: 0.5 * fading(k) + (1 - fading(k)) / k - 0.8, 0.3, 2.0)
     assert limit <= result.parameters["k"] <= 1.05 * limit
     assert result.robustness >= 0.2
@@ -121,7 +121,7 @@ def test_the_margin_is_kept():
 
 @pytest.mark.parametrize("gradient", [True, False])
 def test_no_parameters_are_enough(gradient):
-    result = repair(first_order, ["k"], 6000, margin=0.6, gradient=gradient)
+    result = repair(first_order, ["k"], 6000, aim=vj.Aim(margin=0.6), gradient=gradient)
     assert result.stopped == "no parameters"
     assert not result.repaired
     assert "NO REPAIR FOUND: the best parameters have robustness 0.5" in str(result)
@@ -165,7 +165,7 @@ def test_a_black_box():
         return vj.Trace({"x": x, "u": features["k"] * x}, dt=0.1)
 
     problem = dataclasses.replace(first_order, system=vj.blackbox(simulate))
-    result = repair(problem, ["k"], 1200, attack="halton", held_out=100)
+    result = repair(problem, ["k"], 1200, aim=vj.Aim(attack="halton", held_out=100))
     assert result.repaired
     assert BOUNDARY <= result.parameters["k"] <= 1.15 * BOUNDARY
 
@@ -217,11 +217,11 @@ def test_a_simulation_without_a_verdict_is_no_repair():
         "always x >= 0",
         nominal={"k": 0.2, "e": 0.5},
     )
-    result = repair(problem, ["k"], 600, attack="halton", gradient=False, held_out=50)
+    result = repair(problem, ["k"], 600, aim=vj.Aim(attack="halton", held_out=50), gradient=False)
     assert not result.repaired
     assert result.parameters == {"k": 0.2}
     assert "gave no verdict" in str(result)
-    options = {"attack": "halton", "gradient": False, "held_out": 50}
+    options = {"aim": vj.Aim(attack="halton", held_out=50), "gradient": False}
     started = repair(problem, ["k"], 600, nominal={"k": 0.8}, **options)
     assert started.stopped == "no verdict"
     assert "none of 50 held-out environments gave a verdict" in str(started)

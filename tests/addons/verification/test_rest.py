@@ -96,12 +96,14 @@ def test_what_is_proved_as_a_whole_needs_no_simulation():
     assert (found.probability, found.interval, found.upper_bound) == (0.0, (0.0, 0.0), 0.0)
     assert str(found) == "squares: fails with probability 0, as all of the prior is decided"
     with pytest.raises(ValueError, match="all of 'squares' is proved: nothing is left to search"):
-        vj.falsify(problem, proved=proved)
+        vj.falsify(problem, vj.Start(proved=proved))
 
 
 @pytest.mark.thorough
 def test_a_run_simulates_nothing_that_is_proved(proved, tmp_path):
-    run = vj.falsify(squares(), "uniform", 200, proved=proved, folder=tmp_path, progress=False)
+    run = vj.falsify(
+        squares(), vj.Start("uniform", proved=proved), 200, folder=tmp_path, progress=False
+    )
     rest = Rest(proved.boxes, (PROVED,))
     points = np.asarray(squares().space.points(run.table.all), float)
     assert not rest.is_decided(points, 2.0**-20).any()
@@ -127,7 +129,7 @@ def test_a_search_begins_where_bounds_are_loosest():
     counts = []
     for options in ({"proved": found}, {}):
         one = problem if options else found.rest(problem)
-        run = vj.falsify(one, "cross_entropy", 8192, batch=64, stop_after=1, seed=0,
+        run = vj.falsify(one, "cross_entropy", 8192, batch=64, stop=vj.Stop(after=1), seed=0,
                          progress=False, **options)  # fmt: skip
         counts.append(len(run.table) if run.table.all["violated"].any() else 10**9)
     assert counts[0] <= 64 < 1024 < counts[1]
@@ -154,7 +156,7 @@ def test_parameters_are_proved_as_a_set():
              "kind": vj.Categorical("a", "b")}  # fmt: skip
     problem = vj.Problem("gains", space, system, "always margin >= 0")
     found = vj.synthesize(
-        problem, ["gain", "d", "kind"], 600, held_out=0, prove=4, seed=1, progress=False
+        problem, ["gain", "d", "kind"], 600, aim=vj.Aim(held_out=0), prove=4, seed=1, progress=False
     )
     assert found.proved is not None
     (low, high), (least, greatest) = found.proved.ends["gain"], found.proved.ends["d"]

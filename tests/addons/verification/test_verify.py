@@ -152,7 +152,7 @@ def test_an_array_of_varying_length_and_a_signal_are_features():
 
 @pytest.mark.parametrize(
     ("options", "message"),
-    [({"budget": 0}, "budget must be"), ({"boxes": 0}, "boxes must be"),
+    [({"boxes": 0}, "boxes must be"),
      ({"box": 3}, "did you mean 'boxes'"), ({"confidence": 2}, "confidence must lie")],
 )  # fmt: skip
 def test_options_out_of_range_are_refused(options, message):

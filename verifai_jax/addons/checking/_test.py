@@ -80,9 +80,8 @@ def test(
         @functools.wraps(function)
         def run_test(*arguments: Any, **fixtures: Any) -> None:
             __tracebackhide__ = True
-            target = problem if isinstance(problem, str) else None
             found = load(problem) if isinstance(problem, str) else problem
-            outcome = run_check(found, check, corpus, target)
+            outcome = run_check(found, check, corpus)
             if wants_run:
                 fixtures["run"] = outcome.run
             function(*arguments, **fixtures)
@@ -100,16 +99,14 @@ def test(
 setattr(test, "__test__", False)  # noqa: B010
 
 
-def run_check(
-    problem: Problem, check: Check, corpus: str | Path | None = None, target: str | None = None
-) -> CheckOutcome:
+def run_check(problem: Problem, check: Check, corpus: str | Path | None = None) -> CheckOutcome:
     """Test a problem in the present session, and print the outcome.
 
     **Raises:** `CounterexampleFound` if it failed.
     """
     __tracebackhide__ = True
     now = current_session()
-    outcome = now.settings(check).run(problem, now.corpus_folder(corpus), target)
+    outcome = now.settings(check).run(problem, now.corpus_folder(corpus))
     now.outcomes.append(outcome)
     if outcome.failed:
         raise CounterexampleFound(outcome)
@@ -147,10 +144,12 @@ def load(target: str) -> Problem:
     path, colon, name = target.rpartition(":")
     problems = problems_of(path if colon else target)
     if colon and name in problems:
-        return problems[name]
-    if not colon and len(problems) == 1:
-        return next(iter(problems.values()))
-    return load_target(target, Problem)
+        found = problems[name]
+    elif not colon and len(problems) == 1:
+        found = next(iter(problems.values()))
+    else:
+        found = load_target(target, Problem)
+    return replace(found, target=target)
 
 
 CORPUS = "counterexamples"

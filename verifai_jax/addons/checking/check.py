@@ -24,7 +24,7 @@ from verifai_jax.problem.problem import Problem
 from verifai_jax.search import Search
 from verifai_jax.statistics.binomial import Rate
 from verifai_jax.statistics.confidence_sequences import anytime_interval
-from verifai_jax.statistics.stopping import Decided
+from verifai_jax.statistics.stopping import Decided, Stop
 
 BUDGET = 1000
 """Default number of simulations of a test."""
@@ -77,15 +77,12 @@ class Check:
                 "none fails"
             )
 
-    def run(
-        self, problem: Problem, corpus: str | Path | None = None, target: str | None = None
-    ) -> "CheckOutcome":
+    def run(self, problem: Problem, corpus: str | Path | None = None) -> "CheckOutcome":
         """Replay the corpus and, if all of it is fixed, search with the budget.
 
         **Arguments:**
         - `problem`: the problem to test.
         - `corpus`: folder of saved counterexamples, to which a new one is added; None for none.
-        - `target`: the problem's name on the command line, for the files of the corpus.
         **Returns:** the outcome.
         **Raises:** `ValueError` for a corpus that is a file; the errors of `falsify`.
         """
@@ -98,19 +95,14 @@ class Check:
         if corpus is not None and Path(corpus).is_dir():
             replayed = replay(problem, corpus, rename=self.rename)
             if not replayed.passed:
-                return CheckOutcome(problem.name, self, target, replayed)
+                return CheckOutcome(problem.name, self, problem.target, replayed)
         if self.max_failure_probability is None:
-            run = falsify(
-                problem, self.search, self.budget,
-                seed=self.seed, stop_after=1, progress=False, target=target,
-            )  # fmt: skip
+            search, stop = self.search, Stop(after=1)
         else:
-            run = falsify(
-                problem, "uniform", self.budget,
-                seed=self.seed, stop_when=Decided(self.max_failure_probability, self.confidence),
-                progress=False, target=target,
-            )  # fmt: skip
-        outcome = CheckOutcome(problem.name, self, target, replayed, run)
+            rule = Decided(self.max_failure_probability, self.confidence)
+            search, stop = "uniform", Stop(when=rule)
+        run = falsify(problem, search, self.budget, seed=self.seed, stop=stop, progress=False)
+        outcome = CheckOutcome(problem.name, self, problem.target, replayed, run)
         if corpus is None or not outcome.refuted or not run.table.counts.claimed:
             return outcome
         try:

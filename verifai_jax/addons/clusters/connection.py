@@ -1,7 +1,7 @@
 """The executor of a cluster by its address.
 
 with connect("dask://scheduler:8786") as executor:
-vj.falsify(problem, executor=executor)
+vj.falsify(problem, run_on=vj.RunOn(executor=executor))
 
 `RayExecutor` makes a task of Ray for each `submit`, and returns a future of `concurrent.futures`.
 Ray finds a worker for each task, repeats a task whose worker died, and reuses worker processes with

@@ -45,8 +45,8 @@ MAX_DROPPED = 100
 ever for one that mixes up its answers."""
 MAX_AHEAD = 1 << 22
 """Rows at most that are on their way at a time: a bound on the memory that they take."""
-SHIPMENTS: Slot[tuple[str, str | None], Any] = Slot("shipments")
-"""The problem as it is sent, by kind of executor and target."""
+SHIPMENTS: Slot[str, Any] = Slot("shipments")
+"""The problem as it is sent, by kind of executor."""
 
 
 class ExecutorEngine:
@@ -59,30 +59,19 @@ class ExecutorEngine:
     - `gradient`, `clauses`, `precision`, `guidance`: as in `engine.Engine`.
     - `given`: whether points are rows of given features, as in `CubePoints`.
     - `journal`: the journal of rows in progress, for a problem on the host.
-    - `target`: the name `FILE.py:NAME` of the problem, for an executor that cannot pickle it.
     **Raises:** `TypeError` for anything that is not an executor; `ValueError` for an executor that
     cannot work here, or to which the problem cannot be sent.
     """
 
     def __init__(
-        self,
-        problem: Problem,
-        batch: int,
-        executor: executors.Executor,
-        *,
-        gradient: bool = False,
-        clauses: bool = False,
-        precision: str = "float32",
-        journal: Journal | None = None,
-        target: str | None = None,
-        guidance: Guidance = NOTHING,
-        given: bool = False,
-    ) -> None:
-        executors.check_executor(executor)
+        self, problem: Problem, batch: int, executor: executors.Executor, *, gradient: bool = False,
+        clauses: bool = False, precision: str = "float32", journal: Journal | None = None, guidance:
+        Guidance = NOTHING, given: bool = False,
+    ) -> None:  # fmt: skip
         self.problem, self.executor, self.precision = problem, executor, precision
         self.compile_seconds = 0.0
         self._journal = journal if problem.black_box else None
-        self._shipment = shipped(problem, executor, target)
+        self._shipment = shipped(problem, executor)
         form = problem.space.feature_form
         self._features: Any = jax.tree.structure(form)
         _, lanes = chunks_and_lanes(problem, batch, len(jax.local_devices()))
@@ -314,14 +303,12 @@ class Pending:
             future.cancel()
 
 
-def shipped(
-    problem: Problem, executor: executors.Executor, target: str | None
-) -> executors.Shipment[Problem]:
+def shipped(problem: Problem, executor: executors.Executor) -> executors.Shipment[Problem]:
     """Return the problem as it is sent through this kind of executor, kept with its programs."""
     return problem.programs.get(
         SHIPMENTS,
-        (type(executor).__module__ + type(executor).__name__, target),
-        lambda: executors.ship(problem, executor, target, identity),
+        type(executor).__module__ + type(executor).__name__,
+        lambda: executors.ship(problem, executor, problem.target, identity),
     )
 
 

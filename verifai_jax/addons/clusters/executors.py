@@ -1,6 +1,5 @@
 """Work on other machines, through any executor with the `submit` of `concurrent.futures`.
 
-    check_executor(executor)
     shipment = ship(problem, executor, target="specs/cartpole.py:balance")
     futures = [executor.submit(evaluate_block, shipment, i) for i in range(16)]
     gather(futures, lambda i, result: ...)              # as each ends; on errors cancels the rest
@@ -55,25 +54,6 @@ class Future(Protocol):
 
     def cancel(self) -> Any:
         """Remove the call from the queue if it has not started."""
-
-
-def check_executor(executor: object) -> None:
-    """Refuse anything that is not an executor, and a process pool whose workers would hang.
-
-    **Raises:** `TypeError` for an object without `submit`; `ValueError` for a pool that forks.
-    """
-    if not callable(getattr(executor, "submit", None)):
-        raise TypeError(
-            "executor must have concurrent.futures' submit, such as Dask's client.get_executor(), "
-            f"vj.clusters.RayExecutor() or a process pool; got {type(executor).__name__}"
-        )
-    context = getattr(executor, "_mp_context", None)
-    method = getattr(context, "get_start_method", lambda: "")()
-    if isinstance(executor, concurrent.futures.ProcessPoolExecutor) and method == "fork":
-        raise ValueError(
-            "the process pool forks this process, and JAX does not work in a forked process; make "
-            "it with ProcessPoolExecutor(mp_context=multiprocessing.get_context('spawn'))"
-        )
 
 
 def count_workers(executor: Executor) -> int:
@@ -260,8 +240,8 @@ def ship(
         raise ValueError(
             f"{type(executor).__name__} cannot send the {type(thing).__name__.lower()} to its "
             f"workers ({one_line(format_error(error))[:200]}); name it, "
-            "target='specs/FILE.py:NAME', so that they load it themselves, or use Dask or Ray, "
-            "which can send functions that are not in a module"
+            "Problem(..., target='specs/FILE.py:NAME'), so that they load it themselves, or use "
+            "Dask or Ray, which can send functions that are not in a module"
         ) from error
     return shipment
 

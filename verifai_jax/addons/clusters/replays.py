@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Int, Key, PyTree, UInt32
 
 from verifai_jax.addons.clusters.executor_engine import TOGETHER, shipped
-from verifai_jax.addons.clusters.executors import Shipment, check_executor, gather
+from verifai_jax.addons.clusters.executors import Shipment, gather
 from verifai_jax.addons.clusters.worker import computing
 from verifai_jax.core.compute.executors import Executor
 from verifai_jax.core.compute.keys import as_key
@@ -29,16 +29,13 @@ class ExecutorReplays(HostReplays):
     **Arguments:**
     - `problem`, `precision`, `key`: as in `HostReplays`.
     - `executor`: an executor with `submit`.
-    - `target`: the name of the problem, for an executor that cannot pickle it.
     """
 
     def __init__(
         self, problem: Problem, precision: str, key: Key[Any, ""], executor: Executor,
-        target: str | None = None,
     ) -> None:  # fmt: skip
         super().__init__(problem, precision, key)
-        check_executor(executor)
-        self._executor, self._shipment = executor, shipped(problem, executor, target)
+        self._executor, self._shipment = executor, shipped(problem, executor)
 
     def __call__(
         self, factor: int, each: Sequence[PyTree], numbers: Int[np.ndarray, " n"]

@@ -31,21 +31,22 @@ from verifai_jax.addons.estimation.result import METHODS, WEIGHTED, Estimate
 from verifai_jax.addons.estimation.surrogate import FITTING, estimate_by_surrogate
 from verifai_jax.core.compute.precision import in_precision
 from verifai_jax.core.display.progress import SimulationProgress, shows_progress
-from verifai_jax.core.messages.checks import check_fraction, check_options
+from verifai_jax.core.messages.checks import check_fraction, check_options, options_of
 from verifai_jax.core.messages.errors import suggests_options, unknown_name
 from verifai_jax.core.messages.text import listed
 from verifai_jax.evaluation.backends import resolved
+from verifai_jax.evaluation.run_on import RunOn
 from verifai_jax.falsification.cheap import check_same_features
 from verifai_jax.falsification.validation import SLOW, can_be_slow
 from verifai_jax.problem.dependence import depends_on_key, without_derivative
 from verifai_jax.problem.problem import Problem
 from verifai_jax.problem.silent_mistakes import formula_notes
 from verifai_jax.statistics.binomial import clopper_pearson
+from verifai_jax.statistics.stopping import Stop
 
 if TYPE_CHECKING:
     from verifai_jax.addons.verification import Verification
     from verifai_jax.addons.verification.rest import Rest
-    from verifai_jax.core.compute.executors import Executor
 GRADIENTS_FROM = 3
 """Continuous coordinates from which the searches for failing regions take gradients."""
 CHEAP_BATCH = 4096
@@ -68,11 +69,10 @@ def estimate(
     seed: int = 0,
     confidence: float = 0.95,
     p0: float | None = None,
+    stop: Stop | None = None,
     precision: str = "float32",
-    backend: str | None = None,
-    max_seconds: float | None = None,
+    run_on: RunOn | None = None,
     progress: bool | None = None,
-    executor: "Executor | None" = None,
     simulations_are: Literal["auto", "slow", "fast"] = "auto",
     within: float | None = None,
     cheap: Problem | None = None,
@@ -90,15 +90,11 @@ def estimate(
     - `method`: `"monte_carlo"`, `"importance"`, `"splitting"` or `"surrogate"`; when left out, it
       is chosen from the first samples.
     - `budget`: maximum number of simulations, including those of pilot runs and fits.
-    - `batch`: number of simulations at once; by default what the method needs.
-    - `seed`: the same seed gives the same estimate on the same machine.
     - `confidence`: the confidence of the interval and of the bound, between 0 and 1.
     - `p0`: an upper limit between 0 and 1. The result says whether the probability is shown to lie
       below it, and if not, how many more simulations without a failure would show that.
-    - `precision`, `backend`: as in `falsify`.
-    - `max_seconds`: wall-clock seconds after which the estimate is made from finished simulations.
-    - `progress`: True draws a bar, False none; None draws one on a terminal and in a notebook.
-    - `executor`: an executor whose workers simulate, as in `falsify`; the estimate is the same.
+    - `stop`: the seconds after which the estimate is made from finished simulations.
+    - `run_on`: backend and workers of the simulations; with workers the estimate is the same.
     - `simulations_are`: `"slow"` if only a few hundred simulations are affordable: the method is
       then `"surrogate"`, which computes more to simulate less. `"auto"` assumes this for a black
       box whose simulation takes at least half a second, if the budget is 200 or more.
@@ -109,6 +105,7 @@ def estimate(
       `simulations_are` is then `"slow"`, and `within` 1.5 by default.
     - `proved`: the result of `verify` for this problem, or its file. Proved parts of the space,
       safe or failing, are not simulated; all simulations are in the rest.
+    - all other arguments: as in `falsify`.
     **Returns:** the estimate with its interval and a guaranteed bound. Ctrl-C gives the estimate
     from the finished simulations. A simulation without a verdict (not finite, raised, out of time)
     counts as safe in the estimate, and as a failure at the upper ends of interval and bound.
@@ -121,7 +118,10 @@ def estimate(
         raise TypeError(f"estimate needs a Problem; got {type(problem).__name__}")
     if method is not None and method not in METHODS:
         raise unknown_name("method", method, METHODS)
-    check_options(budget, 1 if batch is None else batch, seed, max_seconds, None)
+    check_options(budget, 1 if batch is None else batch, seed)
+    max_seconds = options_of("estimate", Stop, stop, "seconds").seconds
+    where = options_of("estimate", RunOn, run_on, "backend", "executor")
+    executor = where.executor
     check_fraction("confidence", confidence)
     if p0 is not None:
         check_fraction("p0", p0)
@@ -136,7 +136,9 @@ def estimate(
     share = SHARE_OF_REPLICATE if method == "splitting" else SHARE_OF_LEVEL
     chains = answers.chains_for(budget, share)
     batch = min(chains if batch is None else batch, budget)
-    choice = resolved(problem, batch=batch, budget=budget, precision=precision, wanted=backend)
+    choice = resolved(
+        problem, batch=batch, budget=budget, precision=precision, wanted=where.backend
+    )
     choice.problem.check()
     sources = problem.sources()
     rest = None
@@ -201,16 +203,9 @@ _METHODS = {
 
 
 def _result(
-    problem: Problem,
-    backend: str | None,
-    answer: answers.Answer,
-    limit_state: LimitState,
-    plan: answers.Plan,
-    seed: int,
-    precision: str,
-    p0: float | None,
-    seconds: float,
-) -> Estimate:
+    problem: Problem, backend: str | None, answer: answers.Answer, limit_state: LimitState,
+    plan: answers.Plan, seed: int, precision: str, p0: float | None, seconds: float,
+) -> Estimate:  # fmt: skip
     notes = [text for text in (limit_state.own_chance, *formula_notes(problem)) if text]
     notes += answer.notes
     bound = answer.prior.upper_bound(plan.confidence)

@@ -70,10 +70,7 @@ def sequence(
       keeps. Give one dictionary for all transitions, or one for each.
     - `samples`: samples of the first part.
     - `confidence`: the confidence of all intervals together.
-    - `seed`: the seed of samples and random keys.
-    - `batch`: simulations at once.
-    - `precision`: `"float32"` or `"float64"`.
-    - `progress`: whether to show one line of progress; see `core.display.progress` for the default.
+    - all other arguments: as in `falsify`.
     **Returns:** a `SequenceEstimate`.
     **Raises:** before anything is simulated, `ValueError` for fewer than two parts, for a run whose
     rows are not samples of the prior and for numbers out of range; `UnknownNameError` for features

@@ -152,7 +152,7 @@ def importance_answer(
             f"independent searches do not agree: {format_percent(agreement.alone)} of the "
             "probability lies where no more than one of them found failures, so there may be "
             f"more that none found; the interval allows for {format_percent(agreement.unseen)}. "
-            "A larger budget searches more, and falsify(problem, diverse=...) lists more failures"
+            "A larger budget searches more, and falsify(problem, 'diverse') lists more failures"
         )
     if mean.tail > WORST_TAIL:
         answer.notes.append(

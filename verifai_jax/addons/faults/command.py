@@ -28,7 +28,7 @@ def fmea(target: str, folder: Path | None, plot: Path | None, **options: Any) ->
 
     problem = arguments.load_problem(target)
     into = folder or Path("runs") / f"fmea-{target.rpartition(':')[2]}"
-    found = run(problem, folder=into, target=target, **options)
+    found = run(problem, folder=into, **options)
     say(found)
     found.to_csv(into / "fmea.csv")
     say(f"  table        {into / 'fmea.csv'}")

@@ -18,10 +18,12 @@ from verifai_jax.addons.searches.coverage import Coverage
 from verifai_jax.core.display.progress import shows_progress
 from verifai_jax.core.messages.errors import suggests_options
 from verifai_jax.core.values.trace import Trace
-from verifai_jax.falsification import falsify
+from verifai_jax.evaluation.run_on import RunOn
+from verifai_jax.falsification import Start, falsify
 from verifai_jax.features import Domain, FeatureSpace
 from verifai_jax.problem.problem import Problem
 from verifai_jax.search import Search
+from verifai_jax.statistics.stopping import Stop
 
 
 @suggests_options
@@ -32,21 +34,17 @@ def fuzz(
     *,
     space: FeatureSpace | Mapping[str, Domain] | None = None,
     system: Callable[..., Trace] | None = None,
-    name: str = "fuzz",
     ranges: Mapping[str, tuple[float, float]] | None = None,
     cells: Mapping[str, tuple[float, float, int]] | None = None,
-    search: Search | None = None,
+    search: str | Search | Start | None = None,
     batch: int | None = None,
     seed: int = 0,
-    max_seconds: float | None = None,
-    stop_after: int | None = None,
+    stop: Stop | None = None,
     folder: str | Path | None = None,
-    precision: str = "float32",
-    backend: str | None = None,
     confirm: bool = True,
+    precision: str = "float32",
+    run_on: RunOn | None = None,
     progress: bool | None = None,
-    target: str | None = None,
-    keep_going: bool = False,
 ) -> FuzzRun:
     """Look for failures by covering the possible behaviour, with or without formulas.
 
@@ -55,7 +53,6 @@ def fuzz(
     - `budget`: simulations at most.
     - `space`, `system`: the feature space and the system, if there is no formula. A simulation then
       fails if it raises, hangs, or has a signal that is not finite or outside its range.
-    - `name`: the name of the run, if there is no problem.
     - `ranges`: signal -> `(low, high)`: the range in which it must stay.
     - `cells`: signal -> `(low, high, how many)`: cells of behaviour to cover, of all these signals
       together. The default is the problem's `behaviour`, or, if few signals have ranges, four cells
@@ -71,11 +68,10 @@ def fuzz(
     **Raises:** `ValueError` for invalid ranges or cells, and unless either a problem or a space
     with a system is given; the errors of `falsify`.
     """
-    checked = with_implicit(problem, space, system, ranges or {}, cells, name)
+    checked = with_implicit(problem, space, system, ranges or {}, cells, "fuzz")
     run = falsify(
         checked, Coverage() if search is None else search, budget,
-        batch=batch, seed=seed, max_seconds=max_seconds, stop_after=stop_after, folder=folder,
-        precision=precision, backend=backend, confirm=confirm, progress=progress, target=target,
-        keep_going=keep_going,
+        batch=batch, seed=seed, stop=stop, folder=folder, confirm=confirm, precision=precision,
+        run_on=run_on, progress=progress,
     )  # fmt: skip
     return as_made(run)

@@ -50,7 +50,8 @@ def fuzz(
     ends = {"--max-seconds": options["max_seconds"], "--stop-after": options["stop_after"]}
     goes_on = partial(arguments.resuming, "falsify", target=target, options=ends)
     with given_or_next(folder, "runs", problem.name, goes_on) as path:
-        run = run_fuzz(problem, cells=chosen or None, folder=path, target=target, **options)
+        values = arguments.values_of(options)
+        run = run_fuzz(problem, cells=chosen or None, folder=path, **values)
     print_run(run, pictures, ends)
     check_gate(fail_on, {"counterexample": run.table.counts.may_fail})
 

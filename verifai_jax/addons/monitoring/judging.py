@@ -17,7 +17,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from verifai_jax.addons.clusters.executors import check_executor, gather
+from verifai_jax.addons.clusters.executors import gather
 from verifai_jax.addons.monitoring import resampling
 from verifai_jax.addons.monitoring.columns import LeftOut
 from verifai_jax.addons.monitoring.containers import Episode
@@ -28,11 +28,12 @@ from verifai_jax.addons.monitoring.recording import read
 from verifai_jax.addons.monitoring.requirement_files import Requirements, requirements_of
 from verifai_jax.addons.monitoring.resampling import Method, Missing
 from verifai_jax.addons.monitoring.units import plain_unit, unit_of, units_of
-from verifai_jax.core.compute.executors import Executor
 from verifai_jax.core.display.progress import count_done, shows_progress
+from verifai_jax.core.messages.checks import options_of
 from verifai_jax.core.messages.text import format_time, listed, one_line
 from verifai_jax.core.user_code.sources import Source, hashed_files
 from verifai_jax.core.values.trace import Trace
+from verifai_jax.evaluation.run_on import RunOn
 from verifai_jax.mtl._robustness import first_nan
 from verifai_jax.mtl.evaluate import End
 from verifai_jax.mtl.formula import Formula
@@ -82,7 +83,7 @@ def judge(
     max_gap: float | None = None,
     end: End = "hold",
     explain: bool = True,
-    executor: Executor | None = None,
+    run_on: RunOn | None = None,
     ended: Callable[[int, Sequence[Row]], None] | None = None,
     progress: bool | None = None,
 ) -> Judgement:
@@ -108,13 +109,13 @@ def judge(
       samples, `"hold"` or `"linear"`.
     - `end`: as in `robustness`.
     - `explain`: whether to find the deciding predicate and instant.
-    - `executor`: anything with the `submit` of `concurrent.futures`, to read and judge in parallel;
-      a process pool must not fork.
+    - `run_on`: the workers of an executor, to read and judge in parallel.
     - `ended`: a function called with the index and the rows of each recording when it is done.
     - `progress`: whether to show one line of progress; see `core.display.progress` for the default.
     **Raises:** `ValueError` for no requirement, no recording, `resample_to` without `method`;
     `FileNotFoundError` for a folder or a file that does not exist.
     """
+    executor = options_of("judge", RunOn, run_on, "executor").executor
     requirements = requirements_of(formulas)
     if resample_to is not None and method is None:
         raise ValueError('resampling needs both: resample_to=PERIOD, method="hold" or "linear"')
@@ -143,7 +144,6 @@ def judge(
         for index, (name, source) in enumerate(seen()):
             keep(index, judge_recording(requirements, name, source, reading))
     else:
-        check_executor(executor)
         start = functools.partial(executor.submit, judge_recording, requirements)
         gather([start(name, source, reading) for name, source in seen()], keep)
     if not rows:

@@ -20,6 +20,7 @@ from verifai_jax.falsification import falsify
 from verifai_jax.falsification.run import Run
 from verifai_jax.mtl.formula import Formula
 from verifai_jax.problem import Problem
+from verifai_jax.statistics.stopping import Stop
 
 SIMULATED = 64
 """Simulations from the prior that stand for recordings."""
@@ -88,7 +89,7 @@ def distinguish_by_search(
     if found or budget <= len(some):
         return found
     spec = {"forth": one >> other, "back": other >> one}
-    run = _searched(problem, spec, budget - len(some), seed=seed, stop_after=1)
+    run = _searched(problem, spec, budget - len(some), seed=seed, stop=Stop(after=1))
     traces = _traces(run, _failing(run)[:TAKEN])
     return distinction(one, other, traces, source, end, len(some) + run.simulations)
 

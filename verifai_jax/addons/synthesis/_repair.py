@@ -21,6 +21,7 @@ from jaxtyping import Float
 
 from verifai_jax.addons.synthesis import arguments, optimize
 from verifai_jax.addons.synthesis.adversary import attack
+from verifai_jax.addons.synthesis.aim import Aim, as_aim
 from verifai_jax.addons.synthesis.budget import Budget, split_budget
 from verifai_jax.addons.synthesis.failure_counts import FailureCounts
 from verifai_jax.addons.synthesis.held_out import held_out
@@ -29,14 +30,16 @@ from verifai_jax.addons.synthesis.parametric import FeatureParameters, Parametri
 from verifai_jax.addons.synthesis.region import Region, region_of
 from verifai_jax.addons.synthesis.results import Repair, Round
 from verifai_jax.core.display.progress import shows_progress
-from verifai_jax.core.messages.checks import check_options
-from verifai_jax.core.messages.errors import check_names, suggests_options
+from verifai_jax.core.messages.checks import check_count, check_options, options_of
+from verifai_jax.core.messages.errors import suggests_options
 from verifai_jax.core.user_code.source_collection import sources_of
+from verifai_jax.evaluation.run_on import RunOn
 from verifai_jax.falsification.run import Run
 from verifai_jax.falsification.validation import usual_batch
 from verifai_jax.problem.problem import Problem
 from verifai_jax.search import Search
 from verifai_jax.statistics.smallest_change import smallest_change
+from verifai_jax.statistics.stopping import Stop
 
 ADDED = 8
 """Counterexamples that a round adds to the set at most."""
@@ -54,18 +57,14 @@ def repair(
     *,
     nominal: Mapping[str, Any] | None = None,
     system_of: Callable[[Any], Any] | None = None,
-    aim: Literal["robustness", "probability"] = "robustness",
-    attack: str | Search = "cross_entropy",
-    margin: float = 0.0,
+    aim: Aim | Literal["robustness", "probability"] = "robustness",
     rounds: int = 30,
-    held_out: int = 2000,
-    mass: float = 0.999,
     gradient: bool | None = None,
     batch: int = 256,
     seed: int = 0,
-    max_seconds: float | None = None,
+    stop: Stop | None = None,
     precision: str = "float32",
-    backend: str | None = None,
+    run_on: RunOn | None = None,
     progress: bool | None = None,
 ) -> Repair:
     """Change parameters as little as possible so that the formula holds in all counterexamples.
@@ -77,19 +76,12 @@ def repair(
     - `nominal`: values of the parameters to start from; the problem's own when left out.
     - `system_of(parameters) -> system`: a pure function, traced by JAX. All features then belong to
       the environment.
-    - `aim`: `"robustness"`: the formula must hold in all environments that an attack finds.
-      `"probability"`: the lowest failure probability, counted in samples of the prior without
-      attacks, for problems in which no parameters always keep the formula.
-    - `attack`: the search over the environment that looks for failures of the parameters.
-    - `margin`: the required robustness.
+    - `aim`: what the parameters are chosen for, and how that is checked: `"robustness"`,
+      `"probability"`, or an `Aim` with its options.
     - `rounds`: maximum number of rounds, each an attack and a repair.
-    - `held_out`: number of fresh environments for the rates before and after; 0 for no check.
-    - `mass`: probability of the central part of the prior, around its medians, in which the
-      environment is attacked; environments farther out in the tails are ignored. With 1 the attack
-      reaches the ends of all tails at once.
     - `gradient`: whether to follow gradients; by default if the present backend has them.
-    - `max_seconds`: wall-clock seconds; a fifth is reserved for the check.
-    - `progress`: whether to show one line of progress; see `core.display.progress` for the default.
+    - `stop`: the seconds of the work, a fifth of which is reserved for the check.
+    - `run_on`: the backend of the simulations.
     - all other arguments: as in `falsify`.
     **Returns:** a `Repair`; after Ctrl-C the finished part, without the check.
     **Raises:** `ValueError` before anything compiles for unknown features, parameters without a
@@ -102,10 +94,13 @@ def repair(
     if whole is None:
         assert run is not None
         raise ValueError(f"the run of {run.name!r} has no problem: use vj.load(path, problem)")
-    check_options(budget, batch, seed, max_seconds, None)
-    arguments.check_numbers(margin, rounds=rounds, held_out=held_out)
-    check_names("aim", [aim], arguments.AIMS)
-    if aim == "probability" and system_of is not None:
+    check_options(budget, batch, seed)
+    max_seconds = options_of("repair", Stop, stop, "seconds").seconds
+    backend = options_of("repair", RunOn, run_on, "backend").backend
+    check_count("rounds", rounds)
+    aim = as_aim(aim)
+    margin = aim.margin
+    if aim.of == "probability" and system_of is not None:
         raise ValueError(
             "arrays of parameters are repaired by gradients, for their robustness; "
             "aim='probability' needs features as parameters"
@@ -120,15 +115,15 @@ def repair(
         loop, start = arguments.repaired_features(
             whole, parameters, nominal, gradient, batch, budget, precision, backend, seed
         )
-    search = arguments.attack_search(whole, attack, loop)
+    search = arguments.attack_search(whole, aim.attack, loop)
     sources = sources_of(whole, system_of, made=whole.made_in or ())
     limits, checking = split_budget(lambda: loop.simulations, budget, started, max_seconds)
-    region = region_of(loop, mass)
-    if aim == "probability":
+    region = region_of(loop, aim.mass)
+    if aim.of == "probability":
         region = region_of(loop, 1.0)  # Samples are of the whole prior.
     assert region is not None
     work = _Repair(loop, start, search, limits, margin, seed, region)
-    if aim == "probability":
+    if aim.of == "probability":
         assert isinstance(loop, FeatureParameters)
         work.counts = FailureCounts(loop, margin, limits, seed, start)
     try:
@@ -140,8 +135,8 @@ def repair(
         stopped = "interrupted"
     before = after = None
     searched = loop.simulations
-    if stopped != "interrupted" and held_out:
-        before, after = _check(loop, start, work.now.theta, held_out, margin, seed, checking)
+    if stopped != "interrupted" and aim.held_out:
+        before, after = _check(loop, start, work.now.theta, aim.held_out, margin, seed, checking)
     robustness = work.robustness
     if after is not None and after.lowest is not None:
         robustness = min(robustness, after.lowest)

@@ -20,6 +20,7 @@ from jaxtyping import Float
 
 from verifai_jax.addons.synthesis import arguments, optimize
 from verifai_jax.addons.synthesis.adversary import attack
+from verifai_jax.addons.synthesis.aim import Aim, as_aim
 from verifai_jax.addons.synthesis.budget import Budget, split_budget
 from verifai_jax.addons.synthesis.failure_counts import FailureCounts
 from verifai_jax.addons.synthesis.held_out import HeldOut, draw, held_out
@@ -28,12 +29,14 @@ from verifai_jax.addons.synthesis.parametric import FeatureParameters, Parametri
 from verifai_jax.addons.synthesis.region import Region, region_of
 from verifai_jax.addons.synthesis.results import Synthesis
 from verifai_jax.core.display.progress import shows_progress
-from verifai_jax.core.messages.checks import check_options, check_positive
-from verifai_jax.core.messages.errors import check_names, suggests_options
+from verifai_jax.core.messages.checks import check_count, check_options, check_positive, options_of
+from verifai_jax.core.messages.errors import suggests_options
+from verifai_jax.evaluation.run_on import RunOn
 from verifai_jax.falsification.validation import usual_batch
 from verifai_jax.problem.dependence import depends_on_key
 from verifai_jax.problem.problem import Problem
 from verifai_jax.search import Search
+from verifai_jax.statistics.stopping import Stop
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -54,19 +57,15 @@ def synthesize(
     parameters: Sequence[str] | str | None = None,
     budget: int = 10_000,
     *,
-    aim: Literal["robustness", "probability"] = "robustness",
-    attack: str | Search = "cross_entropy",
-    margin: float = 0.0,
+    aim: Aim | Literal["robustness", "probability"] = "robustness",
     environments: int = 16,
-    held_out: int = 2000,
-    mass: float = 0.999,
     prove: float | None = None,
     gradient: bool | None = None,
     batch: int = 256,
     seed: int = 0,
-    max_seconds: float | None = None,
+    stop: Stop | None = None,
     precision: str = "float32",
-    backend: str | None = None,
+    run_on: RunOn | None = None,
     progress: bool | None = None,
 ) -> Synthesis:
     """Find values of some features for which the formula holds robustly for all others.
@@ -76,36 +75,32 @@ def synthesize(
     - `parameters`: names of the features to choose; all when left out. The others are the
       environment, which varies.
     - `budget`: maximum number of simulations, without those of the final check.
-    - `aim`: `"robustness"`: the greatest worst-case robustness, found by attacks. `"probability"`:
-      the lowest failure probability, counted in samples of the prior without attacks, for problems
-      in which no parameters always keep the formula.
-    - `attack`: the search over the environment that looks for failures of the parameters.
-    - `margin`: the required robustness.
+    - `aim`: what the parameters are chosen for, and how that is checked: `"robustness"`,
+      `"probability"`, or an `Aim` with its options.
     - `environments`: number of environments in the initial set.
-    - `held_out`: number of fresh environments in which the result is checked; 0 for no check.
-    - `mass`: probability of the central part of the prior, around its medians, in which the
-      environment is attacked; with 1 the attack reaches the ends of all tails at once.
     - `prove`: approximate seconds to prove a box of parameters around the best ones, with the
       method of `verify`: for all parameters in it, and all environments of that part of the prior,
       the formula holds. No proof when left out.
     - `gradient`: whether to follow gradients; by default if the present backend has them.
-    - `batch`: simulations at once.
-    - `max_seconds`: wall-clock seconds; a fifth is reserved for the check.
-    - `progress`: whether to show one line of progress; see `core.display.progress` for the default.
+    - `stop`: the seconds of the work, a fifth of which is reserved for the check.
+    - `run_on`: the backend of the simulations.
     - all other arguments: as in `falsify`.
     **Returns:** a `Synthesis`; after Ctrl-C the finished part, without the check.
     **Raises:** `ValueError` before anything compiles for unknown features and options out of range.
     """
     started = time.perf_counter()
-    check_options(budget, batch, seed, max_seconds, None)
-    arguments.check_numbers(margin, environments=environments, held_out=held_out)
-    check_names("aim", [aim], arguments.AIMS)
+    check_options(budget, batch, seed)
+    max_seconds = options_of("synthesize", Stop, stop, "seconds").seconds
+    backend = options_of("synthesize", RunOn, run_on, "backend").backend
+    check_count("environments", environments)
+    aim = as_aim(aim)
+    margin = aim.margin
     if prove is not None:
         check_positive("prove", prove)
     loop = arguments.feature_parameters(
         problem, parameters, gradient, batch, budget, precision, backend, seed
     )
-    search = arguments.attack_search(problem, attack, loop)
+    search = arguments.attack_search(problem, aim.attack, loop)
     enclosed = None
     if prove is not None:
         from verifai_jax.addons.verification.enclosure import enclosable
@@ -113,11 +108,11 @@ def synthesize(
         enclosed = enclosable(loop.problem, precision)
     sources = problem.sources()
     limits, checking = split_budget(lambda: loop.simulations, budget, started, max_seconds)
-    region = region_of(loop, mass)
-    if aim == "probability":
+    region = region_of(loop, aim.mass)
+    if aim.of == "probability":
         region = region_of(loop, 1.0)  # Samples are of the whole prior.
     work = _Synthesis(loop, search, limits, margin, environments, seed, region)
-    if aim == "probability":
+    if aim.of == "probability":
         work.counts = FailureCounts(loop, margin, limits, seed)
     try:
         work.run()
@@ -134,10 +129,10 @@ def synthesize(
     checked = None
     if (
         stopped != "interrupted"
-        and held_out
+        and aim.held_out
         and (loop.environment is not None or depends_on_key(problem))
     ):
-        checked = _check(loop, best.theta, held_out, margin, seed, checking)
+        checked = _check(loop, best.theta, aim.held_out, margin, seed, checking)
     if checked is not None and checked.lowest is not None:
         robustness = min(robustness, checked.lowest)
     proved = None

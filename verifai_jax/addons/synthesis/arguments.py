@@ -9,7 +9,6 @@ from jaxtyping import Float
 from verifai_jax import search as searches
 from verifai_jax.addons.synthesis.parametric import ArrayParameters, FeatureParameters, Parametric
 from verifai_jax.core.compute.precision import in_precision
-from verifai_jax.core.messages.checks import check_count
 from verifai_jax.core.messages.errors import check_names
 from verifai_jax.evaluation.backends import resolved
 from verifai_jax.falsification.validation import check_search
@@ -17,30 +16,14 @@ from verifai_jax.problem.dependence import without_derivative
 from verifai_jax.problem.problem import Problem
 from verifai_jax.search import Search
 
-AIMS = ("robustness", "probability")
-"""What parameters are chosen for."""
 ATTACK = 20_000
 """Simulations of an attack at most, however large the budget."""
 
 
-def check_numbers(margin: float, **counts: int) -> None:
-    """Check that numbers are in range."""
-    if isinstance(margin, bool) or not isinstance(margin, int | float) or not margin >= 0:
-        raise ValueError(f"margin must be a robustness of at least 0; got {margin!r}")
-    for name, count in counts.items():
-        check_count(name, count, 0 if name == "held_out" else 1)
-
-
 def feature_parameters(
-    problem: Problem,
-    parameters: Sequence[str] | str | None,
-    gradient: bool | None,
-    batch: int,
-    budget: int,
-    precision: str,
-    backend: str | None,
-    seed: int,
-) -> FeatureParameters:
+    problem: Problem, parameters: Sequence[str] | str | None, gradient: bool | None, batch: int,
+    budget: int, precision: str, backend: str | None, seed: int,
+) -> FeatureParameters:  # fmt: skip
     """Return the checked problem on its backend, with these features as parameters.
 
     **Raises:** `ValueError` for invalid arguments, before anything compiles.
@@ -98,15 +81,9 @@ def attack_search(problem: Problem, search: str | Search, loop: Parametric) -> S
 
 
 def repaired_arrays(
-    problem: Any,
-    parameters: Any,
-    system_of: Any,
-    nominal: Any,
-    gradient: Any,
-    batch: int,
-    precision: str,
-    seed: int,
-) -> ArrayParameters:
+    problem: Any, parameters: Any, system_of: Any, nominal: Any, gradient: Any, batch: int,
+    precision: str, seed: int,
+) -> ArrayParameters:  # fmt: skip
     """Return the problem with these arrays as parameters of a repair.
 
     **Raises:** `TypeError` or `ValueError` for invalid arguments.
@@ -127,16 +104,9 @@ def repaired_arrays(
 
 
 def repaired_features(
-    problem: Any,
-    names: Any,
-    nominal: Any,
-    gradient: Any,
-    batch: int,
-    budget: int,
-    precision: str,
-    backend: Any,
-    seed: int,
-) -> tuple[Any, Float[np.ndarray, " p"]]:
+    problem: Any, names: Any, nominal: Any, gradient: Any, batch: int, budget: int, precision: str,
+    backend: Any, seed: int,
+) -> tuple[Any, Float[np.ndarray, " p"]]:  # fmt: skip
     """Return the problem with these features as parameters of a repair, and their nominal values.
 
     **Raises:** `ValueError` for invalid arguments, before anything compiles.

@@ -11,11 +11,12 @@ from verifai_jax.addons.verification.enclosure import Enclosure, enclosable
 from verifai_jax.addons.verification.result import Verification, as_verification, described
 from verifai_jax.core.compute.precision import in_precision
 from verifai_jax.core.display.progress import shows_progress
-from verifai_jax.core.messages.checks import check_count, check_fraction, check_positive
+from verifai_jax.core.messages.checks import check_count, check_fraction, options_of
 from verifai_jax.core.messages.errors import suggests_options
 from verifai_jax.features.continuous import OUTERMOST
 from verifai_jax.problem.problem import Problem
 from verifai_jax.problem.silent_mistakes import formula_notes
+from verifai_jax.statistics.stopping import Stop
 
 REST = 0.08
 """Share of the seconds that is kept for the samples of what stays undecided."""
@@ -29,9 +30,9 @@ CONTRADICTED = (
 @shows_progress("verifying")
 def verify(
     problem: Problem,
-    budget: float | None = None,
     *,
     boxes: int | None = None,
+    stop: Stop | None = None,
     samples: int = 4096,
     confidence: float = 0.95,
     seed: int = 0,
@@ -50,19 +51,17 @@ def verify(
 
     **Arguments:**
     - `problem`: a problem whose system JAX traces, without random numbers of its own.
-    - `budget`: approximate seconds; 60 if `boxes` is left out too. Ctrl-C stops it at any time.
     - `boxes`: maximum number of boxes to examine.
+    - `stop`: the approximate seconds; 60 if `boxes` is left out too. Ctrl-C stops it at any time.
     - `samples`: simulations from the prior of the undecided part, to bound how often it fails.
     - `confidence`: the confidence of that bound, which holds whenever one stops.
-    - `seed`: the seed of the samples.
-    - `precision`: the precision of the simulations that are verified, `"float32"` or `"float64"`.
     - `continuous`: verify the differential equation of a system made by `vj.ode`, in real
       arithmetic and at all times, with the controller's output held between its samples. Its
       dynamics must be smooth, without switches or an early end, its formulas without until, since
       and next. Nothing is sampled, and searches and estimates, which simulate steps, cannot use the
       result.
     - `resume`: an earlier result for the same problem, or its file, to continue.
-    - `progress`: as in `falsify`.
+    - all other arguments: as in `falsify`.
     **Returns:** the result: the three volumes, the three probabilities, the boxes.
     **Raises:** `ProblemError` for a black box, for a system that draws random numbers, and for
     systems and formulas that `continuous` does not support; `MissingRule` for an operation without
@@ -72,14 +71,13 @@ def verify(
     started = time.perf_counter()
     if not isinstance(problem, Problem):
         raise TypeError(f"verify needs a Problem; got {type(problem).__name__}")
-    if budget is not None:
-        check_positive("budget", budget)
     if boxes is not None:
         check_count("boxes", boxes)
     check_count("samples", samples, 0)
     check_fraction("confidence", confidence)
     in_precision(precision)
-    seconds = 60.0 if budget is None and boxes is None else budget
+    seconds = options_of("verify", Stop, stop, "seconds").seconds
+    seconds = 60.0 if seconds is None and boxes is None else seconds
     precision = "float64" if continuous else precision
     problem = enclosable(problem, precision)
     about = between_samples(problem) if continuous else problem

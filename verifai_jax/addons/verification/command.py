@@ -37,11 +37,13 @@ def verify(
     **options: Any,
 ) -> None:
     """Divide the features of TARGET (FILE.py:NAME) into proved, broken and undecided boxes."""
+    from verifai_jax import Stop
     from verifai_jax import verify as run
 
     problem = arguments.load_problem(target, only)
     before = into if into is not None and into.exists() else None
-    found = run(problem, resume=before, **options)
+    stop = Stop(seconds=options.pop("budget"))
+    found = run(problem, resume=before, stop=stop, **options)
     show_result(found, plot, "name", "looked_at", "simulations", "seconds", "stopped", "notes")
     low, high = found.probability
     parts = {name: getattr(found, name)._asdict() for name in ("proved", "broken", "undecided")}

@@ -7,11 +7,14 @@ ValueError: confidence must lie between 0 and 1; got 95
 
 import math
 import operator
-from typing import SupportsIndex, TypeGuard
+from dataclasses import fields
+from typing import Any, SupportsIndex, TypeGuard, TypeVar, cast
 
 import numpy as np
 
 from verifai_jax.core.messages.text import is_control
+
+T = TypeVar("T")
 
 
 def is_number(value: object) -> TypeGuard[float]:
@@ -112,15 +115,31 @@ def check_count(
     return count
 
 
-def check_options(
-    budget: object, batch: object, seed: object, max_seconds: object, stop_after: object
-) -> None:
+def check_options(budget: object, batch: object, seed: object) -> None:
     """Refuse numbers out of range."""
-    for name, value in (("budget", budget), ("batch", batch), ("stop_after", stop_after)):
-        if name == "stop_after" and value is None:
-            continue
-        check_count(name, value)
+    check_count("budget", budget)
+    check_count("batch", batch)
     if not isinstance(seed, int | np.integer) or isinstance(seed, bool) or not 0 <= seed < 2**63:
         raise ValueError(f"seed must be an integer from 0 to 2**63 - 1; got {seed!r}")
-    if max_seconds is not None:
-        check_positive("max_seconds", max_seconds)
+
+
+def options_of(verb: str, kind: type[T], given: T | None, *used: str) -> T:
+    """Return the options that a value holds, or their defaults if it is None.
+
+    **Arguments:**
+    - `verb`: name of the public function, for the error message.
+    - `kind`: the frozen dataclass of the value, such as `Stop`.
+    - `used`: fields that the function uses; all when left out.
+    **Raises:** `TypeError` for another object; `ValueError` if another field is set.
+    """
+    if given is None:
+        return kind()
+    if not isinstance(given, kind):
+        raise TypeError(f"{verb} needs a vj.{kind.__name__}; got {given!r}")
+    for field in fields(cast(Any, kind)):
+        if used and field.name not in used and getattr(given, field.name) != field.default:
+            allowed = ", ".join(f"{name}=" for name in used)
+            raise ValueError(
+                f"{verb} does not use {field.name}= of vj.{kind.__name__}; it uses {allowed}"
+            )
+    return given

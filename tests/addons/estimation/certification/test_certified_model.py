@@ -60,7 +60,7 @@ def certified(memo):
             memo[key] = compute()
         return memo[key]
 
-    options = {"p": 0.1, "samples": 8, "budget": 8, "attack_simulations": 8}
+    options = {"p": 0.1, "certification": vj.Certification(8, budget=8, attack_simulations=8)}
     found = vj.certify(problem_of, [{"bias": 0.0}], remember=remember, **options)
     return found, len(computed)
 
@@ -85,7 +85,8 @@ def test_blocks_of_another_model_are_no_part_of_a_certificate(project):
 
 @pytest.mark.thorough
 def test_a_synthesis_records_its_model():
-    options = {"budget": 64, "environments": 2, "held_out": 8, "batch": 8, "progress": False}
+    options = {"budget": 64, "environments": 2, "batch": 8, "progress": False}
+    options["aim"] = vj.Aim(held_out=8)
     found = vj.synthesize(tuning(), "bias", **options)
     assert {"certified_spec.py", "gains.py"} <= names(found)
     assert found.sources["versions"]["verifai_jax"] == vj.__version__
@@ -93,7 +94,7 @@ def test_a_synthesis_records_its_model():
 
 @pytest.mark.thorough
 def test_a_repair_from_a_run_of_another_model_says_so(project):
-    options = {"budget": 64, "held_out": 8, "batch": 8, "progress": False}
+    options = {"budget": 64, "aim": vj.Aim(held_out=8), "batch": 8, "progress": False}
     run = vj.falsify(tuning(), "uniform", 16, progress=False, confirm=False)
     found = vj.repair(run, "bias", **options)
     assert {"certified_spec.py", "gains.py"} <= names(found)

@@ -59,7 +59,14 @@ def certificates(memo):
             memo[key] = compute()
         return memo[key]
 
-    return certify(problem_of, POLICIES, p=0.1, samples=128, seed=3, remember=remember)
+    return certify(
+        problem_of,
+        POLICIES,
+        p=0.1,
+        certification=vj.Certification(samples=128),
+        seed=3,
+        remember=remember,
+    )
 
 
 @pytest.mark.proves
@@ -80,10 +87,10 @@ def test_verdicts_of_known_rates(certificates):
 @pytest.mark.parametrize("traced", [True, False])
 def test_certificates_from_workers_are_the_same(traced):
     policies = POLICIES if traced else [lambda x, t=t: x - t for t in THRESHOLDS]
-    options = {"p": 0.1, "samples": 64, "seed": 3, "attack_simulations": 64}
+    options = {"p": 0.1, "seed": 3, "certification": vj.Certification(64, attack_simulations=64)}
     here = certify(problem_of, policies, **options)
     with ThreadPoolExecutor(2) as executor:
-        there = certify(problem_of, policies, **options, executor=executor)
+        there = certify(problem_of, policies, **options, run_on=vj.RunOn(executor=executor))
     assert here.safest == there.safest
     for one, other in zip(here.rows, there.rows, strict=True):
         assert (one.failures, one.simulations, one.rate) == (
@@ -120,7 +127,14 @@ def test_a_memo_holds_all_that_is_needed(certificates, memo):
     def recalled(key, compute):
         return memo[key]
 
-    again = certify(problem_of, POLICIES, p=0.1, samples=128, seed=3, remember=recalled)
+    again = certify(
+        problem_of,
+        POLICIES,
+        p=0.1,
+        certification=vj.Certification(samples=128),
+        seed=3,
+        remember=recalled,
+    )
     assert again.table.equals(certificates.table)
     # A part of it is enough: the others are simulated as they were.
     random = np.random.default_rng(0)
@@ -129,7 +143,14 @@ def test_a_memo_holds_all_that_is_needed(certificates, memo):
     def partly(key, compute):
         return some[key] if key in some else compute()
 
-    again = certify(problem_of, POLICIES, p=0.1, samples=128, seed=3, remember=partly)
+    again = certify(
+        problem_of,
+        POLICIES,
+        p=0.1,
+        certification=vj.Certification(samples=128),
+        seed=3,
+        remember=partly,
+    )
     assert again.table.equals(certificates.table)
 
 
@@ -137,8 +158,8 @@ def test_a_memo_holds_all_that_is_needed(certificates, memo):
 def test_order_company_and_devices_change_nothing(certificates):
     order = [2, 0, 4, 3, 1]
     other = certify(
-        problem_of, [POLICIES[i] for i in order], p=0.1, samples=128, seed=3,
-        devices=jax.devices()[:1],
+        problem_of, [POLICIES[i] for i in order], p=0.1,
+        certification=vj.Certification(samples=128), seed=3, devices=jax.devices()[:1],
     )  # fmt: skip
     table = other.table.assign(policy=order).sort_values("policy").reset_index(drop=True)
     assert table.equals(certificates.table)
@@ -149,8 +170,8 @@ def test_an_accelerator_works_on_all_blocks_at_once(certificates, monkeypatch):
     monkeypatch.setattr(programs, "_one_by_one", lambda devices: False)
     monkeypatch.setattr(programs, "MAX_BLOCKS", 4)
     other = certify(
-        lambda policy: problem_of(policy), POLICIES, p=0.1, samples=128, seed=3,
-        attack_simulations=0,
+        lambda policy: problem_of(policy), POLICIES, p=0.1, seed=3,
+        certification=vj.Certification(samples=128, attack_simulations=0),
     )  # fmt: skip
     columns = ["failures", "not_finite"]
     first = other.table[columns][other.table["simulations"] == 128]
@@ -210,7 +231,10 @@ def test_without_a_verdict_is_no_pass():
         return vj.Problem("nan", X, simulated(policy, 0.75), "always y <= 0")
 
     found = certify(
-        problem_of, [threshold(2.0), threshold(0.5)], samples=256, attack_simulations=0, p=0.1
+        problem_of,
+        [threshold(2.0), threshold(0.5)],
+        certification=vj.Certification(samples=256, attack_simulations=0),
+        p=0.1,
     )
     for row in found.rows:
         assert 256 * 0.15 < row.not_finite < row.simulations * 0.35
@@ -225,7 +249,12 @@ def test_only_what_the_constraint_accepts_is_simulated():
         space = vj.FeatureSpace(dict(X.domains), where=lambda f: f["x"] <= 0.5)
         return vj.Problem("half", space, simulated(policy), "always y <= 0")
 
-    found = certify(problem_of, [threshold(0.25), threshold(0.6)], samples=256, p=0.1)
+    found = certify(
+        problem_of,
+        [threshold(0.25), threshold(0.6)],
+        certification=vj.Certification(samples=256),
+        p=0.1,
+    )
     assert found[0].rate.low < 0.5 < found[0].rate.high
     assert found[1].failures == found[1].attack_failures == 0
     assert found.counterexamples(0)["x"].max() <= 0.5
@@ -267,7 +296,12 @@ def test_what_jax_cannot_trace_is_simulated_policy_by_policy():
 
 
 def test_what_a_black_box_raises_is_told():
-    found = certify(outside, [POLICIES[1]], p=0.05, samples=64, budget=64, attack_simulations=0)
+    found = certify(
+        outside,
+        [POLICIES[1]],
+        p=0.05,
+        certification=vj.Certification(samples=64, budget=64, attack_simulations=0),
+    )
     assert 0 < found[0].not_finite < 20
     (note,) = found.notes
     assert note.startswith("a simulation of policy 0 raised RuntimeError: out of the world (")
@@ -279,7 +313,14 @@ def test_interrupted_it_says_what_is_known():
         if text.startswith("sampling") and done >= 4 * 256 + 200:
             raise KeyboardInterrupt
 
-    found = certify(problem_of, POLICIES[:4], p=0.1, samples=128, seed=3, progress=progress)
+    found = certify(
+        problem_of,
+        POLICIES[:4],
+        p=0.1,
+        certification=vj.Certification(samples=128),
+        seed=3,
+        progress=progress,
+    )
     assert found.stopped == "interrupted"
     assert [row.simulations for row in found.rows] == [128, 128, 0, 0]
     assert found[3].verdict == "undecided"
@@ -291,7 +332,8 @@ def test_interrupted_it_says_what_is_known():
 def test_progress_counts_simulations():
     seen = []
     found = certify(
-        problem_of, POLICIES[:2], p=0.1, samples=128, attack_simulations=64,
+        problem_of, POLICIES[:2], p=0.1,
+        certification=vj.Certification(samples=128, attack_simulations=64),
         progress=lambda done, total, text: seen.append((done, total, text)),
     )  # fmt: skip
     assert [done for done, _, _ in seen] == sorted(done for done, _, _ in seen)
@@ -314,16 +356,16 @@ def test_it_reads_well(certificates):
     ("options", "told"),
     [
         ({"p": 0}, "p must lie between 0 and 1; got 0"),
-        ({"confidence": 95}, "confidence must lie between 0 and 1; got 95"),
-        ({"samples": 0}, "samples must be an integer of at least 1; got 0"),
         ({"seed": -1}, "seed must be an integer of at least 0; got -1"),
         (
-            {"attack_simulations": 1.5},
-            "attack_simulations must be an integer of at least 0; got 1.5",
+            {"certification": vj.Certification(budget=100)},
+            "5 policies with 512 samples each need a budget of at least 2560",
         ),
-        ({"budget": 100}, "5 policies with 512 samples each need a budget of at least 2560"),
-        ({"attack": "gradient"}, "attack 'gradient' follows gradients"),
-        ({"attack": "portfolio"}, "use one of uniform, halton"),
+        (
+            {"certification": vj.Certification(attack="gradient")},
+            "attack 'gradient' follows gradients",
+        ),
+        ({"certification": vj.Certification(attack="portfolio")}, "use one of uniform, halton"),
         ({"tie": 2}, "tie must be in \\[0, 1\\); got 2"),
     ],
 )
@@ -333,10 +375,10 @@ def test_what_cannot_be_certified_is_refused(options, told):
 
 
 def test_misspelt_names_get_the_nearest():
-    with pytest.raises(UnknownNameError, match="did you mean 'confidence'"):
-        certify(problem_of, POLICIES, confidance=0.9)
+    with pytest.raises(UnknownNameError, match="did you mean 'certification'"):
+        certify(problem_of, POLICIES, certificaton=0.9)
     with pytest.raises(UnknownNameError, match="did you mean 'cross_entropy'"):
-        certify(problem_of, POLICIES, attack="cross_entopy")
+        certify(problem_of, POLICIES, certification=vj.Certification(attack="cross_entopy"))
 
 
 def test_problems_that_do_not_fit():

@@ -82,8 +82,7 @@ def rings(name="rings", **options):
 SMALL = {
     "initial": 64,
     "added": 24,
-    "steps": 5 * STEPS,
-    "further_steps": 5 * STEPS,
+    "steps": (5 * STEPS, 5 * STEPS),
     "budget": 256,
     "test": 512,
     "hard": 64,

@@ -76,7 +76,7 @@ TASK = vj.SupervisedTask(
 
 @pytest.mark.slow
 def test_images_are_added_and_shown(tmp_path):
-    options = {"initial": 128, "added": 32, "steps": 300, "further_steps": 50}
+    options = {"initial": 128, "added": 32, "steps": (300, 50)}
     result = vj.augment(
         TASK, ("none", "standard", "counterexamples"), seeds=2, test=256, hard=0, budget=512,
         **options,

@@ -160,7 +160,7 @@ def test_a_search_that_is_interrupted_leaves_no_table(tmp_path, monkeypatch):
 
     search = study.falsify
     monkeypatch.setattr(study, "falsify", cut)
-    options = {**SMALL, "steps": STEPS, "further_steps": STEPS, "hard": 0}
+    options = {**SMALL, "steps": (STEPS, STEPS), "hard": 0}
     result = vj.augment(TASK, "counterexamples", seeds=1, folder=tmp_path, **options)
     assert not result.complete
     assert list(result.table["arm"]) == ["base"]
@@ -187,7 +187,7 @@ def test_pictures_are_drawn_and_written(whole, tmp_path):
 
 def test_a_base_that_is_never_wrong():
     right = rings(wrongness=lambda logit, label: jnp.float32(-1.0) + 0.0 * logit)
-    options = {**SMALL, "steps": STEPS, "further_steps": STEPS}
+    options = {**SMALL, "steps": (STEPS, STEPS)}
     arms = ("none", "counterexamples", "table_random", "table_closest", "table_pca", "rules_kept")
     result = vj.augment(right, arms, seeds=1, **options)
     assert (result.table["added"] == 0).all()
@@ -223,7 +223,7 @@ def test_training_that_diverges_is_told():
 
 @pytest.mark.parametrize("search", ["cross_entropy", "gradient"])
 def test_any_search_fills_the_table(search):
-    options = {**SMALL, "steps": STEPS, "further_steps": STEPS, "budget": 64}
+    options = {**SMALL, "steps": (STEPS, STEPS), "budget": 64}
     result = vj.augment(rings(), "counterexamples", seeds=1, search=search, **options)
     table = result.error_tables[0]
     assert len(table) == 64

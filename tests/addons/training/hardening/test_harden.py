@@ -34,8 +34,8 @@ PPO_SMALL = PPO(
     learning_rate=0.03, hidden=(4,), value_hidden=(4,), environments=4, horizon=16, minibatches=1,
 )  # fmt: skip
 SMALL = {
-    "algorithm": PPO_SMALL, "rounds": 2, "steps": 256, "further_steps": 128, "samples": 64,
-    "attack_simulations": 64, "added": 32, "episodes": 16, "progress": False,
+    "rounds": 2, "steps": 256, "further": vj.FurtherTraining(steps=128, added=32), "episodes": 16,
+    "certification": vj.Certification(samples=64, attack_simulations=64), "progress": False,
 }  # fmt: skip
 
 
@@ -74,7 +74,9 @@ def whole():
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(_harden, "certify", watched)
-        return harden(TASK, staying_below(1.5), baseline=True, seed=4, **SMALL), certificates
+        return harden(
+            Trainer(TASK, PPO_SMALL), staying_below(1.5), baseline=True, seed=4, **SMALL
+        ), certificates
 
 
 @pytest.mark.slow
@@ -133,7 +135,7 @@ def test_killed_and_called_again_it_gives_the_same(whole, tmp_path, monkeypatch)
     options = {"baseline": True, "seed": 4, "folder": tmp_path, **SMALL}
 
     def again():
-        return harden(TASK, staying_below(1.5), **options)
+        return harden(Trainer(TASK, PPO_SMALL), staying_below(1.5), **options)
 
     collect, certify = _harden.collect, _harden.certify
     calls = []
@@ -166,7 +168,7 @@ def test_killed_and_called_again_it_gives_the_same(whole, tmp_path, monkeypatch)
     finished = again()
     pd.testing.assert_frame_equal(numbers(finished)[0], numbers(whole[0])[0])
     with pytest.raises(ValueError, match="seed"):
-        harden(TASK, staying_below(1.5), **{**options, "seed": 5})
+        harden(Trainer(TASK, PPO_SMALL), staying_below(1.5), **{**options, "seed": 5})
 
 
 @pytest.mark.thorough
@@ -194,7 +196,7 @@ def test_a_function_that_trains_gets_where_its_episodes_begin(tmp_path):
     trainer = Trainer(
         by_starts, example=lambda observation: jnp.zeros(1), observation=np.zeros(1), workers=1
     )
-    options = {**SMALL, "algorithm": None, "rounds": 1, "folder": tmp_path}
+    options = {**SMALL, "rounds": 1, "folder": tmp_path}
     result = harden(trainer, staying_below(1.5), **options)
     own = result.table.set_index("round")
     # As many of its episodes begin near failures as the shares say, and it learns of them.
@@ -209,7 +211,7 @@ def test_a_function_that_trains_gets_where_its_episodes_begin(tmp_path):
 
 @pytest.mark.thorough
 def test_where_nothing_fails_it_is_certified_at_once():
-    result = harden(TASK, staying_below(100.0), p=0.1, **SMALL)
+    result = harden(Trainer(TASK, PPO_SMALL), staying_below(100.0), p=0.1, **SMALL)
     assert (result.stopped, result.safe) == ("certified", True)
     assert len(result.table) == 1
     assert result.chosen == {"hardened": 0}
@@ -221,7 +223,7 @@ def test_where_nothing_fails_it_is_certified_at_once():
 
 @pytest.mark.slow
 def test_where_everything_fails_the_budget_ends_it():
-    result = harden(TASK, staying_below(-100.0), **{**SMALL, "rounds": 1})
+    result = harden(Trainer(TASK, PPO_SMALL), staying_below(-100.0), **{**SMALL, "rounds": 1})
     assert (result.stopped, result.safe, len(result.table)) == ("budget", False, 2)
     assert list(result.table["failure_rate"]) == [1.0, 1.0]
     assert set(result.added["source"]) == {"sample", "counterexample", "shrunk"}  # No rule.
@@ -238,7 +240,5 @@ def test_what_cannot_be_hardened_is_refused_before_anything_trains():
         harden(train, staying_below(1.5))
     with pytest.raises(HardeningError, match="give train an argument starts, a list of features"):
         harden(Trainer(train, example=lambda observation: jnp.zeros(1)), staying_below(1.5))
-    with pytest.raises(ValueError, match="shares of all episodes"):
-        harden(TASK, staying_below(1.5), own=0.6, failing=0.6, algorithm=PPO_SMALL)
     with pytest.raises(ValueError, match="rounds"):
-        harden(TASK, staying_below(1.5), rounds=0, algorithm=PPO_SMALL)
+        harden(Trainer(TASK, PPO_SMALL), staying_below(1.5), rounds=0)

@@ -122,11 +122,9 @@ def drifting(space=None, **options):
     return Study("drifting", space, made, closed_loop, **{"checkpoints": (32, 64), **options})
 
 
-def quick_certificates(
-    problem_of, policies, *, p, confidence, samples, seed, remember, attack, **_
-):
+def quick_certificates(problem_of, policies, *, p, certification, seed, remember, **_):
     """In place of the certification: the closed loop on a grid, in NumPy, policy by policy."""
-    found = []
+    found, samples, confidence = [], certification.samples, certification.confidence
     for policy in policies:
         layers = [(np.asarray(w), np.asarray(b)) for w, b in policy.layers]
 

@@ -100,5 +100,10 @@ def sweep(name, folder):
         checkpoints=(steps // 2,),
     )  # fmt: skip
     return vj.sweep(
-        study, "halton", 2, samples=64, attack_simulations=0, folder=folder, progress=False
+        study,
+        "halton",
+        2,
+        certification=vj.Certification(samples=64, attack_simulations=0),
+        folder=folder,
+        progress=False,
     )

@@ -72,8 +72,8 @@ def study(function, **options):
 
 def sweep(function, folder=None, **options):
     return vj.sweep(
-        study(function), "halton", 2, samples=64, attack_simulations=0, folder=folder,
-        progress=False, **options,
+        study(function), "halton", 2, folder=folder, progress=False,
+        certification=vj.Certification(samples=64, attack_simulations=0), **options,
     )  # fmt: skip
 
 

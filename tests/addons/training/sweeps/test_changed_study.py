@@ -17,7 +17,8 @@ from verifai_jax.core.user_code.sources import Source
 @pytest.mark.thorough
 def test_finished_work_of_another_study_is_not_gone_on_with(tmp_path, monkeypatch):
     monkeypatch.setattr(driver, "certify", quick_certificates)
-    study, options = drifting(), {"configurations": 1, "samples": 8, "folder": tmp_path / "work"}
+    study, options = drifting(), {"configurations": 1, "folder": tmp_path / "work"}
+    options["certification"] = vj.Certification(samples=8)
     whole = sweep(study, **options)
     (part,) = whole.record.sources
     assert any(name.endswith("drifting.py") for name, *_ in part["files"])

@@ -18,7 +18,13 @@ def returns(nominal):
         Trainer(Point(), Drift(), steps=64, nominal=nominal),
         closed_loop,
     )
-    table = sweep(study, "grid", 2, samples=8, attack_simulations=0, progress=False).table
+    table = sweep(
+        study,
+        "grid",
+        2,
+        certification=vj.Certification(samples=8, attack_simulations=0),
+        progress=False,
+    ).table
     return table["nominal_return"].to_numpy()
 
 

@@ -54,7 +54,9 @@ def same_policies(one, other):
 def whole():
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(driver, "certify", quick_certificates)
-        return sweep(drifting(seeds=2), configurations=5, samples=64)
+        return sweep(
+            drifting(seeds=2), configurations=5, certification=vj.Certification(samples=64)
+        )
 
 
 @pytest.mark.thorough
@@ -79,8 +81,8 @@ def test_callbacks_see_each_policy_twice_also_from_the_cache(tmp_path):
     calls = [[], []]
     for seen in calls:
         result = sweep(
-            drifting(), configurations=2, samples=64, folder=tmp_path / "sweep",
-            callbacks=[lambda *call, seen=seen: seen.append(call)],
+            drifting(), configurations=2, certification=vj.Certification(samples=64),
+            folder=tmp_path / "sweep", callbacks=[lambda *call, seen=seen: seen.append(call)],
         )  # fmt: skip
     assert calls[0] == calls[1]
     table = result.record.columns
@@ -113,11 +115,12 @@ def test_rows_are_what_a_training_of_their_own_gives(whole):
 @pytest.mark.thorough
 @pytest.mark.parametrize("halving", [None, Halving(2.0)])
 def test_trainings_on_workers_give_the_same_table(halving):
-    options = {"configurations": 4, "samples": 32, "halving": halving}
+    options = {"configurations": 4, "halving": halving}
+    options["certification"] = vj.Certification(samples=32)
     study = drifting({"rate": vj.LogUniform(0.01, 1.0), "limit": vj.Box(0.05, 9.0)}, seeds=2)
     here = sweep(study, **options)
     with ThreadPoolExecutor(2) as executor:
-        there = sweep(study, **options, executor=executor)
+        there = sweep(study, **options, run_on=vj.RunOn(executor=executor))
     same_tables(here, there)
 
 
@@ -125,7 +128,7 @@ def test_trainings_on_workers_give_the_same_table(halving):
 def test_nominal_returns_are_those_of_the_task_itself():
     # The reset is not random: one episode says all.
     study = drifting({"rate": vj.LogUniform(0.01, 1.0), "reward_scale": vj.Box(1.0, 9.0)})
-    found = sweep(study, configurations=3, samples=8)
+    found = sweep(study, configurations=3, certification=vj.Certification(samples=8))
     for row, policy in enumerate(found.record.policies):
         expected = float(evaluate(Point(), policy, episodes=1)[0])
         assert found.record.columns["nominal_return"][row] == pytest.approx(expected, rel=1e-6)
@@ -143,7 +146,9 @@ def test_returns_do_not_depend_on_company(whole):
 
 def test_what_cannot_train_or_explodes_is_a_row():
     space = {"limit": vj.Categorical(0.3, 100.0), "rate": vj.Categorical(0.1, 0.5)}
-    found = sweep(drifting(space), search="grid", configurations=4, samples=16)
+    found = sweep(
+        drifting(space), search="grid", configurations=4, certification=vj.Certification(samples=16)
+    )
     table = found.table
     assert len(table) == 1 + 3 * 3
     refused = table["status"] == "error: Drift's rate must be less than limit = 0.3; got 0.5"
@@ -166,7 +171,7 @@ def test_a_training_that_raises_is_a_row(monkeypatch):
 
     monkeypatch.setattr(Drift, "step", step)
     study = drifting({"environments": vj.Categorical(4, 8), "rate": vj.Box(0.1, 0.2)}, seeds=2)
-    table = sweep(study, configurations=4, samples=8).table
+    table = sweep(study, configurations=4, certification=vj.Certification(samples=8)).table
     assert set(table["status"]) == {"trained", "error: RuntimeError: no room"}
     assert (table["status"] == "trained").sum() == 2 * 2 * 3
 
@@ -179,7 +184,7 @@ def test_algorithms_and_widths_in_one_sweep():
         "rate": vj.Box(0.05, 0.06),
     }
     study = drifting(space, algorithms={"slow": Drift(), "fast": Drift(noise=0.0)}, checkpoints=())
-    found = sweep(study, configurations=4, samples=8)
+    found = sweep(study, configurations=4, certification=vj.Certification(samples=8))
     assert len(found.table) == 4
     for row, policy in zip(found.table.itertuples(), found.record.policies, strict=True):
         assert policy.layers[0][0].shape == (2, row.width)
@@ -191,7 +196,7 @@ def test_algorithms_and_widths_in_one_sweep():
 def test_steps_are_a_hyper_parameter_too():
     space = {"steps": vj.Categorical(64, 96), "rate": vj.Box(0.05, 0.06)}
     study = drifting(space, checkpoints=(32, 80))
-    found = sweep(study, configurations=2, samples=8)
+    found = sweep(study, configurations=2, certification=vj.Certification(samples=8))
     assert list(found.record.columns)[:4] == ["configuration", "seed", "steps", "rate"]
     assert found.record.hyperparameters == ("steps", "rate")
     of_one = found.table.groupby("configuration")["steps"].apply(list)
@@ -199,7 +204,11 @@ def test_steps_are_a_hyper_parameter_too():
 
 
 def test_a_curve_is_judged():
-    found = sweep(drifting(curve="always return >= 9.8"), configurations=3, samples=8)
+    found = sweep(
+        drifting(curve="always return >= 9.8"),
+        configurations=3,
+        certification=vj.Certification(samples=8),
+    )
     table = found.table
     for row in table.itertuples():
         curve = found.record.curves[row.configuration, 0]
@@ -211,7 +220,12 @@ def test_a_curve_is_judged():
 
 def test_configurations_are_distinct():
     space = {"rate": vj.Categorical(0.1, 0.2, 0.3), "noise": vj.Categorical(0.0, 0.1)}
-    found = sweep(drifting(space, checkpoints=()), search="uniform", configurations=50, samples=8)
+    found = sweep(
+        drifting(space, checkpoints=()),
+        search="uniform",
+        configurations=50,
+        certification=vj.Certification(samples=8),
+    )
     assert len(found.table) == 6
     assert not found.table[["rate", "noise"]].duplicated().any()
 
@@ -238,7 +252,7 @@ CASES = {
 @pytest.mark.thorough
 @pytest.mark.parametrize("case", CASES)
 def test_interrupted_and_resumed_it_is_the_same_sweep(case, monkeypatch, tmp_path):
-    study, how = drifting(), {"samples": 64, **CASES[case]}
+    study, how = drifting(), {"certification": vj.Certification(samples=64), **CASES[case]}
     through = sweep(study, folder=tmp_path / "through", **how)
     kept = Cache(tmp_path / "through")
     pieces = len(kept.names())
@@ -264,9 +278,12 @@ def test_interrupted_and_resumed_it_is_the_same_sweep(case, monkeypatch, tmp_pat
 
 
 def test_a_store_of_another_sweep_says_what_differs(tmp_path):
-    sweep(drifting(), configurations=2, samples=8, folder=tmp_path)
+    sweep(drifting(), configurations=2, certification=vj.Certification(samples=8), folder=tmp_path)
     for other, how, told in (
-        (drifting(), {"samples": 16}, "options.samples is 16, in the cache 8"),
+        (
+            drifting(), {"certification": vj.Certification(16)},
+            "options.samples is 16, in the cache 8",
+        ),
         (drifting(), {"search": "sobol"}, "options.search.name is sobol, in the cache halton"),
         (drifting(steps=256), {}, "steps is 256, in the cache 128"),
         (
@@ -279,16 +296,26 @@ def test_a_store_of_another_sweep_says_what_differs(tmp_path):
         ),
     ):  # fmt: skip
         with pytest.raises(CacheError, match=f"holds a different sweep: {told}"):
-            sweep(other, **{"configurations": 2, "samples": 8, **how}, folder=tmp_path)
+            sweep(
+                other,
+                **{"configurations": 2, "certification": vj.Certification(8), **how},
+                folder=tmp_path,
+            )
     # More of the same is the same sweep.
-    more = sweep(drifting(), configurations=3, samples=8, folder=tmp_path)
-    same_tables(more, sweep(drifting(), configurations=3, samples=8))
+    more = sweep(
+        drifting(), configurations=3, certification=vj.Certification(samples=8), folder=tmp_path
+    )
+    same_tables(
+        more, sweep(drifting(), configurations=3, certification=vj.Certification(samples=8))
+    )
 
 
 def test_halving_keeps_the_best_by_return():
     study = drifting()
-    all_of_them = sweep(study, configurations=7, samples=8).table
-    table = sweep(study, configurations=7, samples=8, halving=Halving(2.0)).table
+    all_of_them = sweep(study, configurations=7, certification=vj.Certification(samples=8)).table
+    table = sweep(
+        study, configurations=7, certification=vj.Certification(samples=8), halving=Halving(2.0)
+    ).table
     alive = set(range(7))
     for steps, after in itertools.pairwise((32, 64, 128)):
         here = all_of_them[all_of_them["steps"] == steps].set_index("configuration")
@@ -316,7 +343,13 @@ def test_a_search_is_told_how_bad_the_policies_are(monkeypatch):
 
     monkeypatch.setattr(SearchProposer, "observe", record)
     space = {"rate": vj.Box(0.01, 0.45), "limit": vj.Categorical(0.5, 100.0)}
-    found = sweep(drifting(space), search="mutation", configurations=8, batch=4, samples=64)
+    found = sweep(
+        drifting(space),
+        search="mutation",
+        configurations=8,
+        batch=4,
+        certification=vj.Certification(samples=64),
+    )
     last = found.table[found.table["steps"] == 128]
     assert len(told) == len(last) == 8
     for bad, row in zip(told, last.itertuples(), strict=True):
@@ -355,7 +388,7 @@ def test_optuna_proposes_and_is_told(tmp_path):
         "reward_scale": vj.Categorical(1.0, 2.0),
     }
     study = drifting(space, checkpoints=())
-    how = {"configurations": 14, "batch": 3, "samples": 16}
+    how = {"configurations": 14, "batch": 3, "certification": vj.Certification(16)}
     one = sweep(study, search="optuna:tpe", folder=tmp_path, **how)
     assert len(one.table) == 14
     assert one.table["limit"].isin(range(50, 61)).all()
@@ -381,14 +414,24 @@ def test_without_optuna_it_says_how_to_get_it(monkeypatch):
 
 
 def test_out_of_time_is_what_there_is():
-    found = sweep(drifting(), configurations=4, samples=8, max_seconds=1e-6)
+    found = sweep(
+        drifting(),
+        configurations=4,
+        certification=vj.Certification(samples=8),
+        stop=vj.Stop(seconds=1e-6),
+    )
     assert not found.record.complete
     assert len(found.table) in range(1, 4 * 3)
 
 
 def test_what_was_trained_in_time_is_certified(monkeypatch):
     monkeypatch.setattr(driver, "FOR_TRAINING", 1e-9)
-    found = sweep(drifting(), configurations=4, samples=8, max_seconds=1000.0)
+    found = sweep(
+        drifting(),
+        configurations=4,
+        certification=vj.Certification(samples=8),
+        stop=vj.Stop(seconds=1000.0),
+    )
     assert not found.record.complete
     assert len(found.table) in range(1, 4 * 3)
     assert (found.table["simulations"] == 8).all()
@@ -399,8 +442,15 @@ def test_a_budget_is_for_all_policies():
     study = drifting(seeds=2)
     for how, least in (({}, 7 * 3 * 2 * 8), ({"halving": Halving(2)}, (7 + 4 + 2) * 2 * 8)):
         with pytest.raises(ValueError, match=f"need a budget of at least {least}; got {least - 1}"):
-            sweep(study, configurations=7, samples=8, budget=least - 1, **how)
-        found = sweep(study, configurations=7, samples=8, budget=least, **how)
+            sweep(
+                study,
+                configurations=7,
+                certification=vj.Certification(samples=8, budget=least - 1),
+                **how,
+            )
+        found = sweep(
+            study, configurations=7, certification=vj.Certification(samples=8, budget=least), **how
+        )
         assert len(found.table) * 8 == least
 
 
@@ -408,16 +458,23 @@ def test_options_are_refused_first(monkeypatch):
     monkeypatch.setattr(driver, "TrainingRuns", None)
     for how, error, told in (
         ({"configurations": 0}, ValueError, "configurations must be an integer of at least 1"),
-        ({"confidence": 1.0}, ValueError, "confidence must lie between 0 and 1"),
-        ({"max_seconds": 0}, ValueError, "max_seconds must be positive"),
+        ({"stop": vj.Stop(after=1)}, ValueError, "sweep does not use after= of vj.Stop"),
         ({"search": "halten"}, UnknownNameError, "did you mean 'halton'"),
         ({"search": "gradient"}, ValueError, "needs gradients, which trainings do not have"),
         ({"search": 3}, TypeError, "search must be a name, a Search or an OptunaSampler; got 3"),
         ({"halving": 3}, TypeError, "halving must be a Halving; got 3"),
-        ({"sampels": 3}, UnknownNameError, "did you mean 'samples'"),
+        ({"certificaton": 3}, UnknownNameError, "did you mean 'certification'"),
         ({"seed": -1}, ValueError, "seed must be an integer of at least 0; got -1"),
-        ({"attack": "cross_entrpy"}, UnknownNameError, "did you mean 'cross_entropy'"),
-        ({"attack": "gradient"}, ValueError, "follows gradients"),
+        (
+            {"certification": vj.Certification(attack="cross_entrpy")},
+            UnknownNameError,
+            "did you mean 'cross_entropy'",
+        ),
+        (
+            {"certification": vj.Certification(attack="gradient")},
+            ValueError,
+            "follows gradients",
+        ),
     ):
         with unchecked(), pytest.raises(error, match=told):
             sweep(drifting(), **how)

@@ -25,7 +25,10 @@ from verifai_jax.addons.training.sweeps.halving import Halving
 study = drifting({"rate": vj.LogUniform(0.01, 0.3), "width": vj.Categorical(3, 4)}, seeds=2)
 how = {"halving": {"halving": Halving(2)}, "learning": {"search": "cross_entropy"}, "plain": {}}
 print("begins", flush=True)
-found = sweep(study, configurations=12, samples=64, folder=sys.argv[1], **how[sys.argv[2]])
+few = vj.Certification(samples=64)
+found = sweep(
+    study, configurations=12, certification=few, folder=sys.argv[1], **how[sys.argv[2]]
+)
 assert found.record.complete
 columns = {n: c for n, c in found.record.columns.items() if n != "training_seconds"}
 policies = [leaf for policy in found.record.policies for leaf in sum(policy.layers, ())]

@@ -24,8 +24,10 @@ def test_a_whole_sweep(tmp_path):
         checkpoints=(64,),
         curve="eventually return >= 15",
     )
-    found = vj.sweep(study, configurations=5, samples=64, folder=tmp_path)
-    again = vj.sweep(study, configurations=5, samples=64)
+    found = vj.sweep(
+        study, configurations=5, certification=vj.Certification(samples=64), folder=tmp_path
+    )
+    again = vj.sweep(study, configurations=5, certification=vj.Certification(samples=64))
     assert found.table.drop(columns="training_seconds").equals(
         again.table.drop(columns="training_seconds")
     )
@@ -42,7 +44,11 @@ def test_a_whole_sweep(tmp_path):
     ):
         np.testing.assert_array_equal(one, other)
     certificates = vj.certify(
-        balance_with, [found.policy(i) for i in range(10)], p=0.01, samples=64, seed=0
+        balance_with,
+        [found.policy(i) for i in range(10)],
+        p=0.01,
+        certification=vj.Certification(samples=64),
+        seed=0,
     )
     assert found.table["verdict"].tolist() == [c.verdict for c in certificates.rows]
     assert found.table["failures"].tolist() == [

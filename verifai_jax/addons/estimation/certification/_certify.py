@@ -26,20 +26,20 @@ from verifai_jax.addons.estimation.certification.attack import (
     check_attack,
 )
 from verifai_jax.addons.estimation.certification.blocks import Blocks, Remember
+from verifai_jax.addons.estimation.certification.certification import Certification
 from verifai_jax.addons.estimation.certification.result import Certificate, Certificates
 from verifai_jax.core.compute.compilation import power_of_two
 from verifai_jax.core.compute.devices import enable_compile_cache
-from verifai_jax.core.compute.executors import Executor
 from verifai_jax.core.display.progress import say_done, shows_progress
-from verifai_jax.core.messages.checks import check_count, check_fraction
+from verifai_jax.core.messages.checks import check_count, check_fraction, options_of
 from verifai_jax.core.messages.errors import suggests_options
 from verifai_jax.evaluation.confirmations import Repetitions, came_otherwise
 from verifai_jax.evaluation.confirmer import LIMIT, MORE, REPEATED, SHARE_REPEATED
+from verifai_jax.evaluation.run_on import RunOn
 from verifai_jax.features import FeatureSpace
 from verifai_jax.problem.dependence import depends_on_key
 from verifai_jax.problem.problem import Problem
 from verifai_jax.problem.silent_mistakes import formula_notes
-from verifai_jax.search import Search
 from verifai_jax.statistics.confidence_sequences import simultaneous_interval, verdict
 
 LANES = 64
@@ -60,17 +60,13 @@ def certify(
     policies: Sequence[Any],
     *,
     p: float = 0.01,
-    confidence: float = 0.95,
-    samples: int = 512,
+    certification: Certification | None = None,
     seed: int = 0,
-    budget: int | None = None,
-    attack: str | Search = "cross_entropy",
-    attack_simulations: int = 256,
     tie: float | None = None,
     remember: Remember | None = None,
     progress: ProgressReport | bool | None = None,
     devices: Sequence[Any] | None = None,
-    executor: Executor | None = None,
+    run_on: RunOn | None = None,
 ) -> Certificates:
     """Attack all policies, then bound the failure probability of each from fresh samples.
 
@@ -80,15 +76,9 @@ def certify(
       each policy is compiled by itself.
     - `policies`: `rl.Policy` objects, or other pytrees of numbers.
     - `p`: the failure probability below which a policy is called safe.
-    - `confidence`: the probability that all intervals hold at once.
-    - `samples`: minimum number of samples of each policy, rounded up to whole blocks of 64 (smaller
-      blocks for fewer than 64 samples). 32 are enough if only the safest policy is wanted.
+    - `certification`: the attack on each policy and the samples of its certificate.
     - `seed`: the seed of samples and search. All policies get the same samples, which differ from
       those of a training with this seed.
-    - `budget`: samples of all policies together; four times the minimum when left out. Samples
-      beyond the minimum go to policies whose verdict is open, and to those that may be the safest.
-    - `attack`: the search that looks for failures first; its failures are not part of any rate.
-    - `attack_simulations`: simulations of each attack, rounded up to whole blocks; 0 for no attack.
     - `tie`: failure rates that differ by less than this count as equally safe. The default is `p /
       10` or less, such that resolving it takes about as many samples as the minimum for all
       policies together.
@@ -99,7 +89,7 @@ def certify(
       once a minute elsewhere. A function `(done, total, text)` is called instead, with the
       simulations so far; `total` may not be reached.
     - `devices`: JAX devices; all of this process when left out.
-    - `executor`: an executor whose workers simulate, as in `falsify`, with the same result.
+    - `run_on`: the workers of the simulations; with them the result is the same.
 
     Ctrl-C returns the certificates from finished samples. The same seed gives the same
     certificates, bit for bit on one machine, whatever the order of the policies, the number of
@@ -117,7 +107,9 @@ def certify(
             f"policies; got {type(problem_of).__name__} and {type(policies).__name__}"
         )
     policies = list(policies)
-    budget = _check(policies, p, confidence, samples, seed, budget, attack_simulations, tie)
+    certified = options_of("certify", Certification, certification)
+    samples, confidence = certified.samples, certified.confidence
+    budget = _check(policies, p, certified, seed, tie)
     lanes = LANES if samples >= LANES else max(8, power_of_two(samples))
     enable_compile_cache()  # Before the search compiles, too.
     blocks = Blocks(
@@ -127,10 +119,10 @@ def certify(
         lanes=lanes,
         remember=remember,
         devices=devices,
-        executor=executor,
+        executor=options_of("certify", RunOn, run_on, "executor").executor,
     )
-    attacker = check_attack(blocks.problem, attack)
-    rounds = -(-attack_simulations // lanes)
+    attacker = check_attack(blocks.problem, certified.attack)
+    rounds = -(-certified.attack_simulations // lanes)
     if tie is None:
         tie = min(p / 10, SETTLED / (len(policies) * samples))
     allocation = Allocation(p, confidence, samples, budget, lanes, tie)
@@ -309,37 +301,17 @@ class _Report:
 
 
 def _check(
-    policies: list[Any],
-    p: float,
-    confidence: float,
-    samples: int,
-    seed: int,
-    budget: int | None,
-    attack_simulations: int,
-    tie: float | None,
+    policies: list[Any], p: float, certified: Certification, seed: int, tie: float | None
 ) -> int:
     """Refuse values out of range, and return the budget."""
     if not policies:
         raise ValueError("there is no policy to certify")
-    for name, value in (("p", p), ("confidence", confidence)):
-        check_fraction(name, value)
-    for name, value, minimum in (
-        ("samples", samples, 1),
-        ("seed", seed, 0),
-        ("attack_simulations", attack_simulations, 0),
-    ):
-        check_count(name, value, minimum)
+    check_fraction("p", p)
+    check_count("seed", seed, 0)
     if tie is not None:
         check_fraction("tie", tie, zero=True)
-    minimum = len(policies) * samples
-    if budget is None:
-        return 4 * minimum
-    if budget < minimum:
-        raise ValueError(
-            f"{len(policies)} policies with {samples} samples each need a budget of at least "
-            f"{minimum}; got {budget!r}"
-        )
-    return budget
+    certified.check_budget(len(policies))
+    return certified.budget or 4 * len(policies) * certified.samples
 
 
 def repeat_failures(

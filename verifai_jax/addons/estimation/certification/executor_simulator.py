@@ -59,7 +59,6 @@ class ExecutorSimulator:
         dim: int,
         executor: executors.Executor,
     ) -> None:
-        executors.check_executor(executor)
         self.lanes, self.messages = lanes, dict[int, str]()
         self._shipment, self._policies, self._structure = shipment, policies, structure
         self._dim, self._executor = dim, executor

@@ -5,14 +5,14 @@ from typing import Any
 
 import click
 
-from verifai_jax.cli.arguments import CLUSTER, ERRORS, MAX_SECONDS, REPORT, SEED, TARGET, on_cluster
+from verifai_jax.cli import arguments
 from verifai_jax.cli.gates import Gate, check_gate, fail_on
 from verifai_jax.cli.going_on import kept_until_done
 from verifai_jax.cli.json_output import as_plain, command, give_result, say
 
 
 @command()
-@TARGET
+@arguments.TARGET
 @click.argument("candidates", nargs=-1, required=True)
 @click.option(
     "--margin",
@@ -29,11 +29,11 @@ from verifai_jax.cli.json_output import as_plain, command, give_result, say
     help="Confidence of all verdicts together.",
 )
 @click.option("--budget", type=int, default=100_000, show_default=True, help="Maximum simulations.")
-@SEED
-@MAX_SECONDS
-@CLUSTER
-@REPORT
-@ERRORS
+@arguments.SEED
+@arguments.MAX_SECONDS
+@arguments.CLUSTER
+@arguments.REPORT
+@arguments.ERRORS
 @fail_on(regression="if a candidate fails more often, by more than the margin")
 def compare(
     target: str,
@@ -52,9 +52,9 @@ def compare(
     from verifai_jax import compare as run_compare
     from verifai_jax.addons.estimation.revisions import load_at_revision
 
-    with kept_until_done() as kept, on_cluster(cluster) as executor:
+    with kept_until_done() as kept, arguments.on_cluster(cluster) as executor:
         named = {name: name for name in candidates}
-        result = run_compare(target, named, executor=executor, **options)
+        result = run_compare(target, named, **arguments.values_of(options, executor=executor))
         say(result)
         kept.stopped(result.stopped)
     if errors is not None:

@@ -69,7 +69,7 @@ def estimate(
         p0 = fail_on.bound
     problem = arguments.load_problem(target, only)
     with kept_until_done() as kept, arguments.on_cluster(cluster) as executor:
-        found = run(problem, p0=p0, executor=executor, **options)
+        found = run(problem, p0=p0, **arguments.values_of(options, executor=executor))
         show_result(found, plot)
         kept.stopped(found.stopped)
     budget = None

@@ -31,6 +31,6 @@ def modes(target: str, only: str | None, plot: Path | None, **options: Any) -> N
 
     problem = arguments.load_problem(target, only)
     with kept_until_done() as kept:
-        found = run(problem, **options)
+        found = run(problem, **arguments.values_of(options))
         show_result(found, plot)
         kept.stopped(found.stopped)

@@ -44,7 +44,7 @@ def trials(
     TRIALS is a CSV or Parquet file with a column for each feature, and `failed` (yes or no) or
     `recording` (a file of signals). Without it, --sheet plans the first trials.
     """
-    from verifai_jax import real_trials, trial_protocol
+    from verifai_jax import RunOn, real_trials, trial_protocol
 
     problem = arguments.load_problem(target)
     if trials is None:
@@ -54,7 +54,7 @@ def trials(
         say(f"sheet {sheet}, to fill in {sheet.with_suffix('.csv')}")
         return
     with kept_until_done(), arguments.on_cluster(cluster) as executor:
-        found = real_trials(problem, trials, seed=seed, executor=executor, **options)
+        found = real_trials(problem, trials, seed=seed, run_on=RunOn(executor=executor), **options)
     say(found)
     chosen = found.next_trials(count or 10, seed=seed) if count or sheet else None
     if chosen is not None:

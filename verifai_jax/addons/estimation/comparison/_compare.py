@@ -25,14 +25,16 @@ from verifai_jax.core.compute.executors import Executor
 from verifai_jax.core.compute.keys import run_keys
 from verifai_jax.core.compute.precision import reproducible_settings
 from verifai_jax.core.display.progress import shows_progress
-from verifai_jax.core.messages.checks import check_count, check_fraction
+from verifai_jax.core.messages.checks import check_count, check_fraction, options_of
 from verifai_jax.core.messages.errors import end_if_interrupted, suggests_options
 from verifai_jax.core.values.trace import Status
 from verifai_jax.evaluation.backends import resolved
 from verifai_jax.evaluation.evaluator import Evaluator
+from verifai_jax.evaluation.run_on import RunOn
 from verifai_jax.features import Domain, FeatureSpace
 from verifai_jax.problem.problem import Problem, ProblemError
 from verifai_jax.problem.silent_mistakes import formula_notes
+from verifai_jax.statistics.stopping import Stop
 
 BLOCK = 1024
 """Points of the cube that are drawn at once."""
@@ -53,10 +55,10 @@ def compare(
     confidence: float = 0.95,
     budget: int = 100_000,
     seed: int = 0,
-    max_seconds: float | None = None,
+    stop: Stop | None = None,
     precision: str = "float32",
+    run_on: RunOn | None = None,
     progress: bool | None = None,
-    executor: Executor | None = None,
 ) -> Comparison:
     """Compare failure rates of problems on common random samples, until the result is decided.
 
@@ -73,16 +75,16 @@ def compare(
     - `margin`: the largest difference of failure probabilities that does not matter, at least 0.
     - `confidence`: the probability that all verdicts hold.
     - `budget`: maximum number of simulations of all problems together.
-    - `seed`: the seed of the samples; the same seed gives the same pairs.
-    - `max_seconds`: wall-clock seconds after which the verdict is made from finished pairs.
-    - `precision`: as in `falsify`.
-    - `progress`: whether to show one line of progress; see `core.display.progress` for the default.
-    - `executor`: an executor whose workers simulate, as in `falsify`; the comparison is the same.
+    - `stop`: the seconds after which the verdict is made from finished pairs.
+    - `run_on`: the workers of the simulations; with them the comparison is the same.
+    - all other arguments: as in `falsify`.
     **Returns:** the comparison; after Ctrl-C that of the finished pairs.
     **Raises:** before anything is simulated, `TypeError` for anything but a `Problem`;
     `ProblemError` if other features vary; `ValueError` for numbers out of range, and for targets
     that cannot be loaded.
     """
+    seconds = options_of("compare", Stop, stop, "seconds").seconds
+    executor = options_of("compare", RunOn, run_on, "executor").executor
     with ExitStack() as loaded:
 
         def problem(given: Problem | str) -> Problem:
@@ -107,22 +109,15 @@ def compare(
             given = candidates
         named = {name: problem(candidate) for name, candidate in given.items()}
         return _compare(
-            first, named, target, margin, confidence, budget, seed, max_seconds, precision, executor
+            first, named, target, margin, confidence, budget, seed, seconds, precision, executor
         )
 
 
 def _compare(
-    baseline: Problem,
-    named: Mapping[str, Problem],
-    target: str | None,
-    margin: float,
-    confidence: float,
-    budget: int,
-    seed: int,
-    max_seconds: float | None,
-    precision: str,
+    baseline: Problem, named: Mapping[str, Problem], target: str | None, margin: float,
+    confidence: float, budget: int, seed: int, max_seconds: float | None, precision: str,
     executor: Executor | None,
-) -> Comparison:
+) -> Comparison:  # fmt: skip
     """Compare problems; see `compare`."""
     started = time.perf_counter()
     _check(baseline, named, margin, confidence, budget)

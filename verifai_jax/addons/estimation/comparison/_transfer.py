@@ -81,10 +81,7 @@ def transfer(
     - `search`: that search, which must not need gradients.
     - `tolerance`: the largest gap that does not count, in units of a signal's range; choose it
       above the tolerance of the engines' solvers.
-    - `seed`: the seed of samples, search and random keys.
-    - `batch`: pairs at once.
-    - `precision`: the precision of the simulations.
-    - `progress`: whether to show one line of progress; see `core.display.progress` for the default.
+    - all other arguments: as in `falsify`.
     **Returns:** a `Transfer` with the table of all pairs.
     **Raises:** before anything is simulated, `ProblemError` for problems without a common feature
     or signal; `TypeError` for anything but a `Problem`; `ValueError` for numbers out of range

@@ -34,7 +34,7 @@ from verifai_jax.addons.estimation.normal_space import Ended, LimitState, Spent,
 from verifai_jax.core.compute.keys import run_keys, simulation_key
 from verifai_jax.core.compute.precision import in_precision
 from verifai_jax.core.display.progress import SimulationProgress, shows_progress
-from verifai_jax.core.messages.checks import check_fraction, check_options
+from verifai_jax.core.messages.checks import check_fraction, check_options, options_of
 from verifai_jax.core.messages.errors import suggests_options
 from verifai_jax.core.messages.text import format_seconds
 from verifai_jax.counterexamples import confirm
@@ -44,6 +44,7 @@ from verifai_jax.counterexamples.selection import problem_of
 from verifai_jax.evaluation.backends import resolved
 from verifai_jax.evaluation.confirmations import REFUSED
 from verifai_jax.evaluation.replay import replay
+from verifai_jax.evaluation.run_on import RunOn
 from verifai_jax.falsification import simulate
 from verifai_jax.falsification.run import Run
 from verifai_jax.features import FeatureSpace
@@ -51,6 +52,7 @@ from verifai_jax.problem.dependence import depends_on_key, without_derivative
 from verifai_jax.problem.problem import Problem
 from verifai_jax.problem.silent_mistakes import formula_notes
 from verifai_jax.statistics.binomial import clopper_pearson
+from verifai_jax.statistics.stopping import Stop
 
 DIVIDING, MAX_DIVIDING = 0.25, 6500
 """Share of the budget that divides the failures, and most of these simulations; the rest is for the
@@ -75,9 +77,9 @@ def modes(
     seed: int = 0,
     confidence: float = 0.95,
     min_share: float = 0.001,
+    stop: Stop | None = None,
     precision: str = "float32",
-    backend: str | None = None,
-    max_seconds: float | None = None,
+    run_on: RunOn | None = None,
     progress: bool | None = None,
 ) -> Modes:
     """Find every mode of failure, with its probability under the prior of the features.
@@ -85,13 +87,11 @@ def modes(
     **Arguments:**
     - `source`: a problem, or a run of one; failures of the run are then used too.
     - `budget`: maximum number of simulations; one with its gradient counts as 2.
-    - `batch`: simulations at once.
-    - `seed`: the same seed gives the same modes on the same machine.
     - `confidence`: the confidence of all intervals, between 0 and 1.
     - `min_share`: regions with a smaller share of the failure probability are not listed.
-    - `precision`, `backend`: as in `falsify`.
-    - `max_seconds`: wall-clock seconds after which the finished simulations are divided into modes.
-    - `progress`: True draws a progress bar, False none; None draws one on a terminal.
+    - `stop`: the seconds after which the finished simulations are divided into modes.
+    - `run_on`: the backend of the simulations.
+    - all other arguments: as in `falsify`.
     **Returns:** the modes, the most probable first. If no failure was found, or failures could not
     be weighted, the result is empty and a note says why. If the system draws random numbers,
     probabilities cover these too, and each mode holds a random key under which its likeliest
@@ -105,7 +105,9 @@ def modes(
     problem = problem_of(source) if isinstance(source, Run) else source
     sources = problem.sources()
     changed = source.changed_since() if isinstance(source, Run) else ""
-    check_options(budget, 1 if batch is None else batch, seed, max_seconds, None)
+    check_options(budget, 1 if batch is None else batch, seed)
+    max_seconds = options_of("modes", Stop, stop, "seconds").seconds
+    backend = options_of("modes", RunOn, run_on, "backend").backend
     check_fraction("confidence", confidence)
     check_fraction("min_share", min_share)
     in_precision(precision)
@@ -396,7 +398,7 @@ def _simulate(
         frame,
         seed=numbers.seed,
         precision=numbers.precision,
-        backend=numbers.backend,
+        run_on=RunOn(backend=numbers.backend),
         progress=False,
     )
     failing = set(run.table.counterexamples.index)

@@ -20,14 +20,13 @@ from verifai_jax.addons.estimation.trials.result import RealTrials
 from verifai_jax.core.messages.checks import check_count, check_fraction
 from verifai_jax.core.messages.errors import suggests_options
 from verifai_jax.core.messages.text import counted
+from verifai_jax.evaluation.run_on import RunOn
 from verifai_jax.falsification import falsify, simulate
 from verifai_jax.falsification.run import Run
 from verifai_jax.problem.problem import Problem
 
 if TYPE_CHECKING:
     import pandas as pd
-
-    from verifai_jax.core.compute.executors import Executor
 UNLIKELY = 1e-3
 """Probability below which trials are not taken for samples of the prior."""
 MIN_TRIALS = 10
@@ -47,7 +46,7 @@ def real_trials(
     time: str = "time",
     dt: float | None = None,
     precision: str = "float32",
-    executor: "Executor | None" = None,
+    run_on: RunOn | None = None,
     progress: bool | None = None,
 ) -> RealTrials:
     """Estimate the failure rate of the real system from trials, with the help of the simulation.
@@ -67,7 +66,7 @@ def real_trials(
       beforehand, as `next_trials` does; otherwise the trials are samples of the prior.
     - `at_any_time`: True if verdicts influenced which trials were made, or when to stop.
     - `time`, `dt`: time column and period of recordings, as in `mtl.read`.
-    - `precision`, `executor`, `progress`: as in `falsify`.
+    - `precision`, `run_on`, `progress`: as in `falsify`.
     **Returns:** the result, with the table of trials and predictions.
     **Raises:** `FileNotFoundError`; `ValueError` for tables without a verdict or a feature,
     features outside their domains, and options out of range; the errors of `falsify`.
@@ -78,7 +77,7 @@ def real_trials(
     check_count("simulations", simulations)
     read, unread = read_trials(problem, trials, time=time, dt=dt)
     features: Any = read[list(problem.space.columns)]
-    how: Any = {"precision": precision, "executor": executor, "progress": progress}
+    how: Any = {"precision": precision, "run_on": run_on, "progress": progress}
     same = simulate(problem, features, seed=seed, **how)
     prior = falsify(problem, "uniform", simulations, seed=seed + 1, confirm=False, **how)
     table: Any = read.assign(**_predictions(same))

@@ -13,7 +13,6 @@ import time
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 import pandas as pd
@@ -23,17 +22,15 @@ from verifai_jax.addons.faults.failure_table.result import FailureTable
 from verifai_jax.addons.faults.failure_table.rows import Points, Rows
 from verifai_jax.addons.faults.fault import AtMost, Fault, FaultFeatures
 from verifai_jax.core.display.progress import shows_progress
-from verifai_jax.core.messages.checks import check_count, check_fraction, is_number
+from verifai_jax.core.messages.checks import check_count, check_fraction, is_number, options_of
 from verifai_jax.core.messages.errors import check_names, end_if_interrupted, suggests_options
 from verifai_jax.core.store.cache import locked_cache
 from verifai_jax.counterexamples import confirm
 from verifai_jax.evaluation.backends import resolved
+from verifai_jax.evaluation.run_on import RunOn
 from verifai_jax.falsification import load, simulate
 from verifai_jax.falsification.run import Run
 from verifai_jax.problem.problem import Problem
-
-if TYPE_CHECKING:
-    from verifai_jax.core.compute.executors import Executor
 
 
 @suggests_options
@@ -50,8 +47,7 @@ def fmea(
     confidence: float = 0.95,
     seed: int = 0,
     folder: str | Path | None = None,
-    executor: "Executor | None" = None,
-    target: str | None = None,
+    run_on: RunOn | None = None,
     progress: bool | None = None,
 ) -> FailureTable:
     """Make the failure table of a system: the effect and the probability of each fault.
@@ -70,18 +66,17 @@ def fmea(
       if few samples fail; 0 switches off all three.
     - `pairs`: whether to try pairs of the faults that cause no failure alone.
     - `confidence`: the confidence of each interval.
-    - `seed`: the seed of everything that is drawn at random.
     - `folder`: the folder of the counterexamples (a run) and of finished simulations; the same call
       continues an interrupted table there.
-    - `executor`: an executor whose workers simulate, as in `falsify`.
-    - `target`: `FILE.py:NAME` of the problem with its faults, for the replay commands.
-    - `progress`: whether to show one line of progress; see `core.display.progress` for the default.
+    - `run_on`: the workers of the simulations.
+    - all other arguments: as in `falsify`.
     **Returns:** the table, the most probable failure first. Ctrl-C ends the call; with `folder` it
     may be repeated.
     **Raises:** `ValueError` without faults, for a fault that cannot be switched off, for rates out
     of range or without a mission time; the errors of `Problem.with_faults`.
     """
     started = time.perf_counter()
+    where = options_of("fmea", RunOn, run_on, "executor")
     faulty = problem.with_faults(*faults) if faults else problem
     known = _faults_of(faulty)
     rates = _rates(rate, mission_time, known)
@@ -100,14 +95,14 @@ def fmea(
     effects = []
     with locked_cache(folder, "fmea") as cache:
         cache.claim(work, faulty.sources())
-        rows = Rows(faulty, known, cache, seed, executor)
+        rows = Rows(faulty, known, cache, seed, where)
         healthy = not rows("healthy", rows.nominal.u[None])[0][0]
         found = [rows.try_out((name,), samples, budget) for name in known]
         if pairs:
             safe = [effect.name for effect, _ in found if not effect.fails]
             both = [rows.try_out(pair, samples, budget) for pair in itertools.combinations(safe, 2)]
             found += [each for each in both if each[0].fails]
-        run, verdicts, last = _run_of(rows, [points for _, points in found], folder, target), {}, 0
+        run, verdicts, last = _run_of(rows, [points for _, points in found], folder), {}, 0
         if run is not None:
             again = confirm(run, progress=False)
             verdicts = dict(zip(again.numbers.tolist(), again.verdict.tolist(), strict=True))
@@ -129,9 +124,7 @@ def fmea(
     )  # fmt: skip
 
 
-def _run_of(
-    rows: Rows, points: list[Points], folder: str | Path | None, target: str | None
-) -> Run | None:
+def _run_of(rows: Rows, points: list[Points], folder: str | Path | None) -> Run | None:
     """Simulate the failing points of all faults as one run; None without failing points."""
     failing = np.concatenate(points)
     if not len(failing):
@@ -143,7 +136,7 @@ def _run_of(
         return load(path, rows.problem)
     if path is not None:
         shutil.rmtree(path, ignore_errors=True)  # What an interrupt left.
-    run = simulate(rows.problem, frame, seed=rows.seed, folder=path, target=target, progress=False)
+    run = simulate(rows.problem, frame, seed=rows.seed, folder=path, progress=False)
     end_if_interrupted(run.stopped)
     if path is not None:
         rows.cache.note("counterexamples", len(frame))

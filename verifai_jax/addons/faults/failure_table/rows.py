@@ -15,13 +15,14 @@ from verifai_jax.core.messages.errors import end_if_interrupted
 from verifai_jax.core.store.cache import Cache
 from verifai_jax.counterexamples.nominal import Nominal
 from verifai_jax.evaluation.evaluator import Evaluator
+from verifai_jax.evaluation.run_on import RunOn
 from verifai_jax.falsification import falsify
 from verifai_jax.problem.dependence import depends_on_key
 from verifai_jax.problem.problem import Problem
 from verifai_jax.statistics.binomial import clopper_pearson
 
 if TYPE_CHECKING:
-    from verifai_jax.core.compute.executors import Executor
+    pass
 LEVELS, TURNS = 33, 3
 """Severities simulated at once, and how often a grid lies within one interval of the last."""
 RESOLVED = 1 / 2000
@@ -48,13 +49,13 @@ class Rows:
     faults: Mapping[str, Fault]
     cache: Cache
     seed: int
-    executor: "Executor | None"
+    run_on: RunOn
 
     def __post_init__(self) -> None:
         self.rng, self.nominal = np.random.default_rng(self.seed), Nominal.of(self.problem)
         self.groups: dict[str, Int[np.ndarray, " k"]] = dict(self.nominal.groups)
         self.draws = depends_on_key(self.problem)
-        self._evaluate = Evaluator(self.problem, 512, seed=self.seed, executor=self.executor)
+        self._evaluate = Evaluator(self.problem, 512, seed=self.seed, executor=self.run_on.executor)
         self._count = 0
 
     def __call__(self, what: str, points: Points) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -98,7 +99,7 @@ class Rows:
         def estimated() -> dict[str, np.ndarray]:
             seen = estimate(
                 self.problem.only(*effect.faults), budget=2 * budget, confidence=confidence,
-                seed=self.seed, progress=False, executor=self.executor,
+                seed=self.seed, progress=False, run_on=self.run_on,
             )  # fmt: skip
             end_if_interrupted(seen.stopped)
             chance = rate.estimate if seen.probability is None else seen.probability
@@ -112,7 +113,7 @@ class Rows:
         def searched() -> dict[str, np.ndarray]:
             run = falsify(
                 self.problem.only(*names), "cross_entropy", budget, seed=self.seed, confirm=False,
-                progress=False, executor=self.executor,
+                progress=False, run_on=self.run_on,
             )  # fmt: skip
             end_if_interrupted(run.stopped)
             worst = run.table.counterexamples.sort_values("rho").head(FOLLOWED)

@@ -58,7 +58,9 @@ def monitor_fleet(
             spawned = multiprocessing.get_context("spawn")
             pool = concurrent.futures.ProcessPoolExecutor(jobs, mp_context=spawned)
             executor = stack.enter_context(pool)
-        found = vj.mtl.judge(requirements, recordings, executor=executor, **options)
+        found = vj.mtl.judge(
+            requirements, recordings, run_on=vj.RunOn(executor=executor), **options
+        )
     say(found)
     for name, path, write in (("report", report, found.report), ("junit", junit, found.junit)):
         if path is not None:

@@ -33,7 +33,7 @@ from verifai_jax.addons.perception.compositional.region import (
 )
 from verifai_jax.core.compute.precision import reproducible_settings
 from verifai_jax.core.display.progress import ProgressBar
-from verifai_jax.core.messages.checks import check_count
+from verifai_jax.core.messages.checks import check_count, options_of
 from verifai_jax.core.messages.errors import suggests_options
 from verifai_jax.core.values.trace import Trace
 from verifai_jax.falsification import Run, falsify, resume, simulate
@@ -42,6 +42,7 @@ from verifai_jax.features import FeatureSpace
 from verifai_jax.mtl import Formula, parse
 from verifai_jax.problem import Problem, ProblemError
 from verifai_jax.search import Search
+from verifai_jax.statistics.stopping import Stop
 from verifai_jax.systems.base import Seed, System
 
 Frame = Callable[[Any, Mapping[str, Array]], Mapping[str, Any]]
@@ -58,7 +59,7 @@ def abstract(
     *,
     search: str | Search = "cross_entropy",
     budget: int = 2000,
-    stop_after: int = 1,
+    stop: Stop | None = None,
     samples: int = 4096,
     batch: int = 16,
     seed: int = 0,
@@ -94,20 +95,20 @@ def abstract(
       signals (a logit, a distance) work better than a decision.
     - `search`: the search for images: a name, or a search with its options.
     - `budget`: maximum number of rendered images.
-    - `stop_after`: number of confirmed failures after which it ends.
+    - `stop`: the number of confirmed failures after which it ends; 1 when left out.
     - `samples`: number of samples of the prior, to sample the region of uncertainty.
     - `batch`: number of images in a round.
-    - `seed`: the same seed gives the same result, bit for bit, on the same machine.
     - `images_per_simulation`: number of images in a simulation; by default one for each sample of a
       trace.
-    - `progress`: whether to show a progress bar; by default on a terminal or in a notebook.
+    - all other arguments: as in `falsify`.
     **Returns:** the region, the images, the candidates and which of them fail in the loop, with the
     number of rendered images of each stage.
     **Raises:** before anything is rendered, `ProblemError` for parts that do not fit; `ValueError`
     for numbers out of range, or a search that cannot work on the space.
     """
+    after = options_of("abstract", Stop, stop, "after").after or 1
     condition = _checked(problem, abstraction, error)
-    for name, value in (("stop_after", stop_after), ("samples", samples), ("batch", batch)):
+    for name, value in (("samples", samples), ("batch", batch)):
         check_count(name, value)
     check_count("seed", seed, 0)
     if images_per_simulation is not None:
@@ -123,7 +124,7 @@ def abstract(
     image = _image_problem(problem, loop, frame)
     image.check()
     check_search(replace(image, space=problem.space), search)
-    stages = _Stages(problem, image, search, budget, stop_after, batch, seed, per)
+    stages = _Stages(problem, image, search, budget, after, batch, seed, per)
     with ProgressBar(progress) as bar:
         bar.begin(f"{problem.name}: region", samples, "samples")
         region = sample_region(loop, samples, seed)
@@ -197,18 +198,11 @@ class _Stages:
     """Images and simulations by turns, until something ends them."""
 
     def __init__(
-        self,
-        problem: Problem,
-        image: Problem,
-        search: str | Search,
-        budget: int,
-        stop_after: int,
-        batch: int,
-        seed: int,
-        per: int,
-    ) -> None:
+        self, problem: Problem, image: Problem, search: str | Search, budget: int, wanted: int,
+        batch: int, seed: int, per: int,
+    ) -> None:  # fmt: skip
         self.problem, self.image, self.search = problem, image, search
-        self.budget, self.stop_after, self.batch = budget, stop_after, batch
+        self.budget, self.wanted, self.batch = budget, wanted, batch
         self.seed, self.per = seed, per
         self.images: Run | None = None
         self.simulations: list[Run] = []
@@ -238,7 +232,7 @@ class _Stages:
                     return result.BUDGET
                 if self._simulate(row) == result.INTERRUPTED:
                     return result.INTERRUPTED
-                if self.confirmed >= self.stop_after:
+                if self.confirmed >= self.wanted:
                     return result.FOUND
             if stopped != result.BUDGET:
                 return stopped

@@ -51,7 +51,7 @@ def repair(
             parameters,
             budget,
             nominal=arguments.plain_values("--nominal", nominal) or None,
-            **keywords,
+            **arguments.values_of(keywords),
         )
         show_result(
             result, None, "before", "parameters", "robustness", "repaired", "change",

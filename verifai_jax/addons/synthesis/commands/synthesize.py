@@ -3,17 +3,18 @@
 from pathlib import Path
 from typing import Any
 
-from verifai_jax.cli.arguments import PARAMETER_CHOICE, PATH, TARGET, load_problem, option
+from verifai_jax.cli import arguments
+from verifai_jax.cli.arguments import PATH, option
 from verifai_jax.cli.gates import Gate, check_gate, fail_on
 from verifai_jax.cli.going_on import kept_until_done
 from verifai_jax.cli.json_output import command, say, show_result
 
 
 @command()
-@TARGET
+@arguments.TARGET
 @option("--parameters", metavar="NAMES", help="Features to choose, comma-separated  [default: all]")
 @option("--budget", default=10_000, help="Maximum simulations.")
-@PARAMETER_CHOICE
+@arguments.PARAMETER_CHOICE
 @option("--table", type=PATH, metavar="CSV", help="Write the candidates into a CSV file.")
 @fail_on(unsafe="unless the formula holds with the parameters, in the check too")
 def synthesize(
@@ -27,9 +28,9 @@ def synthesize(
     """Find parameters for which TARGET (specs/FILE.py:NAME) holds, whatever its other features."""
     from verifai_jax import synthesize as run_synthesize
 
-    problem = load_problem(target)
+    problem = arguments.load_problem(target)
     with kept_until_done() as kept:
-        result = run_synthesize(problem, parameters, budget, **keywords)
+        result = run_synthesize(problem, parameters, budget, **arguments.values_of(keywords))
         show_result(
             result, None, "parameters", "robustness", "holds", "margin", "converged",
             "simulations", "without_verdict", "held_out", "stopped", "seed", "sources",

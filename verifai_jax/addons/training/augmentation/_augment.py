@@ -48,8 +48,7 @@ def augment(
     *,
     initial: int = 1000,
     added: int = 200,
-    steps: int = 600,
-    further_steps: int = 300,
+    steps: tuple[int, int] = (600, 300),
     search: str | Search = "uniform",
     budget: int | None = None,
     seeds: int = 5,
@@ -80,7 +79,7 @@ def augment(
       `standard` if the task has a transformation.
     - `initial`: number of inputs in the initial set.
     - `added`: number of inputs that an arm adds.
-    - `steps`, `further_steps`: training steps of the base network, and of each arm afterwards.
+    - `steps`: training steps of the base network, and of each arm afterwards.
     - `search`: the search that fills the error table: a name, or a search with its options.
     - `budget`: number of simulations for the error table; ten times `added` when left out.
     - `seeds`: number of repetitions, each with its own data, weights and tests.
@@ -91,9 +90,7 @@ def augment(
     - `confidence`: the confidence of each single interval.
     - `folder`: the folder that stores finished work: the same call resumes after an interruption,
       and one with more seeds or arms computes only the new ones.
-    - `progress`: show a progress bar; by default on a terminal or in a notebook.
-    - `even_if_changed`: whether to continue with finished work of a folder although files of the
-      task have changed since it began.
+    - `progress`, `even_if_changed`: as in `falsify` and `resume`.
     **Returns:** the result: a table with a row for each arm and seed, and comparisons. After an
     interruption (Ctrl-C) it has the finished rows, and `complete` is False.
     **Raises:** before anything is trained, `UnknownNameError` for unknown arms, searches and
@@ -104,9 +101,10 @@ def augment(
     if not isinstance(task, SupervisedTask):
         raise TypeError(f"augment needs a SupervisedTask; got {type(task).__name__}")
     chosen = _arms(task, arms)
-    for name, value in (("initial", initial), ("added", added), ("steps", steps)):
+    first, further = steps
+    counts = {"initial": initial, "added": added, "the first of steps": first}
+    for name, value in {**counts, "the second of steps": further}.items():
         check_count(name, value)
-    check_count("further_steps", further_steps)
     check_count("seeds", seeds)
     check_count("seed", seed, 0)
     check_count("test", test)
@@ -116,7 +114,7 @@ def augment(
     search = named(search) if isinstance(search, str) else search
     task.check()
     check_search(searched_problem(task, None, search, None), search)
-    plan = Plan(initial, added, steps, further_steps, search, budget, seed, test, hard)
+    plan = Plan(initial, added, first, further, search, budget, seed, test, hard)
     with locked_cache(folder, KIND) as cache, ProgressBar(progress) as bar:
         cache.claim(_fingerprint(task, plan), sources_of(task), even_if_changed)
         bar.begin(task.name, seeds * (1 + len(chosen)), "networks")

@@ -34,14 +34,18 @@ def harden(
     target: str, folder: Path | None, plot: Path | None, fail_on: Gate | None, **options: Any
 ) -> None:
     """Train a policy of the study TARGET (FILE.py:NAME), train it on its failures, certify it."""
-    from verifai_jax import Study
+    from verifai_jax import Certification, FurtherTraining, Stop, Study
     from verifai_jax import harden as run
     from verifai_jax.core.user_code.targets import load_target
     from verifai_jax.statistics.confidence_sequences import safe_at
 
     study = load_target(target, Study)
     into = folder or Path("runs") / f"harden-{target.rpartition(':')[2]}"
-    result = run(study, folder=into, **options)
+    names = ("samples", "confidence", "attack", "attack_simulations")
+    certified = Certification(**{name: options.pop(name) for name in names})
+    further = FurtherTraining(steps=options.pop("further_steps"))
+    stop = Stop(seconds=options.pop("max_seconds"))
+    result = run(study, folder=into, further=further, certification=certified, stop=stop, **options)
     say(result)
     say(f"  policy       {into}")
     verdict = result.after.verdict

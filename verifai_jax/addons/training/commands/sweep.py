@@ -77,7 +77,7 @@ def sweep(
     **given: Any,
 ) -> None:
     """Train configurations of the study TARGET (specs/FILE.py:NAME), certify their policies."""
-    from verifai_jax import Study
+    from verifai_jax import RunOn, Stop, Study
     from verifai_jax.addons.training.sweeps._sweep import sweep as run_sweep
     from verifai_jax.core.store.cache import cache_file
     from verifai_jax.core.user_code.targets import load_target, target_of_project
@@ -123,9 +123,9 @@ def sweep(
                 study,
                 configurations=configurations,
                 folder=folder if cache is None else cache,
-                max_seconds=max_seconds,
+                stop=Stop(seconds=max_seconds),
                 note=note,
-                executor=executor,
+                run_on=RunOn(executor=executor),
                 even_if_changed=even_if_changed,
                 **keywords,
             )
@@ -169,14 +169,14 @@ def _resuming(
 
 def _keywords(given: Mapping[str, Any], options: tuple[str, ...]) -> dict[str, Any]:
     """Turn options of the command into keyword arguments of `sweep`."""
-    from verifai_jax import Halving
+    from verifai_jax import Certification, Halving
     from verifai_jax.search import named
 
-    keywords = {
-        name: given[name]
-        for name in ("seed", "samples", "confidence", "budget", "attack", "attack_simulations")
-        if given[name] is not None
-    }
+    names = ("samples", "confidence", "budget", "attack", "attack_simulations")
+    certified = {name: given[name] for name in names if given[name] is not None}
+    keywords: dict[str, Any] = {"certification": Certification(**certified)}
+    if given["seed"] is not None:
+        keywords["seed"] = given["seed"]
     search, values = given["search"] or "halton", arguments.plain_values("--set", options)
     if search.startswith("optuna:"):
         from verifai_jax import OptunaSampler

@@ -1,7 +1,7 @@
 """Hardening of a policy: train, attack, train further on the failures, certify.
 
     result = harden(study)                              # a Study: trainer, problem, p
-    result = harden(CartPoleTask(), balance_with, algorithm=PPO())
+    result = harden(Trainer(CartPoleTask(), PPO()), balance_with)
     print(result); result.policy
 
 Sources: Pinto, Davidson, Sukthankar and Gupta, Robust adversarial reinforcement learning, ICML
@@ -12,7 +12,7 @@ randomization for transferring deep neural networks, IROS 2017 (the baseline).
 import inspect
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -21,11 +21,12 @@ import numpy as np
 import pandas as pd
 
 from verifai_jax._version import __version__
-from verifai_jax.addons.estimation.certification import Certificates, certify
+from verifai_jax.addons.estimation.certification import Certificates, Certification, certify
 from verifai_jax.addons.estimation.comparison import Comparison, compare
-from verifai_jax.addons.rl import PPO, Algorithm, evaluate
+from verifai_jax.addons.rl import PPO, evaluate
 from verifai_jax.addons.training.hardening.arms import FunctionArms, TaskArms
 from verifai_jax.addons.training.hardening.collecting import Collected, collect
+from verifai_jax.addons.training.hardening.further import FurtherTraining
 from verifai_jax.addons.training.hardening.mixture import (
     CAPACITY,
     HardeningError,
@@ -41,14 +42,14 @@ from verifai_jax.core.compute.fingerprint import stable_text
 from verifai_jax.core.compute.keys import run_keys
 from verifai_jax.core.compute.precision import reproducible_settings
 from verifai_jax.core.display.progress import say_done, shows_progress
-from verifai_jax.core.messages.checks import check_count, check_fraction
+from verifai_jax.core.messages.checks import check_count, check_fraction, options_of
 from verifai_jax.core.messages.errors import end_if_interrupted, suggests_options
 from verifai_jax.core.store.cache import Cache, locked_cache
 from verifai_jax.features import Categorical
 from verifai_jax.problem.problem import Problem
 from verifai_jax.problem.silent_mistakes import formula_notes
-from verifai_jax.search import Search
 from verifai_jax.statistics.confidence_sequences import safe_at
+from verifai_jax.statistics.stopping import Stop
 
 ROUND, FINAL, COMPARED, ATTACK, RETURNS = range(5)
 """Numbers of the purposes for which random numbers are drawn."""
@@ -67,31 +68,26 @@ class Plan:
 
     rounds: int
     steps: int
-    further_steps: int
+    further: FurtherTraining
     p: float
-    confidence: float
-    samples: int
-    attack: str | Search
-    attack_simulations: int
-    added: int
-    own: float
-    failing: float
-    tolerance: float
+    certification: Certification
     episodes: int
     baseline: bool
     seed: int
 
     def __post_init__(self) -> None:
-        for name in ("rounds", "further_steps", "added", "episodes", "seed"):
+        for name in ("rounds", "episodes", "seed"):
             check_count(name, getattr(self, name), 0 if name == "seed" else 1)
-        for name in ("p", "confidence"):
-            check_fraction(name, getattr(self, name))
-        for name in ("own", "failing", "tolerance"):
-            check_fraction(name, getattr(self, name), zero=True)
-        if self.own + self.failing > 1:
-            raise ValueError(
-                f"own and failing are shares of all episodes; got {self.own} + {self.failing} > 1"
-            )
+        check_fraction("p", self.p)
+
+    def options(self) -> dict[str, Any]:
+        """Return all options by name, as plain data."""
+        further, certified = dict(vars(self.further)), dict(vars(self.certification))
+        named = {"further_steps": further.pop("steps"), **further, **certified, **vars(self)}
+        named["attack"] = stable_text(certified["attack"])
+        return {
+            n: one for n, one in named.items() if n not in ("further", "certification", "start")
+        }
 
     def seed_for(self, purpose: int, stage: int = 0) -> int:
         """Return the seed for a purpose; different purposes get different samples."""
@@ -106,25 +102,16 @@ def harden(
     study: Study | Trainer | object,
     problem: Callable[[Any], Problem] | None = None,
     *,
-    algorithm: Algorithm | None = None,
-    start: Start | None = None,
     hyperparameters: Mapping[str, object] | None = None,
     rounds: int = 8,
     steps: int | None = None,
-    further_steps: int | None = None,
+    further: FurtherTraining | None = None,
     p: float | None = None,
-    confidence: float = 0.95,
-    samples: int = 512,
-    attack: str | Search = "cross_entropy",
-    attack_simulations: int = 512,
-    added: int = 64,
-    own: float = 0.25,
-    failing: float = 0.5,
-    tolerance: float = 0.02,
+    certification: Certification | None = None,
     episodes: int = 256,
     baseline: bool = False,
     seed: int = 0,
-    max_seconds: float | None = None,
+    stop: Stop | None = None,
     folder: str | Path | None = None,
     even_if_changed: bool = False,
     progress: bool | None = None,
@@ -142,54 +129,47 @@ def harden(
     covers the policies before and after together, and is made after the choice.
 
     **Arguments:**
-    - `study`: a `Study`, a `Trainer`, or a task. A task needs a method `start(key, features) ->
-      state` that starts an episode with the problem's features; tasks of `ode_task` have it. A
-      training function gets the argument `starts`, a list from which each episode takes one entry
-      at random: features, or `None` for an episode of the task's own. In the first training all
-      entries are `None`.
+    - `study`: a `Study`, a `Trainer`, or a task, which `PPO` trains. A task needs a method
+      `start(key, features) -> state` that starts an episode with the problem's features; tasks of
+      `ode_task` have it. A training function gets the argument `starts`, a list from which each
+      episode takes one entry at random: features, or `None` for an episode of the task's own. In
+      the first training all entries are `None`.
     - `problem`: a function from a policy to the problem of its closed loop; by default the study's.
-    - `algorithm`: the algorithm of a task; `PPO()` when left out.
-    - `start`: a function `(key, features) -> state` for a task without such a method.
     - `hyperparameters`: a dictionary of the trainer's hyper-parameters.
     - `rounds`: the maximum number of rounds of attack and further training.
     - `steps`: environment steps of the first training; by default the trainer's.
-    - `further_steps`: steps of each round; an eighth of `steps` when left out.
+    - `further`: the training of a round: its length, and where its episodes begin.
     - `p`: failure probability below which the policy is safe; by default the study's, or 0.01.
-    - `confidence`: the joint confidence of the intervals before and after.
-    - `samples`, `attack`, `attack_simulations`: options of each certificate, as in `certify`.
-    - `added`: the maximum number of failures, as points to train around, that a round adds.
-    - `own`, `failing`: share of the task's own episodes, and share of episodes that begin near
-      failures, including those drawn from the prior that fail; all others come from the prior. The
-      share of own episodes grows after a round that loses return, and shrinks after other rounds.
-    - `tolerance`: the share of the first policy's return that the result may lose.
+    - `certification`: the attack and the samples of each certificate; its confidence is that of
+      the intervals before and after together.
     - `episodes`: number of the task's own episodes that measure returns, the same for all policies.
     - `baseline`: whether to train a second arm with plain domain randomisation: the same seed, own
       episodes and environment steps, but episodes from the prior instead of failures.
-    - `seed`: the seed of training, attacks and samples.
-    - `max_seconds`: wall-clock seconds after which no round begins.
+    - `stop`: the seconds after which no round begins.
     - `folder`: the folder of finished work; the same call continues an interrupted hardening.
-    - `even_if_changed`: whether to continue in a folder although files of the model have changed.
-    - `progress`: whether to show one line of progress; see `core.display.progress` for the default.
+    - all other arguments: as in `falsify` and `resume`.
     **Returns:** the result. Ctrl-C ends the call; with `folder` it may be repeated.
     **Raises:** before anything is trained, `HardeningError` for a task that cannot start with the
     features; `ValueError` for numbers out of range; the errors of `Trainer.configuration`;
     `CacheError` for a folder of another hardening; `FolderInUse` if another process writes there.
     """
-    made = _as_study(study, problem, algorithm, p)
+    how = options_of("harden", FurtherTraining, further)
+    usual = Certification(attack_simulations=512)
+    certified = options_of("harden", Certification, certification or usual)
+    max_seconds = options_of("harden", Stop, stop, "seconds").seconds
+    made = _as_study(study, problem, p)
     trainer, values = made.trainer, dict(hyperparameters or {})
     first_steps = check_count("steps", trainer.steps if steps is None else steps)
-    further = max(1, first_steps // 8) if further_steps is None else further_steps
-    plan = Plan(
-        rounds, first_steps, further, made.p if p is None else p, confidence, samples, attack,
-        attack_simulations, added, own, failing, tolerance, episodes, baseline, seed,
-    )  # fmt: skip
+    how = replace(how, steps=max(1, first_steps // 8) if how.steps is None else how.steps)
+    p = made.p if p is None else p
+    plan = Plan(rounds, first_steps, how, p, certified, episodes, baseline, seed)
     untrained = made.untrained_problem()
     untrained.check()
     with locked_cache(folder, "hardening") as cache:
-        options = {name: stable_text(each) for name, each in vars(plan).items()}
+        options = {name: stable_text(each) for name, each in plan.options().items()}
         options["hyperparameters"] = stable_text(sorted(values.items()))
         cache.claim(fingerprint(made, options), untrained.sources(), even_if_changed)
-        result = Work(made, plan, values, untrained, start, cache).run(max_seconds)
+        result = Work(made, plan, values, untrained, how.start, cache).run(max_seconds)
     if folder is not None:
         with cache.writing(folder):
             result.save(folder)
@@ -210,7 +190,9 @@ class Work:
     def __post_init__(self) -> None:
         study, plan, untrained = self.study, self.plan, self.untrained
         self.arms_named = (HARDENED, BASELINE) if plan.baseline else (HARDENED,)
-        stages = [plan.steps + stage * plan.further_steps for stage in range(plan.rounds + 1)]
+        stages = [
+            plan.steps + stage * (plan.further.steps or 0) for stage in range(plan.rounds + 1)
+        ]
         trainer, space = study.trainer, untrained.space
         self.task, self.stages = trainer.nominal, stages
         known = study, self.values, stages, plan.seed, self.cache, self.arms_named
@@ -224,7 +206,7 @@ class Work:
                 *known, configured, mixture_of(configured.task, untrained, self.start)
             )
         self.points, self.radii = np.zeros((0, space.dim), np.float32), np.zeros(0)
-        self.own = dict.fromkeys(self.arms_named, plan.own)
+        self.own = dict.fromkeys(self.arms_named, plan.further.own)
         self.rows: list[dict[str, Any]] = []
         self.added: list[pd.DataFrame] = []
         self.policies: dict[tuple[str, int], Any] = {}
@@ -252,9 +234,8 @@ class Work:
         plan, began = self.plan, time.perf_counter()
         policies = self.arms.policies(stage)
         certificates = certify(
-            self.study.problem, policies, p=plan.p, confidence=plan.confidence,
-            samples=plan.samples, seed=plan.seed_for(ROUND, stage), attack=plan.attack,
-            attack_simulations=plan.attack_simulations, tie=plan.p, progress=False,
+            self.study.problem, policies, p=plan.p, certification=plan.certification,
+            seed=plan.seed_for(ROUND, stage), tie=plan.p, progress=False,
             remember=self.cache.remember,
         )  # fmt: skip
         end_if_interrupted(certificates.stopped)
@@ -277,7 +258,8 @@ class Work:
             found = collect(
                 self.study.problem(self.policies[HARDENED, stage]),
                 certificates.counterexamples(0), self.points,
-                seed=plan.seed_for(ATTACK, stage), added=plan.added, table=TABLE, shrunk=SHRUNK,
+                seed=plan.seed_for(ATTACK, stage), added=plan.further.added, table=TABLE,
+                shrunk=SHRUNK,
             )  # fmt: skip
             return {name: np.asarray(value) for name, value in found._asdict().items()}
 
@@ -295,9 +277,9 @@ class Work:
         rate, mixtures = certificates[0].rate.estimate if certificates[0].rate else 0.0, []
         for arm, count in zip(self.arms_named, (len(self.points), 0), strict=False):
             change = -OWN_STEP if self._keeps_return(arm, stage) else OWN_STEP
-            own = self.own[arm] = max(plan.own, min(self.own[arm] + change, OWN_LIMIT))
+            own = self.own[arm] = max(plan.further.own, min(self.own[arm] + change, OWN_LIMIT))
             # The more of the prior fails, the more of its episodes begin at failures anyway.
-            wanted = plan.failing * (1 - own) / max(1 - plan.own, 1e-9)
+            wanted = plan.further.failing * (1 - own) / max(1 - plan.further.own, 1e-9)
             failing = min(max((wanted - (1 - own) * rate) / max(1 - rate, 1e-9), 0.0), wanted)
             shares = (own, 1 - own - failing, failing)
             mixtures.append(Mixture.of(space, shares, self.points[:count], self.radii[:count]))
@@ -312,7 +294,7 @@ class Work:
 
     def _keeps_return(self, arm: str, stage: int) -> bool:
         before, now = (float(self.returns[arm, at].mean()) for at in (0, stage))
-        return not now < before - self.plan.tolerance * abs(before)
+        return not now < before - self.plan.further.tolerance * abs(before)
 
     def _choice(self, arm: str) -> int:
         """Return the stage that fails least among those that keep the return, else the first."""
@@ -324,12 +306,13 @@ class Work:
     def _result(self, stopped: str, began: float) -> Hardening:
         """Choose a policy, certify it and the first on fresh samples, and compare both in pairs."""
         plan, notes = self.plan, [*formula_notes(self.untrained)]
+        sampled = plan.certification
         chosen = {arm: self._choice(arm) for arm in self.arms_named}
         comparison: Comparison | None = None
         if at := chosen[HARDENED]:
             comparison = compare(
                 *(self.study.problem(self.policies[HARDENED, stage]) for stage in (0, at)),
-                confidence=plan.confidence, budget=16 * plan.samples,
+                confidence=sampled.confidence, budget=16 * sampled.samples,
                 seed=plan.seed_for(COMPARED), progress=False,
             )  # fmt: skip
             end_if_interrupted(comparison.stopped)
@@ -342,9 +325,11 @@ class Work:
         start = self.policies[HARDENED, 0]
         finalists = [start, *(self.policies[arm, at] for arm, at in chosen.items())]
         final = certify(
-            self.study.problem, finalists, p=plan.p, confidence=plan.confidence,
-            samples=4 * plan.samples, seed=plan.seed_for(FINAL), attack_simulations=0,
-            tie=plan.p, progress=False, remember=self.cache.remember,
+            self.study.problem, finalists, p=plan.p,
+            certification=replace(
+                sampled, samples=4 * sampled.samples, budget=None, attack_simulations=0
+            ),
+            seed=plan.seed_for(FINAL), tie=plan.p, progress=False, remember=self.cache.remember,
         )  # fmt: skip
         end_if_interrupted(final.stopped)
         returns = {arm: self.returns[arm, at] for arm, at in chosen.items()}
@@ -355,7 +340,7 @@ class Work:
             certificates=final, comparison=comparison,
             returns={"start": self.returns[HARDENED, 0], **returns},
             stopped=stopped, seconds=time.perf_counter() - began,
-            options={**vars(plan), "attack": stable_text(plan.attack)},
+            options=plan.options(),
             notes=tuple(notes), version=__version__,
         )  # fmt: skip
 
@@ -363,11 +348,8 @@ class Work:
 def _as_study(
     given: object,
     problem: Callable[[Any], Problem] | None,
-    algorithm: Algorithm | None,
     p: float | None,
 ) -> Study:
-    if isinstance(given, Study | Trainer) and algorithm is not None:
-        raise ValueError(f"a {type(given).__name__} has its own algorithms; leave out algorithm=")
     if isinstance(given, Study):
         if problem is not None:
             raise ValueError("a Study has its own problem; leave out problem=")
@@ -377,7 +359,7 @@ def _as_study(
             "harden needs problem=, a function from a policy to the Problem of its closed loop"
         )
     else:
-        trainer = given if isinstance(given, Trainer) else Trainer(given, algorithm or PPO())
+        trainer = given if isinstance(given, Trainer) else Trainer(given, PPO())
         space = {"steps": Categorical(trainer.steps)}
         study = Study(trainer.name, space, trainer, problem, p=0.01 if p is None else p)
     trainer = study.trainer

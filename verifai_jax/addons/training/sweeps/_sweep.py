@@ -12,6 +12,7 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
+from verifai_jax.addons.estimation.certification import Certification
 from verifai_jax.addons.estimation.certification.attack import check_attack
 from verifai_jax.addons.rl._evaluate import EPISODES
 from verifai_jax.addons.training.sweeps.clock import Clock
@@ -23,12 +24,13 @@ from verifai_jax.addons.training.sweeps.result import Sweep
 from verifai_jax.addons.training.sweeps.running import RunningSweep
 from verifai_jax.addons.training.sweeps.study import Study, StudyError
 from verifai_jax.addons.training.sweeps.trainer import STEPS
-from verifai_jax.core.compute.executors import Executor
-from verifai_jax.core.messages.checks import check_count, check_fraction, check_positive
+from verifai_jax.core.messages.checks import check_count, options_of
 from verifai_jax.core.messages.errors import suggests_options
 from verifai_jax.core.store.cache import locked_cache
 from verifai_jax.core.user_code.callbacks import Callback, check_callbacks
+from verifai_jax.evaluation.run_on import RunOn
 from verifai_jax.search import Search
+from verifai_jax.statistics.stopping import Stop
 
 
 @suggests_options
@@ -38,20 +40,16 @@ def sweep(
     configurations: int = 32,
     *,
     seed: int = 0,
-    samples: int = 512,
-    confidence: float = 0.95,
-    budget: int | None = None,
-    attack: str | Search = "cross_entropy",
-    attack_simulations: int = 256,
+    certification: Certification | None = None,
     halving: Halving | None = None,
     batch: int | None = None,
     episodes: int = EPISODES,
+    stop: Stop | None = None,
     folder: str | Path | None = None,
-    max_seconds: float | None = None,
-    progress: bool | None = None,
+    run_on: RunOn | None = None,
     note: Mapping[str, Any] | None = None,
     callbacks: Iterable[Callback] = (),
-    executor: Executor | None = None,
+    progress: bool | None = None,
     even_if_changed: bool = False,
 ) -> Sweep:
     """Train configurations of a study's hyper-parameters and certify their policies.
@@ -67,27 +65,20 @@ def sweep(
     - `configurations`: maximum number of configurations; each is trained with each of the study's
       seeds.
     - `seed`: the seed of the search and of the samples; training seeds belong to the study.
-    - `samples`: minimum number of samples of each policy in its certification.
-    - `confidence`: the confidence of all verdicts together, between 0 and 1.
-    - `budget`: number of samples of the whole certification; see `certify`.
-    - `attack`, `attack_simulations`: the search that looks for failures of each policy first, and
-      its number of simulations for each; its failures enter no rate.
+    - `certification`: the attack on each policy and the samples of its certificate.
     - `halving`: how to stop all but the best configurations at each checkpoint.
     - `batch`: configurations in a round of a search that learns.
     - `episodes`: number of episodes over which the nominal return is averaged.
     - `folder`: the folder that caches finished work; passing it again resumes an interrupted sweep.
-    - `max_seconds`: wall-clock limit; no training begins after two thirds of it, and the call of a
-      training function that has not ended by then is ended, as an error of its row.
-    - `progress`: True draws bars, False none; None draws them on a terminal and in a notebook.
+    - `stop`: the seconds of the sweep; no training begins after two thirds of them, and the call of
+      a training function that has not ended by then is ended, as an error of its row.
     - `note`: plain data that is stored in the folder next to the work.
     - `callbacks`: functions called for each policy when its return is known, and again when its
       safety is, with the number of calls so far and a dictionary of plain numbers; cached work
       counts too.
-    - `executor`: an executor whose workers train and simulate, as in `falsify`; the table is the
-      same. With `halving`, configurations that continue after a checkpoint are trained from the
-      start.
-    - `even_if_changed`: whether to continue with finished work of a folder although files of the
-      study have changed since it began; the record then says so.
+    - `run_on`: the workers that train and simulate; the table is the same. With `halving`,
+      configurations that continue after a checkpoint are trained from the start.
+    - `progress`, `even_if_changed`: as in `falsify` and `resume`.
     **Returns:** the policies with their returns and certificates. An interrupted sweep (Ctrl-C, out
     of time) returns its finished part; `record.complete` is False.
     **Raises:** before anything trains, the `StudyError` and `UnknownNameError` of `Study.check`;
@@ -95,66 +86,48 @@ def sweep(
     for an unknown search or option; `CacheError` for a folder that is damaged, foreign, of another
     format, or of another sweep.
     """
-    check_options(
-        study,
-        configurations=configurations,
-        seed=seed,
-        samples=samples,
-        confidence=confidence,
-        budget=budget,
-        attack_simulations=attack_simulations,
-        halving=halving,
-        batch=batch,
-        episodes=episodes,
-        max_seconds=max_seconds,
-    )
+    certified = options_of("sweep", Certification, certification)
+    seconds = options_of("sweep", Stop, stop, "seconds").seconds
+    executor = options_of("sweep", RunOn, run_on, "executor").executor
+    check_options(study, certified, configurations, seed, halving, batch, episodes)
     called = check_callbacks(callbacks)
     study.check()
-    check_attack(study.untrained_problem(), attack)
+    check_attack(study.untrained_problem(), certified.attack)
     proposer = make_proposer(
         search, study.space, configurations=configurations, seed=seed, batch=batch
     )
+    attack = certified.attack
     options: dict[str, Any] = {
         "search": proposer.to_json(),
         "seed": seed,
-        "samples": samples,
-        "confidence": confidence,
-        "budget": budget,
+        "samples": certified.samples,
+        "confidence": certified.confidence,
+        "budget": certified.budget,
         "attack": attack if isinstance(attack, str) else repr(attack),
-        "attack_simulations": attack_simulations,
+        "attack_simulations": certified.attack_simulations,
         "halving": None if halving is None else {"reduction": halving.reduction, "by": halving.by},
         "episodes": episodes,
     }
     if proposer.learns:
         # Its proposals depend on both.
         options |= {"configurations": configurations, "batch": proposer.batch}
-    with locked_cache(folder) as cache, Clock(study.name, max_seconds, progress) as clock:
+    with locked_cache(folder) as cache, Clock(study.name, seconds, progress) as clock:
         sources = cache.claim(fingerprint(study, options), study.sources(), even_if_changed)
         if note is not None:
             cache.note("command", dict(note))
         options |= {"configurations": configurations, "p": study.p}
         options["curve"] = None if study.curve_formula is None else str(study.curve_formula)
         running = RunningSweep(
-            study, options, cache, clock, halving, attack, called, executor=executor,
+            study, options, cache, clock, halving, certified, called, executor=executor,
             sources=sources,
         )  # fmt: skip
         return Sweep(running.run(proposer), study, reuse=cache.reuse())
 
 
 def check_options(
-    study: object,
-    *,
-    configurations: int,
-    seed: int,
-    samples: int,
-    confidence: float,
-    budget: int | None,
-    attack_simulations: int,
-    halving: object,
-    batch: int | None,
-    episodes: int,
-    max_seconds: float | None,
-) -> None:
+    study: object, certified: Certification, configurations: int, seed: int, halving: object,
+    batch: int | None, episodes: int,
+) -> None:  # fmt: skip
     """Check the options of a sweep, separately and against its study.
 
     **Raises:** `TypeError` for an argument that is not a study or a `Halving`; `ValueError` for a
@@ -163,27 +136,14 @@ def check_options(
     """
     if not isinstance(study, Study):
         raise TypeError(f"sweep needs a Study; got {study!r}")
-    counts = {"configurations": configurations, "samples": samples, "episodes": episodes}
+    counts = {"configurations": configurations, "episodes": episodes}
     if batch is not None:
         counts["batch"] = batch
     for name, value in counts.items():
         check_count(name, value)
-    for name, value in {"seed": seed, "attack_simulations": attack_simulations}.items():
-        check_count(name, value, 0)
-    check_fraction("confidence", confidence)
-    if max_seconds is not None:
-        check_positive("max_seconds", max_seconds)
-    if halving is not None:
-        _check_halving(study, halving)
-    if budget is not None:
-        policies = count_policies(
-            study, configurations, halving if isinstance(halving, Halving) else None
-        )
-        if budget < policies * samples:
-            raise ValueError(
-                f"{policies} policies with {samples} samples each need a budget of at least "
-                f"{policies * samples}; got {budget}"
-            )
+    check_count("seed", seed, 0)
+    halved = None if halving is None else _check_halving(study, halving)
+    certified.check_budget(count_policies(study, configurations, halved))
 
 
 def count_policies(study: Study, configurations: int, halving: Halving | None) -> int:
@@ -197,7 +157,7 @@ def count_policies(study: Study, configurations: int, halving: Halving | None) -
     return total * len(study.training_seeds)
 
 
-def _check_halving(study: Study, halving: object) -> None:
+def _check_halving(study: Study, halving: object) -> Halving:
     if not isinstance(halving, Halving):
         raise TypeError(f"halving must be a Halving; got {halving!r}")
     if STEPS in study.space.domains:
@@ -210,3 +170,4 @@ def _check_halving(study: Study, halving: object) -> None:
             "halving stops trainings at checkpoints; the study has none before the end at "
             f"{study.trainer.steps} steps"
         )
+    return halving

@@ -26,7 +26,7 @@ from typing import Any, cast
 import jax
 import numpy as np
 
-from verifai_jax.addons.clusters.executors import check_executor, gather
+from verifai_jax.addons.clusters.executors import gather
 from verifai_jax.addons.rl.policies import Policy
 from verifai_jax.addons.rl.policies import policy as load
 from verifai_jax.addons.rl.policies.onnx_graph import read_graph
@@ -59,7 +59,6 @@ class FunctionRuns(TrainingRuns):
     ) -> None:
         super().__init__(study, cache, clock)
         if executor is not None:
-            check_executor(executor)
         self._trainer = cast(FunctionTrainer, study.trainer)
         self._submit = None if executor is None else executor.submit
         trainer = self._trainer

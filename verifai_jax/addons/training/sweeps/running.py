@@ -1,13 +1,14 @@
 """The state of a sweep that runs: its configurations, training runs, returns and certificates."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 
 from verifai_jax._version import __version__
 from verifai_jax.addons.estimation.certification._certify import certify
+from verifai_jax.addons.estimation.certification.certification import Certification
 from verifai_jax.addons.estimation.certification.result import Certificate, Certificates
 from verifai_jax.addons.rl._evaluate import batched_mean_returns
 from verifai_jax.addons.training.sweeps import record
@@ -26,7 +27,7 @@ from verifai_jax.core.messages.errors import end_if_interrupted
 from verifai_jax.core.store.cache import Cache
 from verifai_jax.core.store.log import Arrays
 from verifai_jax.core.user_code.callbacks import Callback, notify
-from verifai_jax.search import Search
+from verifai_jax.evaluation.run_on import RunOn
 
 SCREENING = 64
 """Samples of a policy, and simulations of the attack on it, by which a search or halving chooses.
@@ -35,7 +36,7 @@ Certificates take fresh samples."""
 _MAX_BARREN = 64
 """Rounds of a search without a new configuration before proposals end."""
 FOR_TRAINING = 2 / 3
-"""Share of `max_seconds` after which no training begins, to leave time to certify."""
+"""Share of the seconds after which no training begins, to leave time to certify."""
 _LAST = 10**9
 """Number of a checkpoint beyond the last one of every training."""
 
@@ -61,7 +62,7 @@ class RunningSweep:
     cache: Cache
     clock: Clock
     halving: Halving | None
-    attack: str | Search
+    certified: Certification
     callbacks: tuple[Callback, ...] = ()
     calls: int = 0
     executor: Executor | None = None
@@ -245,14 +246,13 @@ class RunningSweep:
             # Other samples than those of the certificates.
             seed = int(np.random.SeedSequence([self.options["seed"], 1]).generate_state(1)[0])
             policies = [self._policy(entry) for entry in finite]
-            certificates = self._certify_policies(
-                policies,
+            screening = replace(
+                self.certified,
                 samples=samples,
                 budget=samples * len(policies),
-                seed=seed,
                 attack_simulations=min(SCREENING, self.options["attack_simulations"]),
-                progress=None,
             )
+            certificates = self._certify_policies(policies, screening, seed, progress=None)
             # A half-finished screening would change the proposals of a resumed sweep.
             end_if_interrupted(certificates.stopped)
             safety = dict(zip(finite, certificates.rows, strict=True))
@@ -286,13 +286,9 @@ class RunningSweep:
         with self.clock.stage(CERTIFYING, total, "simulations"):
             # Training may have been out of time before returns were measured.
             self._measure_returns(list(dict.fromkeys(run for run, _ in entries)))
+            policies = [self._policy(entry) for entry in entries]
             certificates = self._certify_policies(
-                [self._policy(entry) for entry in entries],
-                samples=self.options["samples"],
-                budget=self.options["budget"],
-                seed=self.options["seed"],
-                attack_simulations=self.options["attack_simulations"],
-                progress=self.clock.show,
+                policies, self.certified, self.options["seed"], progress=self.clock.show
             )
         self.safety = dict(zip(entries, certificates.rows, strict=True))
         for entry, safety in self.safety.items():
@@ -302,8 +298,9 @@ class RunningSweep:
         return certificates
 
     def _certify_policies(
-        self, policies: Sequence[record.TrainedPolicy], **options: Any
-    ) -> Certificates:
+        self, policies: Sequence[record.TrainedPolicy], certification: Certification, seed: int,
+        progress: Callable[[int, int, str], None] | None,
+    ) -> Certificates:  # fmt: skip
         def remember(name: str, compute: Callable[[], Arrays]) -> Arrays:
             try:
                 self.clock.check()
@@ -316,11 +313,11 @@ class RunningSweep:
             self.study.problem,
             policies,
             p=self.study.p,
-            confidence=self.options["confidence"],
-            attack=self.attack,
+            certification=certification,
+            seed=seed,
             remember=remember,
-            executor=self.executor,
-            **options,
+            run_on=RunOn(executor=self.executor),
+            progress=progress,
         )
 
     # The record

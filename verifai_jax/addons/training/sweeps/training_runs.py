@@ -18,7 +18,7 @@ import jax
 import numpy as np
 from jaxtyping import Array, Key
 
-from verifai_jax.addons.clusters.executors import Shipment, check_executor, gather, ship
+from verifai_jax.addons.clusters.executors import Shipment, gather, ship
 from verifai_jax.addons.rl.batched_training import BatchedTraining, Configuration, policy_structure
 from verifai_jax.addons.training.sweeps.clock import Clock, OutOfTime
 from verifai_jax.addons.training.sweeps.fingerprint import digest
@@ -95,10 +95,7 @@ class TrainingRuns:
     ) -> None:
         self.study, self.cache, self.clock = study, cache, clock
         self._executor = executor
-        self._shipment: Shipment[Study] | None = None
-        if executor is not None:
-            check_executor(executor)
-            self._shipment = ship(study, executor)
+        self._shipment: Shipment[Study] | None = None if executor is None else ship(study, executor)
         self.runs: list[TrainingRun] = []
         self.errors: dict[int, str] = {}
         self._checkpoints: dict[tuple[int, int], RunCheckpoint] = {}
