@@ -58,7 +58,6 @@ class FunctionRuns(TrainingRuns):
         self, study: Study, cache: Cache, clock: Clock, executor: Executor | None = None
     ) -> None:
         super().__init__(study, cache, clock)
-        if executor is not None:
         self._trainer = cast(FunctionTrainer, study.trainer)
         self._submit = None if executor is None else executor.submit
         trainer = self._trainer
