@@ -110,10 +110,7 @@ def check_columns(
 
 
 def _column(entries: Any, name: str) -> np.ndarray:
-    """Return a column of a table `[n]` with one value in each entry.
-
-    **Raises:** `ValueError` for an entry that is several, such as a list.
-    """
+    """Return a column of a table `[n]` with one value in each entry."""
     column = np.asarray(entries)
     if column.dtype == object and column.ndim == 1:
         column = np.fromiter(map(as_scalar, column), object, len(column))
