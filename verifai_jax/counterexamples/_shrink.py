@@ -14,10 +14,11 @@ import numpy as np
 from jaxtyping import Array, Float, Key
 
 from verifai_jax.core.compute.keys import run_keys
+from verifai_jax.core.display.extensions import verb
 from verifai_jax.core.display.progress import shows_progress
 from verifai_jax.core.messages.checks import check_count
 from verifai_jax.core.messages.errors import suggests_options, unknown_name
-from verifai_jax.counterexamples import likelier, selection
+from verifai_jax.counterexamples import selection
 from verifai_jax.counterexamples.candidates import Candidates
 from verifai_jax.counterexamples.fixed_key import fix_key, note_on_key
 from verifai_jax.counterexamples.minimize_count import grow, minimize_count, revert_features
@@ -167,6 +168,7 @@ def _origin(problem: Problem, by: str, nominal: Mapping[str, Any] | None) -> Nom
         raise ValueError(
             "by='likelihood' measures departures from the likeliest features; leave out nominal="
         )
+    verb("likelier")  # Without its add-on, which the search needs, it is refused here.
     return Likeliest.in_space(problem.space)
 
 
@@ -232,7 +234,8 @@ class _Search:
             if self.by == "distance":
                 grow(candidates, failures[:1], 1)
             revert_features(candidates, failures[0])
-        if self.by == "likelihood":
+        likelier = verb("likelier") if self.by == "likelihood" else None
+        if likelier is not None:
             if len(nominal.cube.continuous):
                 # Slopes lead farther than samples do.
                 half, spent = candidates.limit, candidates.simulations
@@ -243,15 +246,14 @@ class _Search:
             if len(nominal.cube.discrete):
                 likelier.exchange_cells(candidates, self.rng)
         self.note()
-        likely = self.by == "likelihood"
-        self.follow(self.starts(), rounds=15 if likely else 60)
+        self.follow(self.starts(), rounds=15 if likelier else 60)
         candidates.limit = candidates.budget - 2 * nominal.space.dim
-        self.follow(self.starts()[:1], rounds=15 if likely else 60)
+        self.follow(self.starts()[:1], rounds=15 if likelier else 60)
         # A boundary of many pieces has a nearest point on each: some of those next to this one.
         search_alongside(candidates, self.failures()[0], self.rng)
-        for _ in range(8 if likely else 1):
+        for _ in range(8 if likelier else 1):
             before = self.failures()[0]
-            if likely:
+            if likelier is not None:
                 likelier.shift_in_time(candidates, before)
             self.follow(self.starts(self.failures()[:1], cosine=0.97)[1:], rounds=10)
             if np.array_equal(self.failures()[0], before):

@@ -24,7 +24,6 @@ from verifai_jax.core.user_code.callbacks import Callback, check_callbacks
 from verifai_jax.evaluation.backends import resolved
 from verifai_jax.evaluation.engine import Wanted
 from verifai_jax.evaluation.run_on import RunOn
-from verifai_jax.falsification import cheap as cheaply
 from verifai_jax.falsification.derived import as_simulated
 from verifai_jax.falsification.loop import COMPILE, CONFIRM, REST, SEARCH, SIMULATE, Rounds
 from verifai_jax.falsification.model_changes import continued_with
@@ -135,6 +134,7 @@ def falsify(
     check_guide(problem, search)
     first = start.rows
     if start.cheap is not None:
+        cheaply = verb("cheap")
         cheaply.check_same_features(problem, start.cheap)
         options = {"seed": seed, "precision": precision, "confirm": False, "progress": False}
         found = falsify(start.cheap, budget=cheaply.budget_for(budget), **options)

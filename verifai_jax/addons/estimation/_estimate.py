@@ -29,6 +29,7 @@ from verifai_jax.addons.estimation.moved_priors import notice_own_chance
 from verifai_jax.addons.estimation.normal_space import LimitState
 from verifai_jax.addons.estimation.result import METHODS, WEIGHTED, Estimate
 from verifai_jax.addons.estimation.surrogate import FITTING, estimate_by_surrogate
+from verifai_jax.addons.searches.cheap import check_same_features
 from verifai_jax.core.compute.precision import in_precision
 from verifai_jax.core.display.progress import SimulationProgress, shows_progress
 from verifai_jax.core.messages.checks import check_fraction, check_options, options_of
@@ -36,7 +37,6 @@ from verifai_jax.core.messages.errors import suggests_options, unknown_name
 from verifai_jax.core.messages.text import listed
 from verifai_jax.evaluation.backends import resolved
 from verifai_jax.evaluation.run_on import RunOn
-from verifai_jax.falsification.cheap import check_same_features
 from verifai_jax.falsification.validation import SLOW, can_be_slow
 from verifai_jax.problem.dependence import depends_on_key, without_derivative
 from verifai_jax.problem.problem import Problem

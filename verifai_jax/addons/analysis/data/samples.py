@@ -282,7 +282,7 @@ class Samples:
             scaled = (rows[column.name].to_numpy(np.float64) - offset[j]) / width[j]
             absent = np.isnan(scaled)
             parts.append(np.where(absent, middles[j], scaled))
-            if self.table[column.name].isna().any():
+            if bool(self.table[column.name].isna().any()):
                 parts.append(_ABSENT * absent)
         coordinates = np.stack(parts, axis=1) if parts else np.zeros((len(rows), 0))
         codes = [column.codes(rows[column.name]) for column in self.unordered]
