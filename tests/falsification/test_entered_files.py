@@ -4,8 +4,10 @@ python tests/falsification/test_entered_files.py > docs/entered_files.txt    # a
 """
 
 import json
+import os
 import subprocess
 import sys
+import tempfile
 from pathlib import Path
 
 import pytest
@@ -48,7 +50,13 @@ print(json.dumps({"entered": entered, "imported": [*sys.modules]}))
 
 def one_call() -> dict[str, dict[str, str]]:
     """Return the files that one call enters, with the first function of each, and all modules."""
-    done = subprocess.run([sys.executable, "-c", PROGRAM], capture_output=True, text=True, cwd=ROOT)
+    ours = ("JAX_", "XLA_", "VERIFAI_JAX")
+    plain = {name: value for name, value in os.environ.items() if not name.startswith(ours)}
+    with tempfile.TemporaryDirectory() as cache:
+        done = subprocess.run(
+            [sys.executable, "-c", PROGRAM], capture_output=True, text=True, cwd=ROOT,
+            env=plain | {"VERIFAI_JAX_CACHE": cache, "PYTHONPATH": str(ROOT)},
+        )  # fmt: skip
     assert done.returncode == 0, done.stderr
     return json.loads(done.stdout.splitlines()[-1])
 
