@@ -91,6 +91,7 @@ def test_slopes_are_left_out_where_there_are_none():
     assert notes[0] in run.notes
 
 
+@pytest.mark.addons
 @pytest.mark.slow
 def test_diverse_failures_are_of_both_kinds():
     def system(features, key):

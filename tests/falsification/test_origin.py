@@ -25,7 +25,6 @@ OTHERS = {
     [
         ("uniform", 0, "prior"),
         ("uniform", 3, "first"),
-        (searches.Diverse(searches.Uniform()), 0, "prior"),
         ("halton", 0, "sequence"),
         ("halton", 3, "sequence"),
         ("sobol", 0, "sequence"),

@@ -2,7 +2,7 @@
 
 import inspect
 from concurrent.futures import ProcessPoolExecutor
-from types import SimpleNamespace
+from dataclasses import dataclass
 
 import numpy as np
 import pytest
@@ -92,6 +92,7 @@ def test_a_problem_keeps_its_target_in_what_is_derived_from_it(tmp_path):
     assert again.target == "specs/f.py:flat"
 
 
+@pytest.mark.addons
 def test_an_archive_of_failures_has_room_for_those_that_are_wanted():
     stop = vj.Stop(after=300)
     run = vj.falsify(PROBLEM, vj.search.Diverse(capacity=20), 16, stop=stop, progress=False)
@@ -99,6 +100,14 @@ def test_an_archive_of_failures_has_room_for_those_that_are_wanted():
     assert run.batch <= 16
 
 
+@dataclass(frozen=True)
+class Around(vj.search.Wrapper):
+    """A search around another one that no package registers."""
+
+    search: vj.search.Search
+
+
+@pytest.mark.addons
 def test_names_of_searches_around_others():
     assert vj.search.named("diverse") == vj.search.Diverse(vj.search.Portfolio())
     assert vj.search.named("likeliest") == vj.search.Likeliest(vj.search.CrossEntropy())
@@ -106,4 +115,8 @@ def test_names_of_searches_around_others():
     rows = vj.falsify(PROBLEM, "diverse", 40, progress=False).table.all
     told = vj.falsify(PROBLEM, vj.search.Diverse(), 40, progress=False).table.all
     assert rows.equals(told)
-    assert SimpleNamespace(**vj.search.to_json(vj.search.Likeliest())).likeliest
+    inner = {"name": "cross_entropy", "options": vars(vj.search.CrossEntropy())}
+    described = vj.search.to_json(vj.search.Likeliest())
+    assert described == {"name": "likeliest", "options": {"search": inner}}
+    own = Around(vj.search.Uniform())
+    assert vj.search.to_json(own) is vj.search.to_json(vj.search.Diverse(own)) is None

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 from playing import tell_of
 
+from verifai_jax import search as searches
 from verifai_jax.core.values.cube import Cube
-from verifai_jax.search import Diverse, Portfolio, descent
+from verifai_jax.search import Portfolio, descent
 from verifai_jax.search.portfolio import MANY, PATIENT, PortfolioStage
 
 CUBE = Cube((0,) * 3)
@@ -75,10 +76,11 @@ def test_without_gradients_there_is_one_stage():
     assert Portfolio().stage(None, choices, 1000) == Portfolio()
 
 
+@pytest.mark.addons
 def test_a_search_for_diverse_failures_has_the_stages_of_the_one_inside():
-    search = Diverse(Portfolio())
+    search = searches.Diverse(Portfolio())
     state = search.init(jax.random.key(0), CUBE, 4)
-    assert search.stage(state, CUBE, 4) == Diverse(DESCENDS)
+    assert search.stage(state, CUBE, 4) == searches.Diverse(DESCENDS)
     inner = state.inner._replace(interior=state.inner.interior._replace(cost=jnp.float32(1e4)))
     assert search.stage(state._replace(inner=inner), CUBE, 4) is search
 

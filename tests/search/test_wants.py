@@ -13,7 +13,6 @@ import verifai_jax as vj
 from verifai_jax.core.values.cube import Cube
 from verifai_jax.search import (
     CrossEntropy,
-    Diverse,
     Gradient,
     Halton,
     Observations,
@@ -68,11 +67,12 @@ def test_around_any_search_a_wrapper_is_what_that_one_is(name):
     )
 
 
+@pytest.mark.addons
 @pytest.mark.parametrize("name", [name for name in names() if name != "likeliest"])
 def test_a_search_kept_away_from_failures_wants_what_it_is_around_wants(name):
     wants = named(name).wants
     for by in ("inputs", "behaviour"):
-        around = Diverse(named(name), by=by).wants
+        around = vj.search.Diverse(named(name), by=by).wants
         assert around.no_verdict_rows == wants.no_verdict_rows
         assert around.max_batch == min(wants.max_batch, 16)
         assert around.outcomes == (by == "behaviour")
@@ -137,13 +137,14 @@ def test_what_takes_the_place_of_a_search():
     assert Portfolio().fallback == without
     assert without.fallback is None
     assert Gradient().fallback is None
-    assert Diverse(Portfolio()).fallback == Diverse(without)
     assert Split({"x": Portfolio()}, Halton()).fallback == Split({"x": without}, Halton())
     assert Split({"x": Gradient()}, Portfolio()).fallback is None
     assert Split({"x": Uniform()}, Halton()).fallback is None
     assert Gradient().needs_derivatives
     assert Split({"x": Gradient()}, Portfolio()).needs_derivatives
-    assert not Diverse(Portfolio()).needs_derivatives
+    around = Rounded(Portfolio())
+    assert around.fallback == Rounded(without)
+    assert not around.needs_derivatives
 
 
 def test_a_wrapper_of_given_points_is_one_of_given_points():
@@ -163,7 +164,7 @@ def test_a_wrapper_that_moves_points_has_none_of_the_prior():
 
     assert Rounded(Uniform()).origin == "prior"
     assert Moved(Uniform()).origin == "sequence"
-    assert Diverse(Moved(Uniform())).origin == "sequence"
+    assert Rounded(Moved(Uniform())).origin == "sequence"
 
 
 def test_a_wrapper_needs_a_search():
@@ -179,6 +180,7 @@ def test_a_wrapper_keeps_the_contract():
     check_search(Rounded(CrossEntropy()), CUBE)
 
 
+@pytest.mark.addons
 @pytest.mark.slow
 def test_a_diverse_portfolio_does_without_gradients_of_a_black_box():
     space = vj.FeatureSpace({"x": vj.Box(-1, 1)})
@@ -188,6 +190,6 @@ def test_a_diverse_portfolio_does_without_gradients_of_a_black_box():
         return vj.Trace({"z": np.full(3, features["x"])}, dt=1.0)
 
     problem = vj.Problem("black", space, system, "always (z > -0.5)")
-    run = vj.falsify(problem, Diverse(Portfolio()), 24, batch=8, progress=False)
-    assert run.search == repr(Diverse(Portfolio(gradients=False)))
+    run = vj.falsify(problem, vj.search.Diverse(Portfolio()), 24, batch=8, progress=False)
+    assert run.search == repr(vj.search.Diverse(Portfolio(gradients=False)))
     assert any("without gradients: the system is a black box" in note for note in run.notes)

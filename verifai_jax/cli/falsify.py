@@ -78,7 +78,7 @@ def falsify(
     from verifai_jax import falsification
     from verifai_jax.core.compute.compilation import while_compiling
     from verifai_jax.core.display import figure
-    from verifai_jax.search import Diverse, Likeliest, named
+    from verifai_jax.search import named
 
     if pictures:
         while_compiling(figure.load)
@@ -104,9 +104,9 @@ def falsify(
         usual = "cross_entropy" if likely and not options else "portfolio"
         chosen = named(search or usual, **arguments.plain_values("--set", options))
         if diverse or diverse_by:
-            chosen = Diverse(chosen, by=diverse_by or "inputs")
+            chosen = named("diverse", search=chosen, by=diverse_by or "inputs")
         if likely:
-            chosen = Likeliest(chosen)
+            chosen = named("likeliest", search=chosen)
         auto = not (search or options or diverse or diverse_by or likely)
         if fail_on is not None and fail_on.name == RATE and not chosen.samples_prior:
             raise click.UsageError(

@@ -129,8 +129,7 @@ def falsify(
         problem, of_rest = proof.rest(problem, precision), (proof.note,)
     chooses = start.search == AUTO
     search = check_search(problem, "portfolio" if chooses else start.search)
-    if isinstance(search, searches.Diverse) and (stop.after or 0) > search.capacity:
-        search = replace(search, capacity=stop.after)
+    search = search.counting(stop.after or 0)
     check_objective(problem, search)
     check_rule(search, stop.when)
     check_guide(problem, search)

@@ -20,14 +20,7 @@ from verifai_jax.core.store.foreign_archives import read_parquet
 from verifai_jax.core.store.locks import settled
 from verifai_jax.core.store.log import Log, write_log
 from verifai_jax.falsification import segments
-from verifai_jax.falsification.columns import (
-    Columns,
-    cut,
-    from_frame,
-    length,
-    merge,
-    wrong_column,
-)
+from verifai_jax.falsification.columns import Columns, cut, from_frame, length, merge, wrong_column
 from verifai_jax.falsification.segments import (
     SEGMENTS,
     TAIL,

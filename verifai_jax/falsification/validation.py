@@ -178,9 +178,7 @@ def adapt_search(
 
 def _label(search: Search) -> str:
     """Return the name of a search, or its text where it has none."""
-    inner = isinstance(search, searches.Diverse | searches.Likeliest)
-    named = search.search if inner else search
-    return str((searches.to_json(named) or {}).get("name", named))
+    return str((searches.to_json(search) or {}).get("name", search))
 
 
 def _why_no_derivatives(problem: Problem) -> str | None:

@@ -26,10 +26,7 @@ class Film(Protocol):
     has_cameras: bool
 
     def gif(
-        self,
-        size: Sequence[int] | None = None,
-        camera: str | None = None,
-        fps: float | None = None,
+        self, size: Sequence[int] | None = None, camera: str | None = None, fps: float | None = None
     ) -> bytes:
         """Return an animated GIF; sizes in pixels, frames per second.
 

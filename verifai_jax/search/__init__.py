@@ -5,7 +5,7 @@ named("cross_entropy", elite=0.2)
 split({"wind": "cross_entropy"}, rest="halton")
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import fields
 from typing import TYPE_CHECKING, Any, cast
 
@@ -22,11 +22,9 @@ if TYPE_CHECKING:
     from verifai_jax.search.base import Wants as Wants
     from verifai_jax.search.cross_entropy import CrossEntropy as CrossEntropy
     from verifai_jax.search.descent import Descent as Descent
-    from verifai_jax.search.diverse import Diverse as Diverse
-    from verifai_jax.search.diverse import distinct as distinct
+    from verifai_jax.search.distances import distinct as distinct
     from verifai_jax.search.gradient import Gradient as Gradient
     from verifai_jax.search.halton import Halton as Halton
-    from verifai_jax.search.likeliest import Likeliest as Likeliest
     from verifai_jax.search.mutation import Mutation as Mutation
     from verifai_jax.search.point_list import PointList as PointList
     from verifai_jax.search.portfolio import Portfolio as Portfolio
@@ -42,12 +40,9 @@ _SEARCHES = {
     "gradient": "Gradient",
     "descent": "Descent",
     "portfolio": "Portfolio",
-    "diverse": "Diverse",
-    "likeliest": "Likeliest",
 }
 GROUP = "verifai_jax.searches"
 """Entry points of searches of other packages, by name."""
-_WRAPPERS = {"diverse": "Diverse", "likeliest": "Likeliest"}
 # Imported when first used: a run needs few of these searches.
 __getattr__, __dir__, __all__ = attach(
     __name__, "from_json", "named", "names", "split", "to_json", group=GROUP, classes=True
@@ -96,6 +91,8 @@ def _as_search(search: "str | Search") -> "Search":
 
 def to_json(search: "Search") -> dict[str, Any] | None:
     """Describe a search as plain data; None for one that has no name here."""
+    from verifai_jax.search.base import Search
+
     kind, ours = type(search), type(search).__module__.startswith(f"{__name__}.")
     # By the name of its class, since comparing with the classes would import all of them.
     known = {of: name for name, of in _SEARCHES.items()} if ours else entries(GROUP, classes=True)
@@ -109,11 +106,10 @@ def to_json(search: "Search") -> dict[str, Any] | None:
         whole = rest is not None and all(part is not None for _, part in parts)
         return {"split": parts, "rest": rest} if whole else None
     options = {f.name: getattr(search, f.name) for f in fields(cast(Any, search))}
-    if ours and kind.__name__ in _WRAPPERS.values():
-        described: dict[str, Any] = {kind.__name__.lower(): to_json(options.pop("search"))}
-        whole = described[kind.__name__.lower()] is not None
-        return described | ({"options": options} if options else {}) if whole else None
-    return None if name is None else {"name": name, "options": options}
+    inner = {at: to_json(each) for at, each in options.items() if isinstance(each, Search)}
+    if name is None or None in inner.values():
+        return None
+    return {"name": name, "options": options | inner}
 
 
 def from_json(data: Mapping[str, Any]) -> "Search":
@@ -127,14 +123,9 @@ def from_json(data: Mapping[str, Any]) -> "Search":
         return Split(
             {name: from_json(part) for name, part in data["split"]}, from_json(data["rest"])
         )
-    for name, kind in _WRAPPERS.items():
-        if name in data:
-            options = dict(data.get("options", {}), search=from_json(data[name]))
-            return lazy_import(__name__, kind)(**options)
     if not isinstance(data.get("options"), Mapping):
         raise ValueError(f"this does not describe a search: {data!r}")
-    options = {
-        name: tuple(value) if isinstance(value, list) else value
-        for name, value in data["options"].items()
-    }
+    # A search around another one has that as an option.
+    made: dict[type, Callable[[Any], Any]] = {list: tuple, dict: from_json}
+    options = {at: made.get(type(it), lambda it: it)(it) for at, it in data["options"].items()}
     return named(data["name"], **options)

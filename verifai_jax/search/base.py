@@ -221,8 +221,8 @@ class Search(ForUsers, abc.ABC, Generic[State]):
     """
 
     _internal = frozenset((
-        "distinct", "fallback", "learns", "needs_derivatives", "origin", "plan", "samples_prior",
-        "sequence", "stage", "temperature", "total", "wants", "warm_start",
+        "counting", "distinct", "fallback", "learns", "needs_derivatives", "origin", "plan",
+        "samples_prior", "sequence", "stage", "temperature", "total", "wants", "warm_start",
     ))  # fmt: skip
 
     @property
@@ -296,6 +296,10 @@ class Search(ForUsers, abc.ABC, Generic[State]):
         None for a search that does not count them.
         """
         return None
+
+    def counting(self, failures: int) -> "Search[State]":
+        """Return this search with room for so many failures that are far from each other."""
+        return self
 
     def stage(self, state: State | None, cube: Cube, batch: int) -> "Search[State]":
         """Return the search for the next round: this one, or only its members that take part.

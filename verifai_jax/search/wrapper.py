@@ -88,6 +88,10 @@ class Wrapper(Search[State]):
     def total(self, cube: Cube) -> int | None:
         return self.search.total(cube)
 
+    def counting(self, failures: int) -> Search[State]:
+        inner = self.search.counting(failures)
+        return self if inner == self.search else self._around(inner)
+
     def stage(self, state: State | None, cube: Cube, batch: int) -> Search[State]:
         inner = self.search.stage(None if state is None else self.inner_state(state), cube, batch)
         return self if inner == self.search else self._around(inner)

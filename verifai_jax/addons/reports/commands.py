@@ -18,16 +18,16 @@ def run_command(run: Run) -> str | None:
     A run of a problem without a file, or a search without a name, is repeated in Python.
     """
     search = run.search_data or {}
-    objective = ["--objective", "likelihood"] if "likeliest" in search else []
-    search = search.get("likeliest", search)
-    if run.target is None or not search or "name" not in search or run.derived:
+    likely = search.get("name") == "likeliest"
+    search = search["options"]["search"] if likely else search
+    if run.target is None or run.derived or search.get("name") in (None, "diverse"):
         return None
     words = ["verifai-jax", "falsify", run.target, "--search", str(search["name"])]
     words += _options_of_search(str(search["name"]), search.get("options") or {})
     # As many as were made: what ended the run before is no option of a repetition.
     budget = run.budget if run.stopped == "budget" and run.budget else run.simulations
     words += ["--budget", str(budget), "--batch", str(run.batch), "--seed", str(run.seed)]
-    words += objective
+    words += ["--objective", "likelihood"] if likely else []
     if run.precision != "float32":
         words += ["--precision", run.precision]
     if run.backend is not None:

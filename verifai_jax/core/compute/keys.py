@@ -32,9 +32,7 @@ def simulation_key(key: Key[Array, ""], row: Int[Array, ""] | int) -> Key[Array,
     return jax.random.fold_in(key, row)
 
 
-def mixed_bits(
-    value: UInt32[Array | np.ndarray, "*shape"],
-) -> UInt32[Array | np.ndarray, "*shape"]:
+def mixed_bits(value: UInt32[Array | np.ndarray, "*shape"]) -> UInt32[Array | np.ndarray, "*shape"]:
     """Mix the bits of numbers, as a hash does: the finalizer of MurmurHash3."""
     for shift, factor in ((16, 0x85EBCA6B), (13, 0xC2B2AE35)):
         value = (value ^ (value >> shift)) * np.uint32(factor)

@@ -30,10 +30,7 @@ class EpisodeFilm:
         return self.episode.draws
 
     def gif(
-        self,
-        size: Sequence[int] | None = None,
-        camera: str | None = None,
-        fps: float | None = None,
+        self, size: Sequence[int] | None = None, camera: str | None = None, fps: float | None = None
     ) -> bytes:
         """Return an animated GIF."""
         return film_episode(self.episode, self.replay, size, fps)

@@ -25,10 +25,7 @@ class MuJoCoFilm:
         return record(self.replay)
 
     def gif(
-        self,
-        size: Sequence[int] | None = None,
-        camera: str | None = None,
-        fps: float | None = None,
+        self, size: Sequence[int] | None = None, camera: str | None = None, fps: float | None = None
     ) -> bytes:
         """Return an animated GIF."""
         pixels = None if size is None else (int(size[0]), int(size[1]))

@@ -345,11 +345,7 @@ class Work:
         )  # fmt: skip
 
 
-def _as_study(
-    given: object,
-    problem: Callable[[Any], Problem] | None,
-    p: float | None,
-) -> Study:
+def _as_study(given: object, problem: Callable[[Any], Problem] | None, p: float | None) -> Study:
     if isinstance(given, Study):
         if problem is not None:
             raise ValueError("a Study has its own problem; leave out problem=")

@@ -11,9 +11,9 @@ from dataclasses import dataclass, field, replace
 
 from jaxtyping import PyTree
 
+from verifai_jax.addons.searches.diverse import EITHER, Diverse
 from verifai_jax.search.base import Search, Wants
 from verifai_jax.search.cross_entropy import CrossEntropy
-from verifai_jax.search.diverse import EITHER, Diverse
 from verifai_jax.search.wrapper import Wrapper
 
 MAX_BATCH = 64

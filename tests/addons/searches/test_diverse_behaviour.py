@@ -9,6 +9,7 @@ import pytest
 from checked_types import unchecked
 
 import verifai_jax as vj
+from verifai_jax.addons.searches.behaviour import SeenBehaviour
 from verifai_jax.core.values.clauses import OUTCOME, SEGMENTS
 from verifai_jax.core.values.cube import Cube
 from verifai_jax.evaluation.evaluator import Evaluator
@@ -16,7 +17,6 @@ from verifai_jax.evaluation.guidance import Guidance, outcome_of
 from verifai_jax.mtl import explain, parse
 from verifai_jax.mtl.deciding import deciding_instant, leaves_of
 from verifai_jax.search import CrossEntropy, Diverse, from_json, to_json
-from verifai_jax.search.behaviour import SeenBehaviour
 from verifai_jax.testing import check_search
 
 FORMULAS = [

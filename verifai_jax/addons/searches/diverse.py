@@ -13,13 +13,12 @@ on Scientific Computing 37(4), 2015). After an archived failure the search resta
 points elsewhere, since its state would lead back to that failure. Without progress towards a new
 failure the radius shrinks, so that first the modes are found and then filled.
 
-With `by="behaviour"` the distance is that of outcomes (`search/behaviour.py`), for any inputs. If
+With `by="behaviour"` the distance is that of outcomes (`behaviour.py`), for any inputs. If
 all safe points have the same robustness, the search observes a value that rises with the
 familiarity of their behaviour (novelty search: Lehman, Stanley, Abandoning objectives: evolution
 through the search for novelty alone, Evolutionary Computation 19(2), 2011).
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import ClassVar, Literal, NamedTuple
 
@@ -28,12 +27,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
+from verifai_jax.addons.searches.behaviour import SeenBehaviour, is_known
 from verifai_jax.core.messages.errors import unknown_name
 from verifai_jax.core.values.clauses import OUTCOME
 from verifai_jax.core.values.cube import Cube
 from verifai_jax.search.base import Observations, Search, Wants, check_options
-from verifai_jax.search.behaviour import SeenBehaviour, is_known
 from verifai_jax.search.clause_values import NOTHING
+from verifai_jax.search.distances import apart
 from verifai_jax.search.portfolio import Portfolio
 from verifai_jax.search.wrapper import Learn, Wrapper
 
@@ -85,7 +85,7 @@ class Diverse(Wrapper[DiverseState]):
     - `capacity`: size of the archive, the maximum number of distinct failures. A run that stops
       after more failures gets more.
     - `by`: the distance that separates failures: `"inputs"`, or `"behaviour"`, for which the radius
-      is a share of the possible difference (`search.behaviour.unlike`).
+      is a share of the possible difference (`behaviour.SeenBehaviour.unlike`).
     **Raises:** `TypeError` for anything that is not a search; `ValueError` for values out of range.
     """
 
@@ -130,6 +130,9 @@ class Diverse(Wrapper[DiverseState]):
 
     def distinct(self, state: DiverseState) -> Int[Array, ""]:
         return state.count
+
+    def counting(self, failures: int) -> "Diverse":
+        return replace(self, capacity=max(self.capacity, failures))
 
     def inner_state(self, state: DiverseState) -> PyTree:
         return state.inner
@@ -334,49 +337,3 @@ class Diverse(Wrapper[DiverseState]):
         raised = self._raise(state, cube, Points(state.points, happened), rho)
         observed = Observations(state.points, raised, known, outcomes=happened)
         return self.search.warm_start(inner, cube, observed)
-
-
-def apart(cube: Cube, one: Float[Array, "n d"], other: Float[Array, "m d"]) -> Float[Array, "n m"]:
-    """Return root mean square differences over coordinates; choices differ by 0 or 1."""
-    if cube.dim == 0:
-        return jnp.zeros((len(one), len(other)), jnp.float32)
-    square = jnp.zeros((len(one), len(other)), jnp.float32)
-    if len(cube.continuous):
-        a, b = one[:, cube.continuous], other[:, cube.continuous]
-        # Coordinate by coordinate: the product form would cancel digits of small distances.
-        square = jnp.sum((a[:, None, :] - b[None, :, :]) ** 2, axis=-1)
-    if len(cube.discrete):
-        levels = np.array([max(cube.levels[i] - 1, 1) for i in cube.discrete], np.float32)
-        ordered = np.array([cube.ordered[i] for i in cube.discrete])
-        steps = cube.cells(one)[:, None, :] - cube.cells(other)[None, :, :]
-        gap = jnp.where(ordered, jnp.abs(steps) / levels, (steps != 0).astype(jnp.float32))
-        square += jnp.sum(gap**2, axis=-1)
-    return jnp.sqrt(square / cube.dim)
-
-
-def distinct(
-    points: Sequence | np.ndarray | Array,
-    radius: float,
-    cube: Cube | None = None,
-    order: Sequence[int] | np.ndarray | None = None,
-) -> Int[np.ndarray, " k"]:
-    """Choose distinct points: no two of them are within the radius.
-
-    The first point is chosen, then each one beyond the radius of all chosen points.
-
-    **Arguments:**
-    - `points`: `[n, d]`, in the unit cube.
-    - `radius`: root mean square distance over the coordinates, as in `Diverse`.
-    - `cube`: the unit cube of the space; when left out, all coordinates are continuous.
-    - `order`: indices of the points by preference, such as `np.argsort(rho)`.
-    **Returns:** indices `[k]` of the chosen points, in that order.
-    """
-    u = np.asarray(points, np.float32)
-    cube = cube or Cube((0,) * u.shape[1])
-    chosen: list[int] = []
-    near = np.zeros(len(u), bool)
-    for i in range(len(u)) if order is None else np.asarray(order):
-        if not near[i]:
-            chosen.append(int(i))
-            near |= np.asarray(apart(cube, u[i][None], u))[0] <= radius  # pyright: ignore[reportArgumentType]
-    return np.array(chosen, int)

@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 from checked_types import unchecked
 
+from verifai_jax.addons.searches.diverse import Diverse, Points
 from verifai_jax.core.values.cube import Cube
 from verifai_jax.search import CrossEntropy, Gradient, Observations, Search, Uniform, Wants
-from verifai_jax.search.diverse import Diverse, Points, apart, distinct
+from verifai_jax.search.distances import apart, distinct
 from verifai_jax.testing import check_search
 
 MIXED = Cube((0, 4, 0, 3), ordered=(True, True, True, False))
