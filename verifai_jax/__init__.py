@@ -54,6 +54,7 @@ if TYPE_CHECKING:
     from verifai_jax.addons.scenic import ProgramError as ProgramError
     from verifai_jax.addons.scenic import ScenicProgram as ScenicProgram
     from verifai_jax.addons.scenic import scenic as scenic
+    from verifai_jax.addons.simulators import blocks as blocks
     from verifai_jax.addons.simulators.environments import brax as brax
     from verifai_jax.addons.simulators.environments import gymnasium as gymnasium
     from verifai_jax.addons.simulators.environments import gymnax as gymnax
@@ -78,6 +79,8 @@ if TYPE_CHECKING:
     from verifai_jax.addons.training.hardening import FurtherTraining as FurtherTraining
     from verifai_jax.addons.training.hardening import Hardening as Hardening
     from verifai_jax.addons.training.hardening import harden as harden
+    from verifai_jax.addons.training.loggers import CSVLogger as CSVLogger
+    from verifai_jax.addons.training.loggers import TensorBoardLogger as TensorBoardLogger
     from verifai_jax.addons.training.sweeps import Halving as Halving
     from verifai_jax.addons.training.sweeps import OptunaSampler as OptunaSampler
     from verifai_jax.addons.training.sweeps import Study as Study
@@ -89,8 +92,6 @@ if TYPE_CHECKING:
     from verifai_jax.addons.verification import Verification as Verification
     from verifai_jax.addons.verification import load_verification as load_verification
     from verifai_jax.addons.verification import verify as verify
-    from verifai_jax.core.store.loggers import CSVLogger as CSVLogger
-    from verifai_jax.core.store.loggers import TensorBoardLogger as TensorBoardLogger
     from verifai_jax.core.values.trace import Status as Status
     from verifai_jax.core.values.trace import Trace as Trace
     from verifai_jax.core.values.waveform import Waveform as Waveform
@@ -153,7 +154,6 @@ if TYPE_CHECKING:
     from verifai_jax.systems.base import System as System
     from verifai_jax.systems.blackbox import blackbox as blackbox
     from verifai_jax.systems.blackbox import stack_traces as stack_traces
-    from verifai_jax.systems.ode import blocks as blocks
     from verifai_jax.systems.ode import ode as ode
     from verifai_jax.systems.ode import sin_cos as sin_cos
 # Imported when first used (PEP 562), so that importing this package takes milliseconds.

@@ -22,7 +22,13 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from envs.arch.stepped import Features, Scalar, Stepped, real, repeated, value, whole
-from verifai_jax.systems.ode.blocks import DelayLine, LookupTable, delay_line, hysteresis, latch
+from verifai_jax.addons.simulators.blocks import (
+    DelayLine,
+    LookupTable,
+    delay_line,
+    hysteresis,
+    latch,
+)
 
 DT = 0.01
 STEPS = 4

@@ -70,7 +70,7 @@ def test_falsify_and_replay(call, tmp_path):
     command = next(line for line in output.splitlines() if "verifai-jax replay" in line)
     again = call(*command.split("verifai-jax ")[1].split())
     assert "violated" in again
-    call("falsify", "specs/ramp.py:ramp", "--search", "sobol", "--budget", 20, "--no-pictures")
+    call("falsify", "specs/ramp.py:ramp", "--search", "halton", "--budget", 20, "--no-pictures")
     assert (tmp_path / "runs" / "ramp-2" / "table.parquet").exists()
 
 

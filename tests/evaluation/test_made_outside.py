@@ -13,7 +13,7 @@ import verifai_jax as vj
 from verifai_jax.core.compute.keys import run_keys
 from verifai_jax.evaluation.confirmer import Confirmer
 from verifai_jax.evaluation.replay import replay
-from verifai_jax.systems.ode.blocks import LookupTable, delay_line
+from verifai_jax.systems.ode.delay_line import delay_line
 
 CAR = vj.Struct({"size": vj.Box(1, 2), "at": vj.Struct({"kind": vj.Categorical("a", "b")})})
 
@@ -92,9 +92,9 @@ def _in_memory():
         line = m["line"].push(t, jnp.stack([s["x"], s["x"]]))
         return GAIN * line.at(t - f["lag"])[0], {"line": line, "sum": GAIN}
 
-    table = LookupTable(jnp.asarray([0.0, 1.0]), jnp.asarray([0.0, 1.0]))
+    table = jnp.asarray([0.0, 1.0])
     return vj.ode(
-        lambda t, s, c, f: {"x": table(f["v"]) - c},
+        lambda t, s, c, f: {"x": f["v"] * table[1] - c},
         lambda f, key: {"x": f["v"]},
         controller=control, controller_memory=MEMORY, dt=0.1, duration=1.0,
     )  # fmt: skip

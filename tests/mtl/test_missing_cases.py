@@ -9,11 +9,11 @@ import pytest
 from checked_types import unchecked
 
 from verifai_jax import mtl
+from verifai_jax.core.display.lazy import lazy_import
 from verifai_jax.core.values.trace import Trace
 from verifai_jax.mtl import formula as ast
 from verifai_jax.mtl import parse
 from verifai_jax.mtl.clauses import goals_of
-from verifai_jax.mtl.english import formula_words
 from verifai_jax.mtl.expression import Arithmetic, expression
 from verifai_jax.mtl.rewriting import nnf, simplify
 
@@ -46,11 +46,17 @@ WALKS = {
     "the explanation": lambda f: mtl.explain(f, TRACE),
     "the goals": lambda f: goals_of([f]),
     "the normalization": lambda f: mtl.normalize(f, {"x": 1.0}),
-    "the words": formula_words,
+    "the words": lambda f: lazy_import("verifai_jax.addons.reports.english", "formula_words")(f),
 }
 
 
-@pytest.mark.parametrize("walk", WALKS)
+OF_ADD_ONS = ("the normalization", "the words")
+
+
+@pytest.mark.parametrize(
+    "walk",
+    [pytest.param(e, marks=pytest.mark.addons if e in OF_ADD_ONS else ()) for e in WALKS],
+)
 @pytest.mark.parametrize("node", [Mostly(parse("x > 0")), Coin()], ids=["operator", "leaf"])
 @pytest.mark.parametrize("inside", [False, True], ids=["root", "inside"])
 def test_a_node_without_a_case_is_an_error_that_names_both(walk, node, inside):

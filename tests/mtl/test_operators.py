@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 
 from verifai_jax import mtl
+from verifai_jax.core.display.lazy import lazy_import
 from verifai_jax.core.values.trace import Trace
 from verifai_jax.mtl import formula as ast
 from verifai_jax.mtl import parse
 from verifai_jax.mtl.clauses import goals_of
-from verifai_jax.mtl.english import formula_words
 from verifai_jax.mtl.rewriting import expand
 from verifai_jax.mtl.words import OPERATORS, WORDS, Operator
 
@@ -39,7 +39,6 @@ def test_an_operator_is_read_as_it_is_built_and_printed(word):
     assert ast.surface(f)[0] == word
     assert parse(str(f)) == f
     assert operator.latex in mtl.latex(f)
-    assert "{" not in formula_words(f)
     looks = {"ahead": f.horizon(1.0), "back": f.history(1.0)}
     assert (operator.side == "") == (looks == {"ahead": 0, "back": 0})
     assert all(seconds == 0 for side, seconds in looks.items() if side != operator.side)
@@ -87,18 +86,24 @@ def weak_since(monkeypatch):
     )
 
 
-def test_an_operator_made_of_others_is_written_and_looked_at_as_any(weak_since):
-    assert str(weak_since) == "always[0,4] ((x > 0) weak_since[1,2] (y > 0))"
-    assert r"\mathcal{B}}_{[1, 2]}" in mtl.latex(weak_since)
-    assert formula_words(weak_since) == (
+@pytest.mark.addons
+def test_add_ons_write_and_scale_an_operator_made_of_others(weak_since):
+    words = lazy_import("verifai_jax.addons.reports.english", "formula_words")
+    assert words(weak_since) == (
         "at all times from 0 s to 4 s, (x is above 0 since y is above 0, 1 s to 2 s ago, or all "
         "the time)"
     )
-    assert (weak_since.horizon(1.0), weak_since.history(1.0)) == (4, 2)
-    assert weak_since.temporal_depth == 2
     assert mtl.normalize(weak_since, {"x": 2.0, "y": 1.0}) == ast.Always(
         WeakSince(parse("x / 2 > 0"), parse("y / 1 > 0"), ast.Interval(1, 2)), ast.Interval(0, 4)
     )
+    assert not any("{" in words(made(word)) for word in OPERATORS)
+
+
+def test_an_operator_made_of_others_is_written_and_looked_at_as_any(weak_since):
+    assert str(weak_since) == "always[0,4] ((x > 0) weak_since[1,2] (y > 0))"
+    assert r"\mathcal{B}}_{[1, 2]}" in mtl.latex(weak_since)
+    assert (weak_since.horizon(1.0), weak_since.history(1.0)) == (4, 2)
+    assert weak_since.temporal_depth == 2
     assert mtl.nnf(~weak_since) == mtl.nnf(~expand(weak_since))
     assert goals_of([weak_since]) == goals_of([expand(weak_since)])
 

@@ -89,7 +89,7 @@ def test_accepted_samples_follow_the_prior_given_the_constraint():
 
 @pytest.mark.thorough
 def test_sequences_do_not_depend_on_the_batch():
-    for name in ("uniform", "halton", "sobol"):
+    for name in ("uniform", "halton"):
         small, large = (
             Proposals(named(name), SPACE.cube, batch, KEY, SPACE.constraint) for batch in (8, 64)
         )

@@ -261,10 +261,7 @@ def read_record(folder: Path) -> dict[str, Any]:
 
 
 def _check_entries(record: Mapping[str, Any], folder: Path) -> None:
-    """Refuse a record with other entries, written by another version of verifai_jax.
-
-    **Raises:** `DamagedError`.
-    """
+    """Refuse a record with other entries, written by another version of verifai_jax."""
     if other := sorted(record.keys() ^ {"features", *RECORDED}):
         version = one_line(str(record.get("version", "unknown")), 40)
         names = one_line(", ".join(map(repr, other)), 80)

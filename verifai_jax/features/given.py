@@ -47,7 +47,7 @@ def given_features(space: FeatureSpace, rows: Rows, precision: str = "float32") 
     **Raises:** `ValueError` that names the first row and feature that is missing, unknown, outside
     its domain or refused by the constraint; `TypeError` for rows of another type.
     """
-    if _is_frame(rows):
+    if hasattr(rows, "columns") and hasattr(rows, "to_dict"):
         frame: Any = rows
         columns = _by_name(space, list(frame), lambda name: frame[name])
         if len(frame):
@@ -110,10 +110,7 @@ def check_columns(
 
 
 def _column(entries: Any, name: str) -> np.ndarray:
-    """Return a column of a table `[n]` with one value in each entry.
-
-    **Raises:** `ValueError` for an entry that is several, such as a list.
-    """
+    """Return a column of a table `[n]` with one value in each entry."""
     column = np.asarray(entries)
     if column.dtype == object and column.ndim == 1:
         column = np.fromiter(map(as_scalar, column), object, len(column))
@@ -266,10 +263,6 @@ def _check_one(domain: Domain, values: PyTree, row: int, name: str) -> None:
 
 def _at(row: int, count: int) -> str:
     return f"row {row}: " if count > 1 else ""
-
-
-def _is_frame(rows: object) -> bool:
-    return hasattr(rows, "columns") and hasattr(rows, "to_dict")
 
 
 def _is_series(row: object) -> bool:

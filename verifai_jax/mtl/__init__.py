@@ -13,7 +13,6 @@ from verifai_jax.mtl.evaluate import End, IntervalError
 from verifai_jax.mtl.expression import Expression, duration, signal
 from verifai_jax.mtl.formula import FALSE, TRUE, Formula
 from verifai_jax.mtl.grammar import FormulaSyntaxError
-from verifai_jax.mtl.normalization import anneal, normalize
 from verifai_jax.mtl.operators import (
     always,
     during,
@@ -37,9 +36,9 @@ from verifai_jax.mtl.setting import HorizonError, SamplingError
 __all__ = [
     "FALSE", "TRUE", "End", "Explanation", "Expression", "Formula", "FormulaSyntaxError",
     "HorizonError", "IntervalError", "Online", "Requirement", "SamplingError", "Semantics",
-    "SmoothingError", "always", "anneal", "boolean", "duration", "during",
+    "SmoothingError", "always", "boolean", "duration", "during",
     "eventually", "explain", "fall", "hard", "historically", "latex", "next_", "nnf",
-    "normalize", "once", "online", "parse", "phase", "prev", "rise",
+    "once", "online", "parse", "phase", "prev", "rise",
     "robustness", "robustness_signal", "satisfied", "signal", "simplify", "since", "smooth",
     "smoothing_error", "sometime_during", "until",
 ]  # fmt: skip

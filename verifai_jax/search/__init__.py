@@ -28,13 +28,11 @@ if TYPE_CHECKING:
     from verifai_jax.search.mutation import Mutation as Mutation
     from verifai_jax.search.point_list import PointList as PointList
     from verifai_jax.search.portfolio import Portfolio as Portfolio
-    from verifai_jax.search.sobol import Sobol as Sobol
     from verifai_jax.search.uniform import Uniform as Uniform
     from verifai_jax.search.wrapper import Wrapper as Wrapper
 _SEARCHES = {
     "uniform": "Uniform",
     "halton": "Halton",
-    "sobol": "Sobol",
     "cross_entropy": "CrossEntropy",
     "mutation": "Mutation",
     "gradient": "Gradient",

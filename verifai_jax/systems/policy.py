@@ -256,10 +256,7 @@ def load_policy(path: str | Path) -> Policy:
 
 
 def _action_of(data: object) -> Action:
-    """Return the kind of action that a file describes.
-
-    **Raises:** `ValueError` for data that describes no action.
-    """
+    """Return the kind of action that a file describes."""
     if not isinstance(data, dict) or data.get("kind") not in list(_KINDS):
         raise ValueError(f"its action must be an object of kind {' or '.join(_KINDS)}")
     kind = _KINDS[data["kind"]]
@@ -277,10 +274,7 @@ def _action_of(data: object) -> Action:
 
 
 def _layers_of(arrays: Mapping[str, np.ndarray]) -> tuple[Layers, dict[str, np.ndarray]]:
-    """Return the layers of a file whose shapes fit together, and the other arrays.
-
-    **Raises:** `KeyError` for a missing layer, `ValueError` for shapes that do not fit.
-    """
+    """Return the layers of a file whose shapes fit together, and the other arrays."""
     for name, array in arrays.items():
         if array.dtype.kind != "f" or not np.all(np.isfinite(array)):
             raise ValueError(f"its array {name!r} must hold finite floating-point numbers")
@@ -300,10 +294,7 @@ def _layers_of(arrays: Mapping[str, np.ndarray]) -> tuple[Layers, dict[str, np.n
 
 
 def _check_fits(policy: Policy) -> None:
-    """Check that the network's outputs fit the policy's kind of action.
-
-    **Raises:** `ValueError` for another number of outputs, or a scale that does not fit.
-    """
+    """Check that the network's outputs fit the policy's kind of action."""
     action, outputs = policy.action, policy.layers[-1][0].shape[1]
     wanted = action.n if isinstance(action, Discrete) else action.size
     if outputs != wanted:

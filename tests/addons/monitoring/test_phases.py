@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from verifai_jax import mtl
+from verifai_jax.addons.reports.english import formula_words
 from verifai_jax.core.values.trace import Trace
-from verifai_jax.mtl.english import formula_words
 from verifai_jax.mtl.host_values import HostValues
 
 RANDOM = np.random.default_rng(5)

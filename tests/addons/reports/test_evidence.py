@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 import verifai_jax as vj
 from verifai_jax.addons.reports import write_report
 from verifai_jax.addons.reports.commands import run_command
+from verifai_jax.addons.reports.english import formula_words
 from verifai_jax.addons.reports.markup import data_block, element
 from verifai_jax.addons.reports.provenance import Input, chained
 from verifai_jax.addons.reports.view import MAX_ROWS, numbers_of, view_data
@@ -21,7 +22,6 @@ from verifai_jax.cli.main import main
 from verifai_jax.core.messages.errors import UnknownNameError
 from verifai_jax.core.user_code.sources import file_hash
 from verifai_jax.mtl import parse
-from verifai_jax.mtl.english import formula_words
 
 HOSTILE = "<script>alert(1)</script>"
 

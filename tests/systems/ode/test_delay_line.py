@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from verifai_jax.systems.ode import ode
-from verifai_jax.systems.ode.blocks import delay_line
+from verifai_jax.systems.ode.delay_line import delay_line
 
 
 def loop(dt):

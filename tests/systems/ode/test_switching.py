@@ -11,7 +11,7 @@ from scipy.integrate import solve_ivp
 
 from verifai_jax.core.values.trace import Status
 from verifai_jax.systems.ode import ode
-from verifai_jax.systems.ode.blocks import Switch, hysteresis, latch
+from verifai_jax.systems.ode.switching import Switch, hysteresis, latch
 
 G, BACK, ONE = 9.81, 0.8, np.float32(1)
 FLOOR = Switch(

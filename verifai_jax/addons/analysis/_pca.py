@@ -204,7 +204,7 @@ class Components(Drawn, InNotebook):
         for i, direction in enumerate(self.directions[:SHOWN]):
             order = np.argsort(-np.abs(direction), kind="stable")
             parts = [
-                f"{direction[j]:+z.2f} {self.names[j]}" for j in order if _matters(direction[j])
+                f"{direction[j]:+z.2f} {self.names[j]}" for j in order if abs(direction[j]) >= 0.05
             ]
             rest = ", ..." if len(parts) > 4 else ""
             chance = "" if i < self.telling else ", no more than chance"
@@ -307,7 +307,3 @@ def _accepted(space: FeatureSpace | None, frame: pd.DataFrame) -> np.ndarray:
     features = [space.from_row(row) for row in rows]
     stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *features)
     return np.asarray(jax.vmap(space.accepts)(stacked), bool)
-
-
-def _matters(loading: float) -> bool:
-    return bool(abs(loading) >= 0.05)

@@ -74,7 +74,7 @@ class OddCoverage(Tabular):
         drawn = {name: codes[:CANDIDATES] for name, codes in self._drawn.items()}
         known = self._codes
         open_cells = []
-        for names in _sets(drawn):
+        for names in [*((name,) for name in drawn), *combinations(drawn, 2)]:
             taken = np.isin(_keys(drawn, names), _keys(known, names)) if known else False
             open_cells.append((_keys(drawn, names), ~np.broadcast_to(taken, len(self._points))))
         chosen, new = [], []
@@ -225,10 +225,6 @@ def _rows(frame: pd.DataFrame, which: np.ndarray) -> pd.DataFrame:
 
 def _coded(cuts: Mapping[str, _Cut], domain: OperationalDomain, frame: pd.DataFrame) -> Codes:
     return {name: cuts[name].code(x) for name, x in domain.values(frame).items()}
-
-
-def _sets(codes: Codes) -> list[tuple[str, ...]]:
-    return [*((name,) for name in codes), *combinations(codes, 2)]
 
 
 def _keys(codes: Codes, names: tuple[str, ...]) -> Int[np.ndarray, " n"]:

@@ -297,10 +297,7 @@ def _signal(source: str) -> tuple[str, int | None]:
 
 
 def _last(trace: Trace | None, source: str) -> np.ndarray:
-    """Return the last value of a signal.
-
-    **Raises:** `ProblemError` for one that a black box does not have.
-    """
+    """Return the last value of a signal."""
     assert trace is not None
     name, index = _signal(source)
     if name not in trace.signals:
@@ -318,10 +315,7 @@ def _stages(
     precision: str,
     seed: int,
 ) -> list[_Stage]:
-    """Check the parts and how they are joined.
-
-    **Raises:** as `sequence`.
-    """
+    """Check the parts and how they are joined."""
     if not isinstance(parts, Sequence) or len(parts) < 2:
         raise ValueError("a sequence has two parts or more, in a list")
     joints = len(parts) - 1

@@ -203,7 +203,7 @@ class Automaton(Domain):
 
     def from_unit(self, u: Float[jax.Array, " size"]) -> Events:
         taken, _, slots = self._walk(u)
-        units = self._split(slots)
+        units = jnp.split(slots, np.cumsum(self._tables.widths)[:-1].tolist(), axis=1)
         kinds = jnp.where(taken >= 0, jnp.asarray(self._tables.kind_of)[taken], ABSENT)
         waits = jnp.zeros(self.max_events, u.dtype)
         for domain, users in self._tables.waits.items():
@@ -341,9 +341,6 @@ class Automaton(Domain):
         ended = jnp.asarray(self.graph.last)[nodes[jnp.minimum(count, self.max_events - 1)]] < 0
         forced = (count < self.max_events) & ended
         return jnp.where(forced, self.max_events, count)
-
-    def _split(self, slots: jax.Array) -> list[jax.Array]:
-        return jnp.split(slots, np.cumsum(self._tables.widths)[:-1].tolist(), axis=1)
 
     @property
     def coverage_id_count(self) -> int:

@@ -31,6 +31,8 @@ if TYPE_CHECKING:
     from verifai_jax.addons.monitoring.mutation import Mutant as Mutant
     from verifai_jax.addons.monitoring.mutation import Mutants as Mutants
     from verifai_jax.addons.monitoring.mutation import mutants as mutants
+    from verifai_jax.addons.monitoring.normalization import anneal as anneal
+    from verifai_jax.addons.monitoring.normalization import normalize as normalize
     from verifai_jax.addons.monitoring.parametric import Template as Template
     from verifai_jax.addons.monitoring.parametric import templates as templates
     from verifai_jax.addons.monitoring.plot import draw as draw

@@ -19,6 +19,7 @@ import optax
 from jaxtyping import Array, Float
 
 from verifai_jax.addons.monitoring.free_traces import FreeTraces, Signals, states_of
+from verifai_jax.addons.monitoring.normalization import normalize
 from verifai_jax.addons.monitoring.recorded import Recordings, named_traces
 from verifai_jax.core.compute.compilation import jit_each
 from verifai_jax.core.display.figure import Drawn
@@ -29,7 +30,6 @@ from verifai_jax.mtl._robustness import robustness
 from verifai_jax.mtl.evaluate import End
 from verifai_jax.mtl.formula import Formula, Interval, surface
 from verifai_jax.mtl.host_values import HostValues
-from verifai_jax.mtl.normalization import normalize
 from verifai_jax.mtl.semantics import smooth
 from verifai_jax.mtl.setting import as_formula
 

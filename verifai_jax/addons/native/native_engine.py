@@ -210,10 +210,7 @@ class NativeEngine:
         return result
 
     def _check(self, rows: "Rows", key: "RunKey", first: int, temperature: "Temperature") -> None:
-        """Compare the native program with XLA's, in the first rows and where verdicts are near.
-
-        **Raises:** `Unavailable` if they differ by more than rounding.
-        """
+        """Compare the native program with XLA's, in the first rows and where verdicts are near."""
         distance = np.abs(self._program(rows, key, first, temperature).rho)
         nearest = np.min(np.where(np.isnan(distance), np.inf, distance), axis=1)
         at = np.sort(np.argsort(nearest)[:FIRST])

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from verifai_jax.addons.reports.english import formula_words
 from verifai_jax.addons.reports.markup import Child, Markup, element, paragraph, table
 from verifai_jax.addons.reports.page import Section
 from verifai_jax.core.messages.errors import check_names
@@ -14,7 +15,6 @@ from verifai_jax.falsification.run import Run
 from verifai_jax.features import FeatureSpace
 from verifai_jax.features.english import number
 from verifai_jax.mtl import parse
-from verifai_jax.mtl.english import formula_words
 from verifai_jax.problem.problem import Problem
 
 ENDS = {

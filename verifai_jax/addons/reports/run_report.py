@@ -7,6 +7,7 @@ import numpy as np
 from verifai_jax.addons.reports import run_findings
 from verifai_jax.addons.reports.claims import Claim, about_json, claims_json
 from verifai_jax.addons.reports.commands import report_command, run_command, run_python
+from verifai_jax.addons.reports.english import formula_words
 from verifai_jax.addons.reports.markup import element, paragraph, preformatted
 from verifai_jax.addons.reports.page import Page, Section
 from verifai_jax.addons.reports.provenance import Input, Link, Model, chained, folder_inputs
@@ -29,7 +30,6 @@ from verifai_jax.falsification.run_folder import RECORD, STATE, replay_command
 from verifai_jax.falsification.segments import TAIL
 from verifai_jax.falsification.table import FINISHED
 from verifai_jax.mtl import parse
-from verifai_jax.mtl.english import formula_words
 
 FILES = (
     (RECORD, "the record of the run"),

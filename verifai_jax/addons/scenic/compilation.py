@@ -110,10 +110,7 @@ def _with_time_series(veneer: Any) -> None:
 
 
 def _time_series(parameter: Any) -> Any:
-    """Mark a parameter as one with a value at each step of a simulation.
-
-    **Raises:** `TypeError` for something else than a `VerifaiRange` or `VerifaiDiscreteRange`.
-    """
+    """Mark a parameter as one with a value at each step of a simulation."""
     if not isinstance(parameter, sys.modules["scenic.core.external_params"].ExternalParameter):
         raise TypeError(f"TimeSeries takes a VerifaiRange; got {type(parameter).__name__}")
     parameter.isTimeSeries = True
@@ -121,10 +118,7 @@ def _time_series(parameter: Any) -> Any:
 
 
 def _path_of(program: str | Path) -> Path | None:
-    """Return the file that a program is in; None for code.
-
-    **Raises:** `ProgramError` for a file that is not there or is no program.
-    """
+    """Return the file that a program is in; None for code."""
     text = str(program)
     words = "\n" in text or (" " in text.strip() and not text.endswith((".scenic", ".sc")))
     if isinstance(program, str) and words:

@@ -246,10 +246,7 @@ def _compared(op: ast.AST, one: Any, other: Any) -> Any:
 
 
 def _truth(value: Any) -> Any:
-    """Return a truth value.
-
-    **Raises:** `Unsupported` for anything but numbers and truth values.
-    """
+    """Return a truth value."""
     if isinstance(value, bool) or getattr(value, "dtype", None) == jnp.bool_:
         return value
     if is_plain(value):

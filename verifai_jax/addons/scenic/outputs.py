@@ -85,10 +85,7 @@ class Outputs:
                 self.objects[owner] = names
 
     def _probe(self) -> Any:
-        """Return the values of one scene, to see which properties are numbers.
-
-        **Raises:** `ProgramError` for a program that Scenic itself cannot sample.
-        """
+        """Return the values of one scene, to see which properties are numbers."""
         random = np.random.default_rng(0)
         for _ in range(64):
             features = {

@@ -339,10 +339,7 @@ def _is_scenics_default(body: Any, name: str) -> bool:
 
 
 def _written(value: Any) -> str:
-    """Return a value as Scenic code.
-
-    **Raises:** `_NoCodeError` for one that code cannot write.
-    """
+    """Return a value as Scenic code."""
     if isinstance(value, np.generic):
         value = value.item()
     if isinstance(value, float):

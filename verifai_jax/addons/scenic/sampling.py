@@ -121,10 +121,7 @@ class Sampling:
                 self._external |= kind_of(drawn) not in COMPUTED and hasattr(type(drawn), "sampler")
 
     def _series(self, leaf: leaves.Leaf) -> leaves.Leaf:
-        """Return the leaf of a value at each step.
-
-        **Raises:** `ProgramError` where the program does not say how many steps there are.
-        """
+        """Return the leaf of a value at each step."""
         bound = self.scenario.params.get("timeBound")
         if isinstance(bound, bool) or not isinstance(bound, int) or bound < 1:
             raise ProgramError(

@@ -106,10 +106,7 @@ def _is_series(record: Any) -> bool:
 
 
 def _column(name: str, rows: Sequence[tuple[int, Any]]) -> np.ndarray:
-    """Return the values of a record, numbers or vectors.
-
-    **Raises:** `TypeError` for a record of another kind.
-    """
+    """Return the values of a record, numbers or vectors."""
     try:
         values = [tuple(value) if hasattr(value, "coordinates") else value for _, value in rows]
         column = np.asarray(values, np.float64)

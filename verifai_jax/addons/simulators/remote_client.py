@@ -379,10 +379,7 @@ class _Connection:
 
 
 def _encrypted(plain_socket: socket.socket, tls: ssl.SSLContext, host: str) -> ssl.SSLSocket:
-    """Agree on keys with a server whose certificate is trusted.
-
-    **Raises:** `Refused` where it has another one, or speaks no TLS.
-    """
+    """Agree on keys with a server whose certificate is trusted."""
     try:
         return tls.wrap_socket(plain_socket, server_hostname=host)
     except ssl.SSLCertVerificationError as error:
@@ -398,10 +395,7 @@ def _encrypted(plain_socket: socket.socket, tls: ssl.SSLContext, host: str) -> s
 
 
 def _points_of(message: dict[str, Any]) -> list[dict[str, Any]]:
-    """Return the points of a `work` message.
-
-    **Raises:** `Refused` where they are not as they should be.
-    """
+    """Return the points of a `work` message."""
     points = message.get("points")
     if not isinstance(points, list):
         raise _no_run("it sends work without points")

@@ -58,7 +58,7 @@ class Region:
 
     def contains(self, points: Float[np.ndarray, "n d"]) -> Bool[np.ndarray, " n"]:
         """Return which points lie in the region."""
-        return self._distance(points) <= self.radius * (1 + 1e-6)
+        return np.linalg.norm(self._scores(points), axis=1) <= self.radius * (1 + 1e-6)
 
     def project(self, points: Float[np.ndarray, "n d"]) -> Float[np.ndarray, "n d"]:
         """Return points; those outside are moved towards the medians to the edge of the region."""
@@ -89,9 +89,6 @@ class Region:
     def _scores(self, points: Float[np.ndarray, "n d"]) -> Float[np.ndarray, "n t"]:
         u = np.asarray(points, np.float64)[:, self.tailed]
         return scipy_special().ndtri(np.clip(u, MIN_QUANTILE, 1 - MIN_QUANTILE))
-
-    def _distance(self, points: Float[np.ndarray, "n d"]) -> Float[np.ndarray, " n"]:
-        return np.linalg.norm(self._scores(points), axis=1)
 
 
 def region_of(loop: Parametric, mass: float) -> Region | None:

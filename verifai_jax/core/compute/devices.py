@@ -82,10 +82,6 @@ def _mesh(devices: Sequence[Device]) -> Mesh:
     return Mesh(np.array(devices), ("row",))
 
 
-def _setting(name: str) -> Any:
-    return getattr(jax.config, name)
-
-
 def cache_folder() -> Path | None:
     """Folder of the persistent compile cache; None if it is switched off."""
     setting = os.environ.get("VERIFAI_JAX_CACHE", "").strip()
@@ -127,7 +123,7 @@ def enable_compile_cache() -> None:
     limit = cache_limit()
     if next(_compiled) % EVICTED_EVERY == 0:
         threading.Thread(target=evict, args=(folder, limit), daemon=True).start()
-    if _setting("jax_compilation_cache_dir") is not None:
+    if jax.config.jax_compilation_cache_dir is not None:
         return
     try:
         folder.mkdir(parents=True, exist_ok=True)

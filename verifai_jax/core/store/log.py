@@ -134,10 +134,7 @@ class Log:
         return contextlib.nullcontext(self._memory) if self.path is None else open_file(self.path)
 
     def _index(self) -> dict[str, _Extent]:
-        """Find the frames of the file: the place of the last entry of each name.
-
-        **Raises:** `DamagedError` for anything that is not a file.
-        """
+        """Find the frames of the file: the place of the last entry of each name."""
         if self._extents is None:
             extents: dict[str, _Extent] = {}
             self._damaged = False
@@ -181,10 +178,7 @@ def _find_frames(file: IO[bytes]) -> Iterator[dict[str, _Extent] | None]:
 
 
 def _extents(frame: bytes, begin: int) -> dict[str, _Extent]:
-    """Return where the entries of a frame are in a file, in which it begins at `begin`.
-
-    **Raises:** `ValueError` for anything that is not a frame, or has changed.
-    """
+    """Return where the entries of a frame are in a file, in which it begins at `begin`."""
     mark, head, body, own = HEADER.unpack_from(frame)
     if (
         mark != MARK

@@ -106,10 +106,7 @@ def work(fd: int) -> None:
 
 
 def _answer(pipe: Connection, simulation: Callable[[Features, int], Trace]) -> None:
-    """Simulate task after task.
-
-    **Raises:** `EOFError` or `OSError` when the pipe is closed.
-    """
+    """Simulate task after task."""
     while True:
         number, features, seed = pipe.recv()
         try:

@@ -282,7 +282,7 @@ class Samples:
             scaled = (rows[column.name].to_numpy(np.float64) - offset[j]) / width[j]
             absent = np.isnan(scaled)
             parts.append(np.where(absent, middles[j], scaled))
-            if _has_absent(self.table[column.name]):
+            if self.table[column.name].isna().any():
                 parts.append(_ABSENT * absent)
         coordinates = np.stack(parts, axis=1) if parts else np.zeros((len(rows), 0))
         codes = [column.codes(rows[column.name]) for column in self.unordered]
@@ -375,10 +375,6 @@ def _statistics(values: np.ndarray, scale: str) -> tuple[float, float]:
     # All equal entries have a deviation of zero only up to rounding.
     deviation = float(present.std()) if present.min() < present.max() else 0.0
     return float(present.mean()), deviation
-
-
-def _has_absent(entries: pd.Series | pd.DataFrame) -> bool:
-    return bool(entries.isna().any())
 
 
 def _listed(names: Sequence[str], maximum: int = 8) -> str:

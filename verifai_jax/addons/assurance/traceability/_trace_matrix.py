@@ -175,10 +175,7 @@ def _problems(given: Problem | Location | Sequence[Problem | Location]) -> Itera
 def _demanded(
     problems: Sequence[Problem], given: Location | Iterable[Requirement] | None
 ) -> dict[str, Requirement]:
-    """Return the requirements by identifier.
-
-    **Raises:** `ValueError` for two that differ under one identifier.
-    """
+    """Return the requirements by identifier."""
     if isinstance(given, str | Path):
         given = read_requirements(given, need_formulas=False)
     if given is None:

@@ -151,10 +151,7 @@ def _names(problems: Sequence[Problem]) -> tuple[str, str]:
 
 
 def _common(a: Problem, b: Problem) -> tuple[tuple[Problem, Problem], list[str]]:
-    """Return the problems with only their common features, and notes on the others.
-
-    **Raises:** `ProblemError` without a common feature, and where domains differ.
-    """
+    """Return the problems with only their common features, and notes on the others."""
     for problem in (a, b):
         problem.check()
     spaces = [dict(p.space.root.fields) for p in (a, b)]
@@ -346,10 +343,7 @@ def _columns(trace: Trace | None) -> dict[str, Float[np.ndarray, " time"]]:
 
 
 def _scales(sides: Sequence[Verdicts]) -> dict[str, float]:
-    """Return the range of each common signal, over most traces of both engines.
-
-    **Raises:** `ProblemError` without a common signal.
-    """
+    """Return the range of each common signal, over most traces of both engines."""
     known = [[_columns(t) for t in v.traces or () if t is not None] for v in sides]
     first = [next(iter(each), {}) for each in known]
     if not all(first):

@@ -104,10 +104,7 @@ def _centre(z: Float[np.ndarray, "n d"], rows: Int[np.ndarray, " k"]) -> int:
 def _count(
     limit_state: LimitState, z: Float[np.ndarray, "n d"], times: int
 ) -> Int[np.ndarray, " n"]:
-    """Simulate points several times, and count their failures.
-
-    **Raises:** `Ended` where time is over, or the budget.
-    """
+    """Simulate points several times, and count their failures."""
     if limit_state.left < times * len(z):
         raise Ended
     return fails_at(limit_state, np.repeat(z, times, axis=0)).reshape(-1, times).sum(axis=1)

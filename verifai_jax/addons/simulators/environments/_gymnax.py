@@ -230,10 +230,7 @@ def _check_choices(policy: object, space: Space, name: str) -> None:
 
 
 def _as_action(action: PyTree, space: Space, name: str) -> Array:
-    """Return a policy's output as an action of the space.
-
-    **Raises:** `ValueError` for another shape, or numbers of another kind.
-    """
+    """Return a policy's output as an action of the space."""
     if not hasattr(space, "n"):
         if hasattr(space, "low") and len(space.shape) == 1:
             return vector_action(action, space.shape[0], name)

@@ -303,10 +303,7 @@ class Loop:
         return control, jax.tree.map(like, arguments[2], memory)
 
     def _why_on_host(self, arguments: tuple[Any, ...], error: Exception) -> str:
-        """Return why a controller runs on the host, once it has run there.
-
-        **Raises:** what it raises there.
-        """
+        """Return why a controller runs on the host, once it has run there."""
         self._on_host(*jax.tree.map(lambda leaf: np.zeros(np.shape(leaf), leaf.dtype), arguments))
         return (
             "the controller runs in Python, for one simulation after another, because JAX cannot "

@@ -113,10 +113,7 @@ def _clear_idle_flags(mujoco: ModuleType, compiled: MjModel) -> Iterator[str]:
 
 
 def _keyframe(compiled: MjModel, keyframe: str | int) -> dict[str, np.ndarray]:
-    """Return the arrays of a keyframe.
-
-    **Raises:** `ValueError` for one that the model lacks.
-    """
+    """Return the arrays of a keyframe."""
     known = names(compiled, "key")
     if isinstance(keyframe, str):
         if keyframe not in known:

@@ -121,10 +121,7 @@ def _scaled(max_change: float, middle: Callable[[Array], Array]) -> Transformati
 
 
 def _images(inputs: Inputs) -> Float[Array, "n height width *channels"]:
-    """Return inputs as an array of images.
-
-    **Raises:** `ValueError` for anything else.
-    """
+    """Return inputs as an array of images."""
     shape = getattr(inputs, "shape", None)
     if shape is None or len(shape) not in (3, 4):
         given = type(inputs).__name__ if shape is None else f"shape {list(shape)}"

@@ -1,6 +1,6 @@
 """The preference order of the rows of a sweep's table, and tables derived from it."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -92,7 +92,7 @@ def group_by_configuration(table: "pd.DataFrame", hyperparameters: Sequence[str]
                 "failure_rate_worst": last["failure_rate"].max(),
                 "failure_high": last["failure_high"].max(skipna=False),
                 "training_seconds": last["training_seconds"].sum(),
-                "status": _join_statuses(last["status"]),
+                "status": ", ".join(dict.fromkeys(str(status) for status in last["status"])),
                 "best_row": best,
                 "best_steps": table.loc[best, "steps"] if best >= 0 else -1,
                 "best_verdict": table.loc[best, "verdict"] if best >= 0 else "",
@@ -122,8 +122,3 @@ def _worst_verdict(rows: "pd.DataFrame") -> str:
         return str(verdicts.iloc[0])
     # A seed without a certificate leaves the configuration undecided.
     return "undecided" if is_safe(rows).any() else ""
-
-
-def _join_statuses(statuses: Iterable[object]) -> str:
-    """Write the different statuses of trainings, one word if they are equal."""
-    return ", ".join(dict.fromkeys(str(status) for status in statuses))

@@ -7,7 +7,7 @@ import pytest
 from checked_types import unchecked
 from scipy.interpolate import RegularGridInterpolator
 
-from verifai_jax.systems.ode.blocks import LookupTable
+from verifai_jax.addons.simulators.blocks import LookupTable
 
 X, Y = [1.0, 2.0, 4.0, 7.0], [0.1, 0.2, 0.4]
 NUMBERS = np.random.default_rng(0).normal(size=(4, 3))
@@ -68,6 +68,10 @@ def test_tables_of_vectors():
         ),
         (lambda: LookupTable([1, 2], [0, float("nan")]), "values .* must be finite; got nan"),
         (lambda: LookupTable(["a", "b"], [0, 1]), r"argument 0 must be real numbers; got \['a'"),
+        (
+            lambda: LookupTable([0, 1], np.ma.masked_array([0.0, 9e9], mask=[0, 1])),
+            "values of a LookupTable must be numbers; one of 2 is",
+        ),
         (lambda: LookupTable([1, 2], [0, "x"]), r"values of a LookupTable must be real numbers"),
         (lambda: LookupTable([1, 2], [0, 1], beyond="clap"), "unknown beyond 'clap'; did you mean"),
     ],

@@ -5,10 +5,10 @@ line = blocks.delay_line(14.7, longest=0.8, period=0.01)
 vj.ode(..., switches=[blocks.Switch(guard, reset)], method=blocks.adaptive("Kvaerno5"))
 """
 
-from verifai_jax.systems.ode.adaptive import adaptive as adaptive
+from verifai_jax.addons.simulators.blocks.adaptive import adaptive as adaptive
+from verifai_jax.addons.simulators.blocks.lookup_table import LookupTable as LookupTable
 from verifai_jax.systems.ode.delay_line import DelayLine as DelayLine
 from verifai_jax.systems.ode.delay_line import delay_line as delay_line
-from verifai_jax.systems.ode.lookup_table import LookupTable as LookupTable
 from verifai_jax.systems.ode.switching import Switch as Switch
 from verifai_jax.systems.ode.switching import hysteresis as hysteresis
 from verifai_jax.systems.ode.switching import latch as latch

@@ -7,7 +7,7 @@ import pytest
 from checked_types import unchecked
 
 import verifai_jax as vj
-from verifai_jax.core.store.loggers import crc32c
+from verifai_jax.addons.training.loggers import crc32c
 from verifai_jax.core.user_code.callbacks import check_callbacks, notify
 
 

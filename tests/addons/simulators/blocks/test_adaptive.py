@@ -9,11 +9,11 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import verifai_jax as vj
+from verifai_jax.addons.simulators.blocks import adaptive
+from verifai_jax.addons.simulators.blocks.adaptive import adaptive_solvers
 from verifai_jax.core.messages.errors import MissingExtra, UnknownNameError
 from verifai_jax.core.values.trace import Status
 from verifai_jax.systems.ode import ode
-from verifai_jax.systems.ode.adaptive import adaptive_solvers
-from verifai_jax.systems.ode.blocks import adaptive
 
 
 def test_without_diffrax_the_error_names_the_extra(monkeypatch):

@@ -9,8 +9,8 @@ import pytest
 from checked_types import unchecked
 from scipy import stats
 
+from verifai_jax.addons.searches.sobol import Sobol
 from verifai_jax.core.values.cube import Cube
-from verifai_jax.search.sobol import Sobol
 from verifai_jax.testing import check_batch_independence, check_search
 
 
