@@ -225,7 +225,7 @@ def test_what_does_not_fit_is_refused():
         vj.estimate(SLOW, budget=400, cheap=other)
     with pytest.raises(vj.ProblemError, match="in the cheap one missing"):
         vj.falsify(SLOW, vj.Start(cheap=fewer), budget=16)
-    with pytest.raises(ValueError, match="either first, or a cheap model"):
+    with pytest.raises(ValueError, match="either rows, or a cheap model"):
         vj.falsify(SLOW, vj.Start(cheap=CHEAP, rows=[{"x": 0.0, "y": 0.0}]), budget=16)
     with pytest.raises(ValueError, match=r"within must be a factor above 1.*got 0\.5"):
         vj.estimate(SLOW, within=0.5)

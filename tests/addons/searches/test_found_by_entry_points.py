@@ -76,7 +76,5 @@ def test_the_default_of_slow_simulations(dim, priority, monkeypatch):
         f"search portfolio: a simulation takes 2 s, but {name}, which needs fewer of them, is not "
         "installed"
     )
-    with pytest.raises(
-        ValueError, match=f"unknown search '{name}'.*Known: uniform, halton, cross"
-    ):
+    with pytest.raises(ValueError, match=f"unknown search '{name}'.*Known: uniform, halton, cross"):
         searches.named(name)
