@@ -67,6 +67,7 @@ UNCHECKED = {
     "addons.estimation.comparison",
     "addons.estimation.error_budgets",
     "addons.estimation.failure_modes",
+    "addons.estimation.revisions",
     "addons.estimation.trials",
     "addons.rl.policies",
 }

@@ -137,7 +137,6 @@ def rezipped(data, rng):
 
 
 def check(name, tmp_path, count):
-    logging.getLogger("verifai_jax").setLevel(logging.CRITICAL)
     write, read_it = DOORS[name]
     path = tmp_path / name
     if write is not None:
@@ -156,12 +155,16 @@ def check(name, tmp_path, count):
     assert not wrong, "\n".join(wrong)
 
 
+@pytest.mark.filterwarnings("ignore:.*is read as Windows-1252")
 @pytest.mark.parametrize("name", DOORS)
-def test_mutated(name, tmp_path):
+def test_mutated(name, tmp_path, caplog):
+    caplog.set_level(logging.CRITICAL, "verifai_jax")
     check(name, tmp_path, FEW)
 
 
 @pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:.*is read as Windows-1252")
 @pytest.mark.parametrize("name", DOORS)
-def test_many_mutated(name, tmp_path):
+def test_many_mutated(name, tmp_path, caplog):
+    caplog.set_level(logging.CRITICAL, "verifai_jax")
     check(name, tmp_path, MANY)

@@ -163,7 +163,7 @@ def test_a_control_that_is_none_is_said():
     counting = vj.ode(
         lambda t, s, u, f: sum(s for _ in range(s)), lambda f, key: f["a"], dt=0.1, steps=3
     )
-    with pytest.raises(ProblemError, match=r"counts by a value, as range.* fori_loop"):
+    with pytest.raises(ProblemError, match=r"counts by a value, as range.*fori_loop"):
         vj.Problem("p", {"a": vj.Box(0, 1)}, counting, "always state < 1").check()
     order = r"the order is Problem\(name, space, system, spec\)"
     with unchecked(), pytest.raises(ProblemError, match=order):

@@ -68,6 +68,9 @@ class Pool:
     import.
     """
 
+    what = "simulation"
+    """The word for a call in messages."""
+
     def __init__(
         self,
         simulation: Callable[[Any, int], Trace],
@@ -143,7 +146,7 @@ class Pool:
                     yield result
             if isinstance(end, KeyboardInterrupt):
                 raise
-            ended, unbegun = "the simulation was ended, as all time was over", ""
+            ended, unbegun = f"the {self.what} was ended, as all time was over", ""
             later = {index for index, *_ in batch.tasks}
             for index in sorted(waiting):
                 message = unbegun if index in later else ended
@@ -186,6 +189,8 @@ class Pool:
                         break
                     batch.leave(worker)
                     end, worker = worker.end(), None
+                    if outcome is not None:
+                        outcome = outcome._replace(message=f"the {self.what} {outcome.message}")
                     if outcome is not None or batch.stopped:
                         break
                     deaths += 1
@@ -400,8 +405,7 @@ class _Worker:
                 if self.process.poll() is not None:
                     return None
                 if left <= 0:
-                    message = f"the simulation took longer than {timeout:zg} s"
-                    return Outcome(None, Status.TIMEOUT, message)
+                    return Outcome(None, Status.TIMEOUT, f"took longer than {timeout:zg} s")
         except Exception:  # The pipe is closed, or somebody else has written into it.
             return None
 

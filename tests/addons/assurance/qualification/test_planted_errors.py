@@ -64,7 +64,7 @@ PLANTED = {
     "E36": ("core/compute/keys.py", "int(seed) & 0xFFFFFFFF", '(int(seed) + __import__("time").time_ns()) & 0xFFFFFFFF'),
     "E37": ("core/compute/keys.py", "int(seed) & 0xFFFFFFFF", "0 & 0xFFFFFFFF"),
     "E38": ("evaluation/replay.py", "simulation_key(key, 0 if number is None else number)", "simulation_key(key, 1 if number is None else number + 1)"),
-    "E39": ("falsification/_falsify.py", "        if checkpoint:\n            rounds.resume(checkpoint)", "        pass"),
+    "E39": ("falsification/_falsify.py", "            if checkpoint:\n                rounds.resume(checkpoint)", "            pass"),
     "E40": ("falsification/table.py", "            self._tail.put(tail_entry(first, batch))\n            return", "            return"),
     "E41": ("core/store/files.py", "    if own != record_checksum(record):", "    if False:"),
     "E42": ("search/cross_entropy.py", "            elite=elite,\n            score=jnp.where", "            elite=state.elite,\n            score=jnp.where"),

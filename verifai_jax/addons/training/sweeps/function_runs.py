@@ -64,6 +64,7 @@ class FunctionRuns(TrainingRuns):
         self._train = partial(train_once, trainer.train, trainer.observation)
         workers = trainer.workers or available_cores()
         self._pool = Pool(self._train, trainer.train, workers, trainer.timeout, retries=0)
+        self._pool.what = "training"
         self._faults: dict[Hashable, str] = {}
         self.starts: dict[int, Any] = {}
         """For a function with an argument `starts`, what it gets of a training, by its number."""
@@ -133,7 +134,7 @@ class FunctionRuns(TrainingRuns):
                 if outcome.status == Status.OK:
                     ended(index, cast("Arrays", outcome.trace))
                 elif outcome.message:  # Others had not begun when the time was over.
-                    ended(index, outcome.message.replace("the simulation", "the training"))
+                    ended(index, outcome.message)
         self.clock.check()
 
     def _begin(self, number: int, at: int) -> Path:

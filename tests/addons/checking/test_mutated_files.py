@@ -8,10 +8,10 @@ import numpy as np
 import pandas as pd
 import pytest
 from mutated import altered, flipped, wrong_answers
-from verifai_jax.counterexamples.corpus import SavedCounterexample
 
 import verifai_jax as vj
-from verifai_jax.mtl.requirements import read_requirements, write_requirements
+from verifai_jax.addons.checking.corpus import SavedCounterexample
+from verifai_jax.addons.monitoring.requirement_files import read_requirements, write_requirements
 from verifai_jax.systems.actions import Continuous
 from verifai_jax.systems.policy import Policy, load_policy, save_policy
 
@@ -126,6 +126,7 @@ def check_sample(sample, tmp_path, count):
     assert not wrong, "\n".join(wrong)
 
 
+pytestmark = pytest.mark.filterwarnings("ignore:.*is read as Windows-1252")
 NAMES = ["p.npz", "r.csv", "r.reqif", "r.toml", "r.yaml", "c.json"]
 
 
