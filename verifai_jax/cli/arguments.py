@@ -175,10 +175,9 @@ def load_problem(target: str, only: str | None = None) -> "vj.Problem":
 
 
 def values_of(
-    options: Mapping[str, Any],
-    when: "StoppingRule | None" = None,
+    options: Mapping[str, Any], when: "StoppingRule | None" = None,
     executor: "Executor | None" = None,
-) -> dict[str, Any]:
+) -> dict[str, Any]:  # fmt: skip
     """Return the options of a command as arguments of its verb, with the values that join some."""
     left = dict(options)
     if "aim" in left:

@@ -7,12 +7,9 @@ from pathlib import Path
 
 @contextlib.contextmanager
 def given_or_next(
-    folder: Path | None,
-    parent: str,
-    name: str,
-    goes_on: Callable[[Path], str] | None = None,
+    folder: Path | None, parent: str, name: str, goes_on: Callable[[Path], str] | None = None,
     record: str | Path = "run.json",
-) -> Iterator[Path]:
+) -> Iterator[Path]:  # fmt: skip
     """Return the given folder, or else the next one, made by `next_folder`.
 
     **Arguments:**

@@ -48,13 +48,9 @@ def confirm(
 @suggests_options
 @shows_progress("confirming", "replays")
 def confirm(
-    run: Run,
-    row: Row = None,
-    *,
-    engines: Engines = None,
-    max_rows: int | None = None,
+    run: Run, row: Row = None, *, engines: Engines = None, max_rows: int | None = None,
     progress: bool | None = None,
-) -> Confirmation | Confirmations:
+) -> Confirmation | Confirmations:  # fmt: skip
     """Replay counterexamples more precisely than they were found, and decide which are real.
 
     **Arguments:**

@@ -85,12 +85,9 @@ class Explained(Drawn, InNotebook):
 @suggests_options
 @shows_progress("explaining a counterexample of")
 def explain(
-    run: Run,
-    row: Row = None,
-    *,
-    nominal: Mapping[str, Any] | None = None,
+    run: Run, row: Row = None, *, nominal: Mapping[str, Any] | None = None,
     progress: bool | None = None,
-) -> Explained:
+) -> Explained:  # fmt: skip
     """Explain a counterexample: the deciding predicate, its time, and the features that matter.
 
     **Arguments:**
@@ -189,11 +186,9 @@ def explain(
 
 
 def slopes_of(
-    space: FeatureSpace,
-    u: Float[np.ndarray, " d"],
-    gradient: Float[np.ndarray, " d"],
+    space: FeatureSpace, u: Float[np.ndarray, " d"], gradient: Float[np.ndarray, " d"],
     precision: str,
-) -> tuple[Float[np.ndarray, " d"], Float[np.ndarray, " d"]]:
+) -> tuple[Float[np.ndarray, " d"], Float[np.ndarray, " d"]]:  # fmt: skip
     """Return derivatives with respect to the features' real numbers, and the ranges of these.
 
     Unit coordinates are probabilities: a step of 0.01 changes a feature much in the tail of its

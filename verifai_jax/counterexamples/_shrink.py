@@ -176,12 +176,9 @@ class _Search:
     """The order of a shrinking: fewer coordinates, a smaller distance, then other failures."""
 
     def __init__(
-        self,
-        candidates: Candidates,
-        by: str,
-        rng: np.random.Generator,
+        self, candidates: Candidates, by: str, rng: np.random.Generator,
         start: Float[np.ndarray, "1 d"],
-    ) -> None:
+    ) -> None:  # fmt: skip
         self.candidates, self.by, self.rng = candidates, by, rng
         self.max_changed = int(candidates.nominal.count(start)[0])
         self.history: list[Step] = []
@@ -283,12 +280,9 @@ class _Search:
         return lowest[None]
 
     def starts(
-        self,
-        first: Float[np.ndarray, "m d"] | None = None,
-        *,
-        alike: bool = True,
+        self, first: Float[np.ndarray, "m d"] | None = None, *, alike: bool = True,
         cosine: float = 0.7,
-    ) -> Float[np.ndarray, "n d"]:
+    ) -> Float[np.ndarray, "n d"]:  # fmt: skip
         """Return the least failures in different directions, after those of `first`.
 
         **Arguments:**

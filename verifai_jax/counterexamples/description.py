@@ -37,14 +37,9 @@ def format_apart(value: float, bound: float) -> tuple[str, str]:
 
 
 def describe(
-    name: str,
-    row: int,
-    why: Explanation,
-    rho: float,
-    influences: Sequence[Influence],
-    matter: Sequence[Influence],
-    notes: Sequence[str] = (),
-) -> str:
+    name: str, row: int, why: Explanation, rho: float, influences: Sequence[Influence],
+    matter: Sequence[Influence], notes: Sequence[str] = (),
+) -> str:  # fmt: skip
     """Write the whole explanation of a counterexample as a paragraph.
 
     **Arguments:**

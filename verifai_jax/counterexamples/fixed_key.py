@@ -47,12 +47,9 @@ class FixedKey(System):
         return self.system.can_fold
 
     def fold(
-        self,
-        features: Features,
-        key: Seed,
-        carry: Carry,
+        self, features: Features, key: Seed, carry: Carry,
         update: Callable[[Carry, dict[str, Array]], Carry],
-    ) -> tuple[Carry, Int[Array, ""]]:
+    ) -> tuple[Carry, Int[Array, ""]]:  # fmt: skip
         return self.system.fold(features, self.key, carry, update)
 
     @property

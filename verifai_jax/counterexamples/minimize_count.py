@@ -191,14 +191,9 @@ def exchange(candidates: Candidates, u: Point, rng: np.random.Generator) -> Poin
 
 
 def push(
-    candidates: Candidates,
-    centre: Point,
-    coordinates: np.ndarray,
-    tangent: Tangent | None,
-    count: int,
-    width: float,
-    rng: np.random.Generator,
-) -> Results:
+    candidates: Candidates, centre: Point, coordinates: np.ndarray, tangent: Tangent | None,
+    count: int, width: float, rng: np.random.Generator,
+) -> Results:  # fmt: skip
     """Draw points that differ from `centre` only in these coordinates."""
     cube, u0 = candidates.nominal.cube, candidates.nominal.u
     free = np.array([i for i in coordinates if cube.levels[i] == 0], int)

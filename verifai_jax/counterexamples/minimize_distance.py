@@ -63,13 +63,9 @@ class Track:
 
 
 def minimize_distance(
-    candidates: Candidates,
-    starts: Points,
-    rng: np.random.Generator,
-    *,
-    keep_nominal: bool,
+    candidates: Candidates, starts: Points, rng: np.random.Generator, *, keep_nominal: bool,
     rounds: int = 60,
-) -> Points:
+) -> Points:  # fmt: skip
     """Follow failing points along the boundary until none gets nearer to nominal.
 
     **Arguments:**
@@ -144,12 +140,9 @@ def segment_shares(track: Track) -> Float[np.ndarray, " n"]:
 
 
 def boundary_steps(
-    candidates: Candidates,
-    track: Track,
-    coordinates: Int[np.ndarray, " k"],
-    v: Departure,
+    candidates: Candidates, track: Track, coordinates: Int[np.ndarray, " k"], v: Departure,
     costs: float = 0.0,
-) -> Departures:
+) -> Departures:  # fmt: skip
     """Return departures at the nearest points of the linearised boundary, and on the way there.
 
     - `costs`: a small cost of a departure of each coordinate over its whole range, or 0. Without it

@@ -46,14 +46,9 @@ class Choice(NamedTuple):
 
 
 def resolved(
-    problem: Problem,
-    *,
-    gradient: bool = False,
-    batch: int = 1024,
-    budget: int = 10_000,
-    precision: str = "float32",
-    wanted: str | None = None,
-) -> Choice:
+    problem: Problem, *, gradient: bool = False, batch: int = 1024, budget: int = 10_000,
+    precision: str = "float32", wanted: str | None = None,
+) -> Choice:  # fmt: skip
     """Return the problem on the backend that suits the run.
 
     - `wanted`: a backend by name; by default the system's own, or else the faster one here.

@@ -229,12 +229,9 @@ class Confirmations(InNotebook):
 
     @classmethod
     def blank(
-        cls,
-        name: str,
-        numbers: Int[np.ndarray, " n"],
-        run_rho: Float[np.ndarray, " n"] | None,
+        cls, name: str, numbers: Int[np.ndarray, " n"], run_rho: Float[np.ndarray, " n"] | None,
         verdict: str = "unexamined",
-    ) -> "Confirmations":
+    ) -> "Confirmations":  # fmt: skip
         """Return rows with one verdict, none of them replayed yet; see `put`."""
         missing = np.full(len(numbers), np.nan)
         known = missing if run_rho is None else np.asarray(run_rho, np.float64)

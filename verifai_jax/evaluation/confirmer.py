@@ -85,14 +85,9 @@ class Confirmer:
     """
 
     def __init__(
-        self,
-        problem: Problem,
-        precision: str = "float32",
-        seed: int = 0,
-        *,
-        engines: Engines = None,
-        executor: "Executor | None" = None,
-    ) -> None:
+        self, problem: Problem, precision: str = "float32", seed: int = 0, *,
+        engines: Engines = None, executor: "Executor | None" = None,
+    ) -> None:  # fmt: skip
         in_precision(precision)
         self.problem, self.precision, self.seed = problem, precision, seed
         self.executor = executor
@@ -271,11 +266,9 @@ class Confirmer:
         return found
 
     def _replay(
-        self,
-        rows: Mapping[str, np.ndarray],
-        numbers: Int[np.ndarray, " n"],
+        self, rows: Mapping[str, np.ndarray], numbers: Int[np.ndarray, " n"],
         run: Float[np.ndarray, " n"] | None,
-    ) -> dict[str, Verdicts]:
+    ) -> dict[str, Verdicts]:  # fmt: skip
         """Simulate rows again by each check."""
         space = self.problem.space
         precisions = dict.fromkeys(replays.precision for replays, _ in self._checks.values())
@@ -302,13 +295,9 @@ class Confirmer:
         return {name: replayed[name] for name in self._checks}
 
     def _insist(
-        self,
-        replays: HostReplays,
-        features: Any,
-        numbers: Int[np.ndarray, " n"],
-        again: Verdicts,
+        self, replays: HostReplays, features: Any, numbers: Int[np.ndarray, " n"], again: Verdicts,
         run: Float[np.ndarray, " n"] | None,
-    ) -> Verdicts:
+    ) -> Verdicts:  # fmt: skip
         """Simulate rows that fail again more often, where the system is known to waver.
 
         **Returns:** of each row the repetition of greatest robustness.
@@ -336,11 +325,9 @@ class Confirmer:
         return again
 
     def _decide(
-        self,
-        found: Confirmations,
-        replayed: Mapping[str, Verdicts],
+        self, found: Confirmations, replayed: Mapping[str, Verdicts],
         run: Float[np.ndarray, " n"] | None,
-    ) -> None:
+    ) -> None:  # fmt: skip
         """Decide on rows from their replays, in place; all of them have the verdict `raised`."""
         rho = {name: verdicts.lowest for name, verdicts in replayed.items()}
         found.rho.update(rho)
@@ -392,11 +379,9 @@ class Confirmer:
 
 
 def _hold_to_run(
-    found: Confirmations,
-    replayed: Mapping[str, Verdicts],
-    rows: Mapping[str, np.ndarray],
+    found: Confirmations, replayed: Mapping[str, Verdicts], rows: Mapping[str, np.ndarray],
     only_repeats: bool,
-) -> None:
+) -> None:  # fmt: skip
     """Keep the run's verdict on rows of a host system that the present replays do not contradict.
 
     A failure that the run could not reproduce stays unconfirmed, whatever happens now; one that

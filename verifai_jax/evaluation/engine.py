@@ -125,13 +125,9 @@ class Engine:
             self._executable("evaluate")
 
     def evaluate(
-        self,
-        rows: PyTree,
-        key: Key[Array, ""] | Key[Array, " lanes"],
-        first: int = 0,
-        temperature: Float[np.ndarray, " n"] | Float[Array, ""] | float = 1.0,
-        shared: PyTree = (),
-    ) -> Verdicts:
+        self, rows: PyTree, key: Key[Array, ""] | Key[Array, " lanes"], first: int = 0,
+        temperature: Float[np.ndarray, " n"] | Float[Array, ""] | float = 1.0, shared: PyTree = (),
+    ) -> Verdicts:  # fmt: skip
         """Simulate `n <= batch` rows and decide which violate the property.
 
         **Arguments:**
@@ -153,12 +149,9 @@ class Engine:
         return Verdicts(rho, status, violations(rho, status, holds), features, **more)
 
     def holds(
-        self,
-        rows: PyTree,
-        key: Key[Array, ""] | Key[Array, " lanes"],
-        first: int = 0,
+        self, rows: PyTree, key: Key[Array, ""] | Key[Array, " lanes"], first: int = 0,
         shared: PyTree = (),
-    ) -> Bool[np.ndarray, "n formulas"]:
+    ) -> Bool[np.ndarray, "n formulas"]:  # fmt: skip
         """Simulate the rows again and return the Boolean semantics of each formula."""
         return self._run("holds", rows, key, first, 1.0, shared)
 
@@ -183,14 +176,9 @@ class Engine:
         return self.layout.padded
 
     def _run(
-        self,
-        mode: Mode,
-        rows: PyTree,
-        key: Key[Array, ""] | Key[Array, " lanes"],
-        first: int,
-        temperature: ArrayLike,
-        shared: PyTree,
-    ) -> Any:
+        self, mode: Mode, rows: PyTree, key: Key[Array, ""] | Key[Array, " lanes"], first: int,
+        temperature: ArrayLike, shared: PyTree,
+    ) -> Any:  # fmt: skip
         # What is compiled already needs nothing else of the precision, and a batch can take less
         # than a millisecond.
         compiled = mode in self._executables
@@ -323,14 +311,9 @@ ENGINES: Slot[EngineMode, Engine] = Slot("engines")
 
 
 def engine_for(
-    problem: Problem,
-    batch: int,
-    gradient: bool = False,
-    precision: str = "float32",
-    clauses: bool = False,
-    guidance: Guidance = NOTHING,
-    given: bool = False,
-) -> Engine:
+    problem: Problem, batch: int, gradient: bool = False, precision: str = "float32",
+    clauses: bool = False, guidance: Guidance = NOTHING, given: bool = False,
+) -> Engine:  # fmt: skip
     """Return the engine for this (problem, batch, mode), made once and cached with the problem."""
     mode = EngineMode(batch, gradient, precision, clauses, guidance, given)
     return problem.programs.get(

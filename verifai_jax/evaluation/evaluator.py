@@ -221,12 +221,9 @@ class Evaluator:
         return Verdicts.concatenate(parts)
 
     def _recall_or(
-        self,
-        points: Float[Any, "n d"],
-        first: int,
-        temperature: Float[np.ndarray, " n"] | float,
+        self, points: Float[Any, "n d"], first: int, temperature: Float[np.ndarray, " n"] | float,
         simulate: Callable[[], Verdicts],
-    ) -> Verdicts:
+    ) -> Verdicts:  # fmt: skip
         """Return the verdicts of work that continues after an earlier process was killed."""
         kept = self.part()
         if kept is None:
@@ -247,11 +244,9 @@ class Evaluator:
         return self._kept
 
     def begin(
-        self,
-        u: Float[Any, "n d"],
-        temperature: Float[np.ndarray, " n"] | float = 1.0,
+        self, u: Float[Any, "n d"], temperature: Float[np.ndarray, " n"] | float = 1.0,
         first: int | None = None,
-    ) -> "Sent":
+    ) -> "Sent":  # fmt: skip
         """Send points to the workers; `result` of the returned object gives the verdicts.
 
         **Raises:** `TypeError` for an evaluator without an executor.
@@ -297,12 +292,9 @@ class Sent:
     """Points sent to workers, unless their verdicts are already stored; see `Evaluator.begin`."""
 
     def __init__(
-        self,
-        evaluator: Evaluator,
-        u: Float[Any, "n row"],
-        temperature: Float[np.ndarray, " n"] | float,
-        first: int,
-    ) -> None:
+        self, evaluator: Evaluator, u: Float[Any, "n row"],
+        temperature: Float[np.ndarray, " n"] | float, first: int,
+    ) -> None:  # fmt: skip
         self._evaluator, self._asked = evaluator, (u, first, temperature)
         kept, numbers = evaluator.part(), np.arange(first, first + len(u))
         self._known = None if kept is None else kept.recall(np.asarray(u), numbers, temperature)

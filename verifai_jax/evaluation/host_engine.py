@@ -137,14 +137,9 @@ class HostEngine:
             return self._verdicts(features, keys, seeds, None, 0, self.keep_traces)
 
     def _verdicts(
-        self,
-        features: PyTree,
-        keys: Key[Array, " n"] | None,
-        seeds: Integer[np.ndarray, " n"],
-        u: Float[np.ndarray, "n d"] | None,
-        first: int,
-        keep_traces: bool,
-    ) -> Verdicts:
+        self, features: PyTree, keys: Key[Array, " n"] | None, seeds: Integer[np.ndarray, " n"],
+        u: Float[np.ndarray, "n d"] | None, first: int, keep_traces: bool,
+    ) -> Verdicts:  # fmt: skip
         behaviour = self.problem.behaviour
         width = None if behaviour is None else behaviour.size
         formulas = len(self.problem.formulas)
@@ -207,13 +202,9 @@ class HostEngine:
         waiting.settle_all()
 
     def _one_by_one(
-        self,
-        features: PyTree,
-        seeds: Integer[np.ndarray, " n"],
-        u: Float[np.ndarray, "n d"] | None,
-        first: int,
-        rows: "_Rows",
-    ) -> None:
+        self, features: PyTree, seeds: Integer[np.ndarray, " n"],
+        u: Float[np.ndarray, "n d"] | None, first: int, rows: "_Rows",
+    ) -> None:  # fmt: skip
         journal = None if u is None else self.journal
         known = {} if journal is None or u is None else journal.recall(first, u)
 
@@ -273,11 +264,9 @@ class _Waiting:
     """Traces that wait for others of their form, to be evaluated in one block."""
 
     def __init__(
-        self,
-        decide: Callable[[Sequence[int], Sequence[Trace]], list[RowVerdict]],
-        keep: Callable[[int, RowVerdict], None],
-        show: Callable[[int, Trace], None],
-    ) -> None:
+        self, decide: Callable[[Sequence[int], Sequence[Trace]], list[RowVerdict]],
+        keep: Callable[[int, RowVerdict], None], show: Callable[[int, Trace], None],
+    ) -> None:  # fmt: skip
         self._decide, self.keep, self._show = decide, keep, show
         self._blocks: dict[Any, list[tuple[int, Trace, str]]] = {}
         self._since = time.monotonic()

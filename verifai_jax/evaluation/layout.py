@@ -105,13 +105,9 @@ class Layout(NamedTuple):
         """
 
         def on_device(
-            rows: PyTree,
-            numbers: Array,
-            temperature: Array,
-            key: Any,
-            shared: PyTree,
+            rows: PyTree, numbers: Array, temperature: Array, key: Any, shared: PyTree,
             vector: Array,
-        ) -> Any:
+        ) -> Any:  # fmt: skip
             def chunk(block: tuple[PyTree, Array, Array]) -> Any:
                 keys = block[1]
                 if not own_keys:

@@ -31,12 +31,9 @@ Point: TypeAlias = Float[Any, " dim"] | Mapping[str, Any]
 
 
 def objective(
-    problem: Problem,
-    semantics: Semantics = hard,
-    of: str = "unit",
-    key: Key[Array, ""] | None = None,
-    formula: str | None = None,
-) -> Callable[..., Float[Array, ""]]:
+    problem: Problem, semantics: Semantics = hard, of: str = "unit",
+    key: Key[Array, ""] | None = None, formula: str | None = None,
+) -> Callable[..., Float[Array, ""]]:  # fmt: skip
     """Return the robustness of one simulation as a function `(point, key=key)`.
 
     If the problem's system has several backends, the one that JAX traces is used.

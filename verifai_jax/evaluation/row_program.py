@@ -51,14 +51,9 @@ class RowProgram:
     """
 
     def __init__(
-        self,
-        problem: Problem,
-        inputs: Inputs,
-        precision: str,
-        gradient: bool = False,
-        clauses: bool = False,
-        guidance: Guidance = NOTHING,
-    ) -> None:
+        self, problem: Problem, inputs: Inputs, precision: str, gradient: bool = False,
+        clauses: bool = False, guidance: Guidance = NOTHING,
+    ) -> None:  # fmt: skip
         self.problem, self.inputs, self.precision = problem, inputs, precision
         self.gradient = gradient
         self.goals = goals_of(problem.formulas.values()) if clauses else None
@@ -76,12 +71,9 @@ class RowProgram:
         return self._function(row, key, temperature, shared, self.derivative)
 
     def row_holds(
-        self,
-        row: PyTree,
-        key: Key[Array, ""],
-        temperature: Float[Array, ""] | float = 1.0,
+        self, row: PyTree, key: Key[Array, ""], temperature: Float[Array, ""] | float = 1.0,
         shared: PyTree = (),
-    ) -> Bool[Array, " formulas"]:
+    ) -> Bool[Array, " formulas"]:  # fmt: skip
         """Return the Boolean semantics of one row under `jax.vmap`, in a caller's program."""
         return self._function.holds(row, key, shared)
 

@@ -112,12 +112,9 @@ class Part:
         }
 
     def recall_or(
-        self,
-        points: Float[np.ndarray, "n d"],
-        numbers: Int[np.ndarray, " n"],
-        temperature: Float[np.ndarray, " n"] | float,
-        simulate: Callable[[], Verdicts],
-    ) -> Verdicts:
+        self, points: Float[np.ndarray, "n d"], numbers: Int[np.ndarray, " n"],
+        temperature: Float[np.ndarray, " n"] | float, simulate: Callable[[], Verdicts],
+    ) -> Verdicts:  # fmt: skip
         """Return verdicts of these points: the stored ones, or else those of `simulate`.
 
         **Arguments:**
@@ -139,11 +136,9 @@ class Part:
         return verdicts
 
     def recall(
-        self,
-        points: Float[np.ndarray, "n d"],
-        numbers: Int[np.ndarray, " n"],
+        self, points: Float[np.ndarray, "n d"], numbers: Int[np.ndarray, " n"],
         temperature: Float[np.ndarray, " n"] | float,
-    ) -> Verdicts | None:
+    ) -> Verdicts | None:  # fmt: skip
         """Return stored verdicts of these points; None if some are missing."""
         if not self._known:
             return None
@@ -190,10 +185,9 @@ def keeping(folder: Path, work: Mapping[str, Any]) -> Iterator[Unfinished]:
 
 
 def _asked(
-    points: Float[np.ndarray, "n d"],
-    numbers: Int[np.ndarray, " n"],
+    points: Float[np.ndarray, "n d"], numbers: Int[np.ndarray, " n"],
     temperature: Float[np.ndarray, " n"] | float,
-) -> dict[str, np.ndarray]:
+) -> dict[str, np.ndarray]:  # fmt: skip
     return {
         "points": np.asarray(points),
         "numbers": np.asarray(numbers, np.int64),

@@ -124,10 +124,9 @@ class RowVerdict(NamedTuple):
 
 
 def violations(
-    rho: Float[np.ndarray, "n formulas"],
-    status: Int[np.ndarray, " n"],
+    rho: Float[np.ndarray, "n formulas"], status: Int[np.ndarray, " n"],
     holds: Callable[[], Bool[np.ndarray, "n formulas"]],
-) -> Bool[np.ndarray, " n"]:
+) -> Bool[np.ndarray, " n"]:  # fmt: skip
     """Decide which simulations violate the property.
 
     **Arguments:**

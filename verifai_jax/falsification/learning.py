@@ -132,12 +132,9 @@ class Learning:
         return self._objective(verdicts.rho, verdicts.rho < 0)
 
     def learn(
-        self,
-        batch: Batch,
-        objective: Float[np.ndarray, " n"],
-        verdicts: Verdicts,
+        self, batch: Batch, objective: Float[np.ndarray, " n"], verdicts: Verdicts,
         coverage_ids: Int[np.ndarray, "n ids"] | None,
-    ) -> None:
+    ) -> None:  # fmt: skip
         """Let the search learn from a round.
 
         **Arguments:**
@@ -163,12 +160,9 @@ class Learning:
             self.surrogate.learn(batch.points, verdicts)
 
     def _learn_given(
-        self,
-        batch: Batch,
-        objective: Float[np.ndarray, " n"],
-        verdicts: Verdicts,
+        self, batch: Batch, objective: Float[np.ndarray, " n"], verdicts: Verdicts,
         outcomes: Float[np.ndarray, "n outcome"] | None,
-    ) -> None:
+    ) -> None:  # fmt: skip
         """Let the search learn from points that a person gave."""
         self.proposals.remember(batch.points)
         proper = verdicts.proper

@@ -34,11 +34,9 @@ class Likelihood:
         self.state: dict[str, np.ndarray] = {"scale": np.zeros(())}  # 0 until a batch shows it.
 
     def __call__(
-        self,
-        points: Float[np.ndarray, "n d"],
-        rho: Float[np.ndarray, " n"],
+        self, points: Float[np.ndarray, "n d"], rho: Float[np.ndarray, " n"],
         failing: Bool[np.ndarray, " n"],
-    ) -> Float[np.ndarray, " n"]:
+    ) -> Float[np.ndarray, " n"]:  # fmt: skip
         """Return the distance of failures in standard deviations, and more for safe rows."""
         known = np.abs(rho[np.isfinite(rho)])
         if not self.state["scale"] and known.any():

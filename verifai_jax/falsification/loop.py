@@ -217,11 +217,9 @@ class Rounds:
         self.tally.add(verdicts, stands.claimed)
 
     def _confirm(
-        self,
-        confirmer: Confirmer,
-        columns: dict[str, np.ndarray],
+        self, confirmer: Confirmer, columns: dict[str, np.ndarray],
         objective: Float[np.ndarray, " n"],
-    ) -> Float[np.ndarray, " n"]:
+    ) -> Float[np.ndarray, " n"]:  # fmt: skip
         """Replay violations, and write the verdicts into the columns.
 
         **Returns:** the objective, in which refused rows count as safe, so that a search does not

@@ -77,12 +77,9 @@ def model_changes(
 
 
 def continued_with(
-    name: str,
-    recorded: Sequence[Mapping[str, Any]],
-    problem: Problem,
-    rows: int,
+    name: str, recorded: Sequence[Mapping[str, Any]], problem: Problem, rows: int,
     even_if_changed: bool,
-) -> tuple[tuple[Mapping[str, Any], ...], str]:
+) -> tuple[tuple[Mapping[str, Any], ...], str]:  # fmt: skip
     """Return the models' record for a continued run, and a note if the model has changed.
 
     **Arguments:**

@@ -50,14 +50,9 @@ class Prefetch:
     """
 
     def __init__(
-        self,
-        proposals: Proposals,
-        evaluate: Evaluator,
-        batch: int,
-        limit: int,
-        first: int,
+        self, proposals: Proposals, evaluate: Evaluator, batch: int, limit: int, first: int,
         searching: Callable[[], AbstractContextManager[object]] = nullcontext,
-    ) -> None:
+    ) -> None:  # fmt: skip
         self._proposals, self._evaluate, self._searching = proposals, evaluate, searching
         self._workers = evaluate.sender
         self._thread = None if self._workers else ThreadPoolExecutor(1, "simulations")

@@ -361,12 +361,9 @@ class Run(InNotebook):
         return replace(seen, changed=again.changed, finding=again.finding)
 
     def _replayed(
-        self,
-        problem: Problem,
-        values: "pd.Series | Mapping[str, Any]",
-        number: int | None,
+        self, problem: Problem, values: "pd.Series | Mapping[str, Any]", number: int | None,
         precision: str,
-    ) -> "Replay":
+    ) -> "Replay":  # fmt: skip
         replay = lazy_import("verifai_jax.evaluation.replay", "replay")
         return replay(problem, values, run_keys(self.seed)[1], number, precision)
 

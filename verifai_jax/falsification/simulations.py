@@ -111,13 +111,9 @@ class Simulations:
             self._differentiate.begin_compiling()
 
     def __call__(
-        self,
-        points: Float[Any, "n d"],
-        first: int,
-        *,
-        differentiate: bool = False,
+        self, points: Float[Any, "n d"], first: int, *, differentiate: bool = False,
         temperature: Float[np.ndarray, " n"] | float = 1.0,
-    ) -> Verdicts:
+    ) -> Verdicts:  # fmt: skip
         """Simulate and evaluate the points of a round.
 
         **Arguments:**

@@ -288,11 +288,9 @@ class FeatureSpace(PointMaps, ForUsers):
 
     @classmethod
     def from_json(
-        cls,
-        data: Mapping[str, Any],
-        where: Callable[[Any], Bool[Array, ""]] | None = None,
+        cls, data: Mapping[str, Any], where: Callable[[Any], Bool[Array, ""]] | None = None,
         distributions: Mapping[str, Distribution] | None = None,
-    ) -> "FeatureSpace":
+    ) -> "FeatureSpace":  # fmt: skip
         """Build the space that `to_json` described; code is passed as arguments, never read.
 
         **Arguments:**

@@ -38,10 +38,9 @@ _TOKEN = re.compile(r'"[^"\n]*"|[\w.]+|\S')
 
 
 def parse(
-    text: str,
-    constants: Mapping[str, float] | None = None,
+    text: str, constants: Mapping[str, float] | None = None,
     definitions: Mapping[str, Formula | str] | None = None,
-) -> Formula:
+) -> Formula:  # fmt: skip
     """Read a formula from its text.
 
     **Arguments:**

@@ -32,12 +32,9 @@ from verifai_jax.mtl.setting import Setting, as_formula, evaluator_of, prepare
 
 
 def robustness(
-    formula: Formula | str,
-    trace: Trace,
-    semantics: Semantics = hard,
-    end: End = "hold",
+    formula: Formula | str, trace: Trace, semantics: Semantics = hard, end: End = "hold",
     compat: str | None = None,
-) -> Float[Array, ""]:
+) -> Float[Array, ""]:  # fmt: skip
     """Compute the robustness of a formula on a trace at time 0; it holds if this is positive.
 
     **Arguments:**
@@ -65,12 +62,9 @@ def robustness(
 
 
 def robustness_signal(
-    formula: Formula | str,
-    trace: Trace,
-    semantics: Semantics = hard,
-    end: End = "hold",
+    formula: Formula | str, trace: Trace, semantics: Semantics = hard, end: End = "hold",
     compat: str | None = None,
-) -> Float[Array, " time"]:
+) -> Float[Array, " time"]:  # fmt: skip
     """Compute the robustness at every sample of the trace; only for reverse-mode gradients.
 
     It is NaN, no verdict, where `end` leaves none: under `"strict"` at samples from which the
@@ -113,13 +107,9 @@ def first_nan(formula: Formula, trace: Trace) -> str:
 
 
 def _values(
-    setting: Setting,
-    last: int,
-    signals: dict[str, Array],
-    tau: Array | None,
-    valid: Array | None,
+    setting: Setting, last: int, signals: dict[str, Array], tau: Array | None, valid: Array | None,
     lanes: int,
-) -> Float[Array, "instants *lanes"]:
+) -> Float[Array, "instants *lanes"]:  # fmt: skip
     """Compute the values at the instants 0 to `last`."""
     if setting.kind == "smooth":
         shift = 0.0
@@ -209,13 +199,9 @@ class _Everywhere:
         return in_chunks(work, axes, self.out_axes, *arguments) if lanes else work(*arguments)
 
     def _work(
-        self,
-        lanes: int,
-        signals: dict[str, Array],
-        tau: Array | None,
-        valid: Array | None,
+        self, lanes: int, signals: dict[str, Array], tau: Array | None, valid: Array | None,
         cotangent: Array | None = None,
-    ) -> Any:
+    ) -> Any:  # fmt: skip
         def value(signals: dict[str, Array]) -> Array:
             return _values(self.setting, self.setting.length - 1, signals, tau, valid, lanes)
 
@@ -307,11 +293,9 @@ LANES = 256
 
 
 def in_chunks(
-    function: Callable[..., tuple[PyTree, ...]],
-    axes: tuple[int, ...],
-    out_axes: tuple[int, ...],
+    function: Callable[..., tuple[PyTree, ...]], axes: tuple[int, ...], out_axes: tuple[int, ...],
     *arguments: PyTree,
-) -> tuple[PyTree, ...]:
+) -> tuple[PyTree, ...]:  # fmt: skip
     """Compute `function(*arguments)` over the first lane axis, in chunks that fit into the cache.
 
     Arguments have their lanes on `axes`, results on `out_axes`.

@@ -53,12 +53,9 @@ class ExpressionBuilder:
     """
 
     def __init__(
-        self,
-        text: str,
-        constants: Mapping[str, float],
-        known: Mapping[str, Formula],
+        self, text: str, constants: Mapping[str, float], known: Mapping[str, Formula],
         reads: Callable[[str], bool] = lambda text: False,
-    ) -> None:
+    ) -> None:  # fmt: skip
         self.text = text
         self.constants = constants
         self.known = known

@@ -48,11 +48,9 @@ boolean = Semantics("boolean")
 
 
 def smooth(
-    tau: Float[Array, ""] | float | None = None,
-    *,
-    error: float | None = None,
+    tau: Float[Array, ""] | float | None = None, *, error: float | None = None,
     bound: Bound = "none",
-) -> Semantics:
+) -> Semantics:  # fmt: skip
     """Return quantitative semantics with log-sum-exp, which is differentiable everywhere.
 
     **Arguments:**

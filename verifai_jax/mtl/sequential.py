@@ -154,14 +154,9 @@ def _add(m: Array, s: Array, x: Array, weight: Number, tau: Number) -> Pair:
 
 
 def _pairs(
-    n: int,
-    reverse: bool,
-    sign: int,
-    x: Series,
-    weight: Series | None,
-    tau: Number,
+    n: int, reverse: bool, sign: int, x: Series, weight: Series | None, tau: Number,
     finish: Callable[[Array, Array], Any],
-) -> Any:
+) -> Any:  # fmt: skip
     """Compute `finish(m, s)` of the pairs over windows of `weight * exp(sign * x / tau)`."""
     length = x.shape[0]
     nothing = (jnp.full(x.shape[1:], -NEVER, x.dtype), jnp.zeros(x.shape[1:], x.dtype))

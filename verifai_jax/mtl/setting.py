@@ -249,12 +249,9 @@ def check_reach(formula: Formula, duration: float, dt: float) -> None:
 
 
 def evaluator_of(
-    setting: Setting,
-    signals: dict[str, Array],
-    tau: Array | float | None,
-    valid: Array | None,
+    setting: Setting, signals: dict[str, Array], tau: Array | float | None, valid: Array | None,
     lanes: int,
-) -> Evaluator:
+) -> Evaluator:  # fmt: skip
     of, pymtl = setting, setting.compat == "pymtl"
     return Evaluator(
         signals, of.length, of.dt, of.kind, tau, of.end, valid, pymtl, lanes,

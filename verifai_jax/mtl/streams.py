@@ -100,11 +100,9 @@ class Plan(NamedTuple):
 
 
 def streams(
-    formulas: Formula | str | Mapping[str, Formula | str],
-    dt: float,
-    semantics: Semantics = hard,
+    formulas: Formula | str | Mapping[str, Formula | str], dt: float, semantics: Semantics = hard,
     every: bool = False,
-) -> Plan:
+) -> Plan:  # fmt: skip
     """Plan the operations of one or several formulas; common parts occur once.
 
     **Arguments:**

@@ -50,13 +50,9 @@ def join(values: list[Array], sign: int = 1, tau: Tau = None) -> Array:
 
 
 def windowed(
-    x: Float[Array, "time *lanes"],
-    n: int,
-    sign: int = 1,
-    tau: Tau = None,
-    reverse: bool = True,
+    x: Float[Array, "time *lanes"], n: int, sign: int = 1, tau: Tau = None, reverse: bool = True,
     form: ModuleType | None = None,
-) -> Float[Array, "time *lanes"]:
+) -> Float[Array, "time *lanes"]:  # fmt: skip
     """Compute the maximum over `n` samples from each instant on, or, if not `reverse`, up to it.
 
     For sign -1 it is the minimum. Windows are cut at the ends of the array. Time `O(time)` on a
@@ -75,12 +71,9 @@ def windowed(
 
 
 def until(
-    f: Float[Array, "time *lanes"],
-    g: Float[Array, "time *lanes"],
-    tau: Tau = None,
-    reverse: bool = True,
-    form: ModuleType | None = None,
-) -> Float[Array, "time *lanes"]:
+    f: Float[Array, "time *lanes"], g: Float[Array, "time *lanes"], tau: Tau = None,
+    reverse: bool = True, form: ModuleType | None = None,
+) -> Float[Array, "time *lanes"]:  # fmt: skip
     """Compute `u[t] = max(g[t], min(f[t], u[t+1]))`, and `u = g` at the last sample.
 
     If not `reverse`, backwards: `u[t] = max(g[t], min(f[t], u[t-1]))`, which is since.
@@ -92,11 +85,9 @@ def until(
 
 
 def until_first(
-    f: Float[Array, "time *lanes"],
-    g: Float[Array, "time *lanes"],
-    tau: Tau = None,
+    f: Float[Array, "time *lanes"], g: Float[Array, "time *lanes"], tau: Tau = None,
     form: ModuleType | None = None,
-) -> Float[Array, " *lanes"]:
+) -> Float[Array, " *lanes"]:  # fmt: skip
     """Compute the first sample of `until(f, g)`."""
     form = form or _form()
     if form is sequential and g.shape[0] > 1:

@@ -42,13 +42,9 @@ class Animation:
 
 
 def animate(
-    replay: Replay,
-    path: str | Path | None = None,
-    *,
-    camera: str | None = None,
-    size: Sequence[int] | None = None,
-    fps: float | None = None,
-) -> Animation:
+    replay: Replay, path: str | Path | None = None, *, camera: str | None = None,
+    size: Sequence[int] | None = None, fps: float | None = None,
+) -> Animation:  # fmt: skip
     """Draw a simulation as a GIF, in real time unless it has too many frames.
 
     The problem's `draw(axes, trace, sample, features)` draws one frame. Without it, MuJoCo draws a
@@ -130,12 +126,9 @@ class _Layout(NamedTuple):
 
 
 def _frame(
-    replay: Replay,
-    draw: Callable[..., None],
-    sample: int,
-    size: tuple[int, int],
+    replay: Replay, draw: Callable[..., None], sample: int, size: tuple[int, int],
     before: _Layout | None,
-) -> tuple[UInt8[np.ndarray, "height width 3"], _Layout | None]:
+) -> tuple[UInt8[np.ndarray, "height width 3"], _Layout | None]:  # fmt: skip
     """Return the picture of one sample, of a width and a height in pixels, and its layout.
 
     - `before`: the layout of the frame before, which stays where nothing has changed that decides

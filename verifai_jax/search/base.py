@@ -69,11 +69,9 @@ class Observations(NamedTuple):
 
 
 def check_options(
-    options: object,
-    counts: Mapping[str, int] | None = None,
-    shares: Sequence[str] = (),
+    options: object, counts: Mapping[str, int] | None = None, shares: Sequence[str] = (),
     sizes: Sequence[str] = (),
-) -> None:
+) -> None:  # fmt: skip
     """Check the options of a search, which are its attributes of the same names.
 
     **Arguments:**

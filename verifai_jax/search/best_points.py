@@ -6,11 +6,9 @@ from jaxtyping import Array, Float
 
 
 def newest_first(
-    u: Float[Array, "n d"],
-    new: Float[Array, " n"],
-    points: Float[Array, "k d"],
+    u: Float[Array, "n d"], new: Float[Array, " n"], points: Float[Array, "k d"],
     score: Float[Array, " k"],
-) -> tuple[Float[Array, "n+k d"], Float[Array, " n+k"]]:
+) -> tuple[Float[Array, "n+k d"], Float[Array, " n+k"]]:  # fmt: skip
     """Return the points of a round before those of a memory, with their scores.
 
     **Arguments:**
@@ -22,11 +20,9 @@ def newest_first(
 
 
 def keep_best(
-    u: Float[Array, "n d"],
-    new: Float[Array, " n"],
-    points: Float[Array, "k d"],
+    u: Float[Array, "n d"], new: Float[Array, " n"], points: Float[Array, "k d"],
     score: Float[Array, " k"],
-) -> tuple[Float[Array, "k d"], Float[Array, " k"]]:
+) -> tuple[Float[Array, "k d"], Float[Array, " k"]]:  # fmt: skip
     """Return the best points of a round and a memory, sorted; the newest first among equal ones.
 
     **Arguments:** those of `newest_first`.

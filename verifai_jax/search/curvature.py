@@ -52,13 +52,9 @@ def begin(descents: int, dim: int) -> Curvature:
 
 
 def advance(
-    state: Curvature,
-    point: Float[Array, "n d"],
-    value: Float[Array, " n"],
-    slope: Float[Array, "n d"],
-    fresh: Bool[Array, " n"],
-    radius: Float[Array, " n"],
-) -> tuple[Curvature, Float[Array, "n d"]]:
+    state: Curvature, point: Float[Array, "n d"], value: Float[Array, " n"],
+    slope: Float[Array, "n d"], fresh: Bool[Array, " n"], radius: Float[Array, " n"],
+) -> tuple[Curvature, Float[Array, "n d"]]:  # fmt: skip
     """Learn from one point of each descent, and return the next point.
 
     **Arguments:**
@@ -108,11 +104,9 @@ def _next(state: Curvature) -> Float[Array, " d"]:
 
 
 def _inverse_hessian_times(
-    vector: Float[Array, " d"],
-    steps: Float[Array, "pairs d"],
-    turns: Float[Array, "pairs d"],
+    vector: Float[Array, " d"], steps: Float[Array, "pairs d"], turns: Float[Array, "pairs d"],
     radius: Float[Array, ""],
-) -> Float[Array, " d"]:
+) -> Float[Array, " d"]:  # fmt: skip
     """Return an approximate inverse Hessian times a vector, by the two loops of L-BFGS.
 
     Without a pair it is the vector as long as the trust region, in its greatest coordinate.

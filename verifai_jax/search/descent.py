@@ -269,13 +269,9 @@ def plan(state: InteriorState, cube: Cube, batch: int) -> Plan:
 
 
 def learn(
-    state: InteriorState,
-    cube: Cube,
-    observations: Observations,
-    score: Float[Array, " n"],
-    spent: Float[Array, ""],
-    best: tuple[Float[Array, "k d"], Float[Array, " k"]],
-) -> InteriorState:
+    state: InteriorState, cube: Cube, observations: Observations, score: Float[Array, " n"],
+    spent: Float[Array, ""], best: tuple[Float[Array, "k d"], Float[Array, " k"]],
+) -> InteriorState:  # fmt: skip
     """Learn from a round.
 
     **Arguments:**
@@ -340,11 +336,9 @@ def _counted(
 
 
 def _offer(
-    descent: DescentState,
-    state: InteriorState,
-    points: Float[Array, "k d"],
+    descent: DescentState, state: InteriorState, points: Float[Array, "k d"],
     score: Float[Array, " k"],
-) -> tuple[DescentState, Float[Array, "taken d"]]:
+) -> tuple[DescentState, Float[Array, "taken d"]]:  # fmt: skip
     """Offer the best point from which no descent began or ended as the next start but one."""
     index = jnp.argmax(descent.step == 0)
     ends = state.turn & state.descent.given[index] & (descent.step[index] == 0)

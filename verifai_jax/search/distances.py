@@ -28,11 +28,9 @@ def apart(cube: Cube, one: Float[Array, "n d"], other: Float[Array, "m d"]) -> F
 
 
 def distinct(
-    points: Sequence | np.ndarray | Array,
-    radius: float,
-    cube: Cube | None = None,
+    points: Sequence | np.ndarray | Array, radius: float, cube: Cube | None = None,
     order: Sequence[int] | np.ndarray | None = None,
-) -> Int[np.ndarray, " k"]:
+) -> Int[np.ndarray, " k"]:  # fmt: skip
     """Choose distinct points: no two of them are within the radius.
 
     The first point is chosen, then each one beyond the radius of all chosen points.

@@ -193,13 +193,9 @@ class Gradient(SlopeSearch[GradientState]):
         )
 
     def _boxes(
-        self,
-        state: GradientState,
-        cube: Cube,
-        descent: Int[Array, " n"],
-        size: Int[Array, " n"],
+        self, state: GradientState, cube: Cube, descent: Int[Array, " n"], size: Int[Array, " n"],
         box: Float[Array, " n"],
-    ) -> tuple[Float[Array, "n d"], Bool[Array, " n"]]:
+    ) -> tuple[Float[Array, "n d"], Bool[Array, " n"]]:  # fmt: skip
         """Return where the linear clauses are lowest in boxes of descents, and which are flips."""
         free = np.array(cube.levels) == 0
         clauses, gradients = state.clauses[descent], state.gradients[descent]

@@ -123,13 +123,9 @@ def _digits(base: int) -> int:
 
 
 def _radical_inverse(
-    index: UInt32[Array, " n"],
-    bases: UInt32[np.ndarray, " d"],
-    digits: Int[np.ndarray, " d"],
-    maps: tuple[UInt32[Array, "digits d"], UInt32[Array, "digits d"]] | None,
-    *,
-    unroll: bool,
-) -> Float[Array, "n d"]:
+    index: UInt32[Array, " n"], bases: UInt32[np.ndarray, " d"], digits: Int[np.ndarray, " d"],
+    maps: tuple[UInt32[Array, "digits d"], UInt32[Array, "digits d"]] | None, *, unroll: bool,
+) -> Float[Array, "n d"]:  # fmt: skip
     """Mirror the digits of the indices at the point, in a loop or written out (`unroll`)."""
     width = int(np.max(digits, initial=0))
     shape = (len(index), len(bases))

@@ -71,12 +71,9 @@ def minimax_direction(
 
 
 def flip_weakest(
-    clauses: Float[Array, " clauses"],
-    gradients: Float[Array, "clauses d"],
-    point: Float[Array, " d"],
-    number: Int[Array, ""],
-    free: Bool[np.ndarray, " d"],
-) -> Float[Array, " d"]:
+    clauses: Float[Array, " clauses"], gradients: Float[Array, "clauses d"],
+    point: Float[Array, " d"], number: Int[Array, ""], free: Bool[np.ndarray, " d"],
+) -> Float[Array, " d"]:  # fmt: skip
     """Move the coordinate with the `number`-th weakest effect to the other end of its range."""
     steep = jnp.abs(gradients[jnp.argmax(clauses)])
     # Coordinates without a derivative come last: they seem to have no effect.

@@ -128,14 +128,9 @@ class Mutation(Search[MutationState]):
         )
 
     def _mutate(
-        self,
-        state: MutationState,
-        cube: Cube,
-        coins: Float[Array, "n 14"],
-        values: Float[Array, "n d"],
-        masks: Float[Array, "n d"],
-        normal: Float[Array, "n d"],
-    ) -> Float[Array, "n d"]:
+        self, state: MutationState, cube: Cube, coins: Float[Array, "n 14"],
+        values: Float[Array, "n d"], masks: Float[Array, "n d"], normal: Float[Array, "n d"],
+    ) -> Float[Array, "n d"]:  # fmt: skip
         d = cube.dim
         there = jnp.sum(jnp.isfinite(state.score)).astype(jnp.float32)
         # Every second parent is any of several failures, so that not all come from the worst.
@@ -195,14 +190,9 @@ def _other_cells(
 
 
 def _explore(
-    cube: Cube,
-    direction: Float[Array, " n"],
-    change: Float[Array, " n"],
-    even: Float[Array, " n"],
-    idle: Float[Array, ""],
-    values: Float[Array, "n d"],
-    cuts: Float[Array, "n d"],
-) -> Float[Array, "n d"]:
+    cube: Cube, direction: Float[Array, " n"], change: Float[Array, " n"], even: Float[Array, " n"],
+    idle: Float[Array, ""], values: Float[Array, "n d"], cuts: Float[Array, "n d"],
+) -> Float[Array, "n d"]:  # fmt: skip
     """Draw points towards the ends of the range; signals change seldom, always or at random."""
     # Arcsine distributed: dense at both ends, as the best controls often are.
     u = jnp.sin(0.5 * np.pi * values) ** 2

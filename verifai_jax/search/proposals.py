@@ -174,11 +174,9 @@ class Proposals:
         self.tell(np.zeros(0, np.float32), np.zeros(0, bool), None)
 
     def warm_start(
-        self,
-        u: Float[np.ndarray, "n d"],
-        rho: Float[np.ndarray, " n"],
+        self, u: Float[np.ndarray, "n d"], rho: Float[np.ndarray, " n"],
         outcomes: Float[np.ndarray, "n outcome"] | None = None,
-    ) -> None:
+    ) -> None:  # fmt: skip
         """Let the search learn from points of an earlier table, or points that a person gave."""
         if not self.search.learns or not len(u):
             return
@@ -200,13 +198,9 @@ class Proposals:
             self._repetition.add(u)
 
     def _observed(
-        self,
-        points: Any,
-        rows: Int[np.ndarray, " m"],
-        rho: Float[np.ndarray, " m"],
-        valid: Bool[np.ndarray, " m"],
-        known: Mapping[str, Any],
-    ) -> Observations:
+        self, points: Any, rows: Int[np.ndarray, " m"], rho: Float[np.ndarray, " m"],
+        valid: Bool[np.ndarray, " m"], known: Mapping[str, Any],
+    ) -> Observations:  # fmt: skip
         """Return the observations of a whole batch, of which these rows were simulated.
 
         - `known`: further parts by name, which the search gets if it wants them; None for nothing.

@@ -54,12 +54,9 @@ class Repetition:
         self._known.update(new.tolist())
 
     def avoid(
-        self,
-        points: Float[np.ndarray, "n d"],
-        wanted: Bool[np.ndarray, " n"],
-        anywhere: bool,
+        self, points: Float[np.ndarray, "n d"], wanted: Bool[np.ndarray, " n"], anywhere: bool,
         number: int,
-    ) -> tuple[Float[np.ndarray, "n d"], Float[np.ndarray, "n d"]]:
+    ) -> tuple[Float[np.ndarray, "n d"], Float[np.ndarray, "n d"]]:  # fmt: skip
         """Replace points that were simulated before, or that occur twice.
 
         **Arguments:**

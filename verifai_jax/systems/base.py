@@ -150,12 +150,9 @@ class System(ForUsers):
         return type(self).fold is not System.fold
 
     def fold(
-        self,
-        features: Features,
-        key: Seed,
-        carry: Carry,
+        self, features: Features, key: Seed, carry: Carry,
         update: Callable[[Carry, dict[str, Array]], Carry],
-    ) -> tuple[Carry, Int[Array, ""]]:
+    ) -> tuple[Carry, Int[Array, ""]]:  # fmt: skip
         """Simulate with `carry = update(carry, sample)` for each sample, without storing samples.
 
         After an early end the last valid sample repeats until the last step.

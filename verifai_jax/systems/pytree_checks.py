@@ -59,14 +59,9 @@ def _both_real(one: Any, other: Any) -> bool:
 
 
 def check_like(
-    got: PyTree,
-    wanted: PyTree,
-    origin: str,
-    role: str,
-    note: str = "",
-    *,
+    got: PyTree, wanted: PyTree, origin: str, role: str, note: str = "", *,
     same_precision: bool = True,
-) -> None:
+) -> None:  # fmt: skip
     """Refuse a pytree of shapes that differs from the `wanted` one in structure, shape or dtype.
 
     A weakly typed number (a Python literal) matches any dtype to which it can be converted.

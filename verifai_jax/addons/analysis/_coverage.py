@@ -220,10 +220,9 @@ def _drop_constant(samples: Samples) -> Samples:
 
 
 def _discrepancy(
-    unit: Float[np.ndarray, "n d"],
-    allowed: Float[np.ndarray, "m d"] | None,
+    unit: Float[np.ndarray, "n d"], allowed: Float[np.ndarray, "m d"] | None,
     generator: np.random.Generator,
-) -> float:
+) -> float:  # fmt: skip
     """Return the squared centred discrepancy over that of as many samples of the prior."""
     from scipy.stats import qmc
 
@@ -266,11 +265,9 @@ BLOCK = 4096
 
 
 def largest_hole(
-    points: Float[np.ndarray, "n k"],
-    parts: Sequence[Marginal],
-    seed: int,
+    points: Float[np.ndarray, "n k"], parts: Sequence[Marginal], seed: int,
     among: Float[np.ndarray, "m k"] | None = None,
-) -> tuple[float, Float[np.ndarray, " k"]]:
+) -> tuple[float, Float[np.ndarray, " k"]]:  # fmt: skip
     """Return the greatest distance of a probe to its nearest point, and that probe.
 
     Probes are 4096 points of a Sobol sequence (1024 in more than 8 dimensions), then ever closer

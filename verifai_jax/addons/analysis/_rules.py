@@ -172,14 +172,9 @@ _COLUMNS = ("rule", "coverage", "precision", "low", "high", "failures", "rows")
 
 
 def rules(
-    source: Source,
-    depth: int = 3,
-    *,
-    cover: float = 0.95,
-    max_rules: int = 6,
-    held_out: float = 0.4,
-    seed: int = 0,
-) -> Rules:
+    source: Source, depth: int = 3, *, cover: float = 0.95, max_rules: int = 6,
+    held_out: float = 0.4, seed: int = 0,
+) -> Rules:  # fmt: skip
     """Describe the failure region by a few boxes.
 
     **Arguments:**
@@ -385,12 +380,9 @@ def _simplify(region: Region, score: Callable[[Region], float]) -> Region:
 
 
 def _supported(
-    region: Region,
-    values: Float[np.ndarray, "n k"],
-    codes: Int[np.ndarray, "n m"],
-    failing: Bool[np.ndarray, " n"],
-    samples: Samples,
-) -> Region:
+    region: Region, values: Float[np.ndarray, "n k"], codes: Int[np.ndarray, "n m"],
+    failing: Bool[np.ndarray, " n"], samples: Samples,
+) -> Region:  # fmt: skip
     """Remove the conditions that rows kept aside do not support, the worst one first."""
     while region.size:
         inside = region.covers(values, codes)

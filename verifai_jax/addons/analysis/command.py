@@ -23,13 +23,9 @@ from verifai_jax.cli.json_output import command, give_result, say
     "--next", "count", type=click.IntRange(1), default=10, help="Points of --odd to simulate next."
 )
 def analyze(
-    folder: Path,
-    target: str | None,
-    into: Path | None,
-    boundary: int | None,
-    odd: Path | None,
+    folder: Path, target: str | None, into: Path | None, boundary: int | None, odd: Path | None,
     count: int,
-) -> None:
+) -> None:  # fmt: skip
     """Report rules, importance, kinds of failures and coverage of the run in RUN."""
     run = load_judged_run(folder, target)
     analysis = run.analyze()

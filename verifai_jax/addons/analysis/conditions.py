@@ -133,11 +133,9 @@ class Region:
         return found
 
     def round(
-        self,
-        values: Float[np.ndarray, "n k"],
-        codes: Int[np.ndarray, "n m"],
+        self, values: Float[np.ndarray, "n k"], codes: Int[np.ndarray, "n m"],
         integer: Sequence[bool],
-    ) -> "Region":
+    ) -> "Region":  # fmt: skip
         """Round the bounds to short numbers such that the region covers the same of these rows.
 
         **Arguments:**

@@ -154,13 +154,9 @@ def nearest(
 
 
 def random_rows(
-    source: Source,
-    k: int,
-    seed: Seed,
-    which: Which = "counterexamples",
-    columns: Sequence[str] | None = None,
-    space: Problem | FeatureSpace | None = None,
-) -> Neighbours:
+    source: Source, k: int, seed: Seed, which: Which = "counterexamples",
+    columns: Sequence[str] | None = None, space: Problem | FeatureSpace | None = None,
+) -> Neighbours:  # fmt: skip
     """Draw `k` different rows with equal probability; all of them if there are fewer.
 
     **Arguments:**

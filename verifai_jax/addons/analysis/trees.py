@@ -55,11 +55,9 @@ def propose_regions(
 
 
 def _encoded(
-    values: Float[np.ndarray, "n k"],
-    codes: Int[np.ndarray, "n m"],
-    failing: Bool[np.ndarray, " n"],
-    unordered: tuple[Column, ...],
-) -> tuple[Float[np.ndarray, "n e"], list[tuple[int, Any]]]:
+    values: Float[np.ndarray, "n k"], codes: Int[np.ndarray, "n m"],
+    failing: Bool[np.ndarray, " n"], unordered: tuple[Column, ...],
+) -> tuple[Float[np.ndarray, "n e"], list[tuple[int, Any]]]:  # fmt: skip
     """Return columns that a tree can split, and the meaning of each.
 
     An ordered column stands for itself. An unordered one is given by a column for each choice, and

@@ -134,12 +134,9 @@ class CorpusReplay(InNotebook):
 @suggests_options
 @shows_progress("replaying the counterexamples of", "replays")
 def replay_counterexamples(
-    problem: Problem,
-    folder: str | Path,
-    *,
-    rename: Mapping[str, str] | None = None,
+    problem: Problem, folder: str | Path, *, rename: Mapping[str, str] | None = None,
     progress: bool | None = None,
-) -> CorpusReplay:
+) -> CorpusReplay:  # fmt: skip
     """Simulate the counterexamples of a corpus again, all in one batch.
 
     Each is simulated with its features and its random key. A file whose features no longer fit the

@@ -172,14 +172,9 @@ _FORMS: dict[str, tuple[Callable[[Any], bool], str]] = {
 
 @shows_progress("saving counterexamples of", of_budget=False)
 def save_counterexamples(
-    run: Run,
-    folder: str | Path,
-    *,
-    max_count: int = 5,
-    shrink: bool = True,
-    budget: int = 1000,
+    run: Run, folder: str | Path, *, max_count: int = 5, shrink: bool = True, budget: int = 1000,
     progress: bool | None = None,
-) -> list[Path]:
+) -> list[Path]:  # fmt: skip
     """Write counterexamples of a run into a folder, one small file each.
 
     Only claimed rows are written: if the run confirms, those that closer replays confirmed. The

@@ -118,22 +118,16 @@ class ExecutorEngine:
         """Do nothing, because workers compile with their first block."""
 
     def evaluate(
-        self,
-        rows: Float[Any, "n d"],
-        key: Key[Array, ""],
-        first: int = 0,
+        self, rows: Float[Any, "n d"], key: Key[Array, ""], first: int = 0,
         temperature: Float[np.ndarray, " n"] | Float[Array, ""] | float = 1.0,
-    ) -> Verdicts:
+    ) -> Verdicts:  # fmt: skip
         """Simulate and evaluate rows on the workers; arguments as in `engine.Engine.evaluate`."""
         return self.submit(rows, key, first, temperature).result()
 
     def submit(
-        self,
-        rows: Float[Any, "n d"],
-        key: Key[Array, ""],
-        first: int = 0,
+        self, rows: Float[Any, "n d"], key: Key[Array, ""], first: int = 0,
         temperature: Float[np.ndarray, " n"] | Float[Array, ""] | float = 1.0,
-    ) -> "Pending":
+    ) -> "Pending":  # fmt: skip
         """Send rows to the workers, and return an object that waits for their verdicts."""
         u = np.ascontiguousarray(rows, self._dtype)
         pending = Pending(self, u, key, first, np.asarray(temperature, np.float32))
@@ -239,13 +233,9 @@ class Pending:
     """
 
     def __init__(
-        self,
-        engine: ExecutorEngine,
-        u: Float[np.ndarray, "n d"],
-        key: Key[Array, ""],
-        first: int,
+        self, engine: ExecutorEngine, u: Float[np.ndarray, "n d"], key: Key[Array, ""], first: int,
         temperature: Float[np.ndarray, "*n"],
-    ) -> None:
+    ) -> None:  # fmt: skip
         self._engine, self._u, self._key, self._first = engine, u, key, first
         self._temperature, self._words = temperature, np.asarray(jax.random.key_data(key))
         runs = engine.runs(u, first)

@@ -71,11 +71,9 @@ def seconds_per_block(executor: Executor) -> float:
 
 
 def gather(
-    futures: Sequence[Future],
-    ended: Callable[[int, Any], None],
-    further: Callable[[], Sequence[Future]] = tuple,
-    check: Callable[[], None] = lambda: None,
-) -> None:
+    futures: Sequence[Future], ended: Callable[[int, Any], None],
+    further: Callable[[], Sequence[Future]] = tuple, check: Callable[[], None] = lambda: None,
+) -> None:  # fmt: skip
     """Wait for all futures, and call `ended(index, result)` when each has ended.
 
     `further()` returns more futures whenever some have ended; indices continue. `check()` is called
@@ -158,11 +156,9 @@ class Shipment(Generic[T]):
     """
 
     def __init__(
-        self,
-        thing: T,
-        target: str | None = None,
+        self, thing: T, target: str | None = None,
         same: Callable[[Any], Mapping[str, str]] | None = None,
-    ) -> None:
+    ) -> None:  # fmt: skip
         self.thing, self.target, self.same = thing, target, same
         self.token = uuid.uuid4().hex
         self.made: dict[str, Any] = {}
@@ -214,11 +210,9 @@ def _receive_target(
 
 
 def ship(
-    thing: T,
-    executor: Executor,
-    target: str | None = None,
+    thing: T, executor: Executor, target: str | None = None,
     same: Callable[[Any], Mapping[str, str]] | None = None,
-) -> Shipment[T]:
+) -> Shipment[T]:  # fmt: skip
     """Prepare an object to be sent through an executor.
 
     If the executor sends code, the object is pickled together with functions of files loaded as

@@ -71,12 +71,9 @@ class ExecutorReplays(HostReplays):
 
 @reproducible_settings()
 def replay_block(
-    shipment: Shipment[Problem],
-    how: tuple[str | None, str, int, bool],
-    words: UInt32[np.ndarray, "2"],
-    leaves: Sequence[np.ndarray],
-    numbers: Int[np.ndarray, " n"],
-) -> dict[str, Any]:
+    shipment: Shipment[Problem], how: tuple[str | None, str, int, bool],
+    words: UInt32[np.ndarray, "2"], leaves: Sequence[np.ndarray], numbers: Int[np.ndarray, " n"],
+) -> dict[str, Any]:  # fmt: skip
     """Simulate rows again; called by a worker.
 
     **Arguments:**

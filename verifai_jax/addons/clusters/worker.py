@@ -66,13 +66,9 @@ computing = threading.Lock()
 
 @reproducible_settings()
 def evaluate_block(
-    shipment: Shipment[Problem],
-    mode: BlockMode,
-    key: UInt32[np.ndarray, "2"],
-    first: int,
-    u: Float[np.ndarray, "n d"],
-    temperature: Float[np.ndarray, " n"] | float,
-) -> dict[str, Any]:
+    shipment: Shipment[Problem], mode: BlockMode, key: UInt32[np.ndarray, "2"], first: int,
+    u: Float[np.ndarray, "n d"], temperature: Float[np.ndarray, " n"] | float,
+) -> dict[str, Any]:  # fmt: skip
     """Simulate and evaluate the rows `first` to `first + n - 1`; called by a worker.
 
     **Arguments:**
@@ -107,22 +103,17 @@ def evaluate_block(
 
 
 def question_of(
-    shipment: Shipment[Problem],
-    key: UInt32[np.ndarray, "2"],
-    first: int,
+    shipment: Shipment[Problem], key: UInt32[np.ndarray, "2"], first: int,
     u: Float[np.ndarray, "n d"],
-) -> tuple[str, tuple[int, ...], int, int]:
+) -> tuple[str, tuple[int, ...], int, int]:  # fmt: skip
     """Return a value that identifies a call of `evaluate_block` among all calls of a run."""
     return shipment.token, tuple(int(word) for word in key), int(first), len(u)
 
 
 def _on_host(
-    problem: Problem,
-    mode: BlockMode,
-    key: UInt32[np.ndarray, "2"],
-    first: int,
+    problem: Problem, mode: BlockMode, key: UInt32[np.ndarray, "2"], first: int,
     u: Float[np.ndarray, "n d"],
-) -> tuple[Verdicts, float, Remarks]:
+) -> tuple[Verdicts, float, Remarks]:  # fmt: skip
     engine = problem.programs.get(
         HOST_ENGINES,
         mode,
@@ -134,13 +125,9 @@ def _on_host(
 
 
 def _compiled(
-    problem: Problem,
-    mode: BlockMode,
-    key: UInt32[np.ndarray, "2"],
-    first: int,
-    u: Float[np.ndarray, "n d"],
-    temperature: Float[np.ndarray, " n"] | float,
-) -> tuple[Verdicts, float, tuple[str, ...]]:
+    problem: Problem, mode: BlockMode, key: UInt32[np.ndarray, "2"], first: int,
+    u: Float[np.ndarray, "n d"], temperature: Float[np.ndarray, " n"] | float,
+) -> tuple[Verdicts, float, tuple[str, ...]]:  # fmt: skip
     devices = jax.local_devices()
     devices = devices[: max(1, min(len(devices), -(-len(u) // mode.lanes)))]
     step = mode.lanes * len(devices)

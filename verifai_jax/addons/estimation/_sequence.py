@@ -125,13 +125,9 @@ class _Stage:
     """A part, its number, and the values that the next part takes from its end."""
 
     def __init__(
-        self,
-        part: Problem | Run,
-        number: int,
-        begins: Handover,
-        hands: Handover,
+        self, part: Problem | Run, number: int, begins: Handover, hands: Handover,
         options: Mapping[str, Any],
-    ) -> None:
+    ) -> None:  # fmt: skip
         self.run = part if isinstance(part, Run) else None
         problem = part.problem if isinstance(part, Run) else part
         assert problem is not None
@@ -309,12 +305,9 @@ def _last(trace: Trace | None, source: str) -> np.ndarray:
 
 
 def _stages(
-    parts: Sequence[Problem | Run],
-    handover: Handover | Sequence[Handover],
-    batch: int,
-    precision: str,
-    seed: int,
-) -> list[_Stage]:
+    parts: Sequence[Problem | Run], handover: Handover | Sequence[Handover], batch: int,
+    precision: str, seed: int,
+) -> list[_Stage]:  # fmt: skip
     """Check the parts and how they are joined."""
     if not isinstance(parts, Sequence) or len(parts) < 2:
         raise ValueError("a sequence has two parts or more, in a list")

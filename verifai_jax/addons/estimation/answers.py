@@ -112,12 +112,9 @@ def splitting_cost(run: SplittingRun, size: int) -> float:
 
 
 def importance_answer(
-    samples: importance.ImportanceSamples,
-    run: SplittingRun,
-    agreement: Agreement,
-    counts: Counts,
+    samples: importance.ImportanceSamples, run: SplittingRun, agreement: Agreement, counts: Counts,
     plan: Plan,
-) -> Answer:
+) -> Answer:  # fmt: skip
     mean = samples.mean
     low, high = samples.interval(plan.confidence)
     failing, drawn = samples.defensive_counts
@@ -207,12 +204,9 @@ def estimate_by_splitting(limit_state: LimitState, rng: np.random.Generator, pla
 
 
 def splitting_answer(
-    limit_state: LimitState,
-    rng: np.random.Generator,
-    plan: Plan,
-    runs: list[SplittingRun],
+    limit_state: LimitState, rng: np.random.Generator, plan: Plan, runs: list[SplittingRun],
     counts: Counts,
-) -> Answer:
+) -> Answer:  # fmt: skip
     """Answer with the mean of these runs and of further runs within the budget.
 
     If the first level of each run already consists of failures, the runs contain only samples of

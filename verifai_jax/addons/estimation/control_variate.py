@@ -41,12 +41,9 @@ class Control:
     """
 
     def __init__(
-        self,
-        limit_state: LimitState,
-        rng: np.random.Generator,
-        surrogate: Surrogate,
+        self, limit_state: LimitState, rng: np.random.Generator, surrogate: Surrogate,
         proposal: Mixture,
-    ) -> None:
+    ) -> None:  # fmt: skip
         self._surrogate, self._accepts = surrogate, limit_state.accepts
         self.mean = self.error = 0.0
         if surrogate.posterior is not None:

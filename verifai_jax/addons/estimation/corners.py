@@ -25,11 +25,9 @@ INSIDE = 3e-4
 
 
 def approach_corner(
-    limit_state: LimitState,
-    z: Float[np.ndarray, "n d"],
-    planes: int = PLANES,
+    limit_state: LimitState, z: Float[np.ndarray, "n d"], planes: int = PLANES,
     halvings: int = HALVINGS,
-) -> tuple[Float[np.ndarray, "n d"], list[Float[np.ndarray, "_ d"]]]:
+) -> tuple[Float[np.ndarray, "n d"], list[Float[np.ndarray, "_ d"]]]:  # fmt: skip
     """Move failures to nearby ones closest to the origin, using all their tangent planes.
 
     The path to the closest point that all planes allow is followed as long as it fails; the next

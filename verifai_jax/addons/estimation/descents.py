@@ -211,11 +211,9 @@ def _worse_neighbours(
 
 
 def _descend(
-    limit_state: LimitState,
-    rng: np.random.Generator,
-    descents: Descents,
+    limit_state: LimitState, rng: np.random.Generator, descents: Descents,
     known: Float[np.ndarray, "m d"],
-) -> None:
+) -> None:  # fmt: skip
     """Lower the robustness of each point until it fails or its steps are used up.
 
     With gradients a descent ends at once where many before it reached the same plane, one of

@@ -88,13 +88,9 @@ class DoublePrecisionEvaluator:
     """
 
     def __init__(
-        self,
-        problem: Problem,
-        batch: int,
-        precision: str,
-        seed: int,
+        self, problem: Problem, batch: int, precision: str, seed: int,
         executor: "Executor | None" = None,
-    ) -> None:
+    ) -> None:  # fmt: skip
         space = problem.space
         self._held = max(space.levels, default=0) <= EXACT
         if self._held:

@@ -191,10 +191,9 @@ def _merge(
 
 
 def _regions_of(
-    limit_state: LimitState,
-    nearest: Float[np.ndarray, "m d"],
+    limit_state: LimitState, nearest: Float[np.ndarray, "m d"],
     known: Int[np.ndarray, " m"] | None = None,
-) -> Int[np.ndarray, " m"]:
+) -> Int[np.ndarray, " m"]:  # fmt: skip
     """Return the region `[m]` of chains: of one are near ones between which another point fails.
 
     Those that are `known` to belong together do so.
@@ -213,11 +212,9 @@ def _regions_of(
 
 
 def _joined(
-    limit_state: LimitState,
-    z: Float[np.ndarray, "k d"],
-    others: Int[np.ndarray, "k links"],
+    limit_state: LimitState, z: Float[np.ndarray, "k d"], others: Int[np.ndarray, "k links"],
     known: Int[np.ndarray, " k"] | None = None,
-) -> Int[np.ndarray, " k"]:
+) -> Int[np.ndarray, " k"]:  # fmt: skip
     """Return numbers `[k]` of groups of failures: joined to others where the middle fails."""
     indices = np.arange(len(z))
     group = indices.copy() if known is None else known.copy()

@@ -113,11 +113,9 @@ def fit_diagonal(
 
 
 def fit_across(
-    z: Float[np.ndarray, "n d"],
-    weight: Float[np.ndarray, " n"],
-    directions: Float[np.ndarray, "d p"],
-    worth: float = 1.0,
-) -> Gaussian:
+    z: Float[np.ndarray, "n d"], weight: Float[np.ndarray, " n"],
+    directions: Float[np.ndarray, "d p"], worth: float = 1.0,
+) -> Gaussian:  # fmt: skip
     """Fit a slightly widened Gaussian in orthonormal directions; across them it is the prior."""
     within = fit_gaussian(z @ directions, weight, worth)
     others = np.linalg.qr(directions, mode="complete")[0][:, directions.shape[1] :]
@@ -127,12 +125,9 @@ def fit_across(
 
 
 def fit_gaussian_mixture(
-    z: Float[np.ndarray, "n d"],
-    weight: Float[np.ndarray, " n"],
-    modes: int,
-    rng: np.random.Generator,
-    worth: float = 1.0,
-) -> tuple[list[float], list[Gaussian], Float[np.ndarray, "n modes"]]:
+    z: Float[np.ndarray, "n d"], weight: Float[np.ndarray, " n"], modes: int,
+    rng: np.random.Generator, worth: float = 1.0,
+) -> tuple[list[float], list[Gaussian], Float[np.ndarray, "n modes"]]:  # fmt: skip
     """Fit a mixture of Gaussians by expectation maximisation from spread-out centres.
 
     **Returns:** shares, components, and memberships `[n, modes]` times weight; covariances are
@@ -188,11 +183,9 @@ _AMONG = [np.searchsorted(_FINEST, border) for border in _BORDERS]
 
 
 def fit_copula(
-    z: Float[np.ndarray, "n d"],
-    weight: Float[np.ndarray, " n"],
-    steps: Marginals,
+    z: Float[np.ndarray, "n d"], weight: Float[np.ndarray, " n"], steps: Marginals,
     worth: float = 1.0,
-) -> Copula | None:
+) -> Copula | None:  # fmt: skip
     """Join marginals by their correlations beyond sampling noise; None if there are none."""
     d, size = z.shape[1], effective_size(weight) * worth
     v = rank_scores(steps, z)
@@ -211,11 +204,9 @@ def fit_copula(
 
 
 def fit_marginals(
-    z: Float[np.ndarray, "n d"],
-    weight: Float[np.ndarray, " n"],
-    wider: float = 1.0,
+    z: Float[np.ndarray, "n d"], weight: Float[np.ndarray, " n"], wider: float = 1.0,
     worth: float = 1.0,
-) -> Marginals:
+) -> Marginals:  # fmt: skip
     """Fit each coordinate's density by kernels with reflected ends, as a fine step function.
 
     **Arguments:**

@@ -225,13 +225,9 @@ def widening(tail: float) -> float:
 
 
 def _share_out(
-    mixture: Mixture,
-    anchored: Mixture,
-    anchors: Anchors,
-    z: Float[np.ndarray, "n d"],
-    weight: Float[np.ndarray, " n"],
-    defensive: float,
-) -> Float[np.ndarray, " k"]:
+    mixture: Mixture, anchored: Mixture, anchors: Anchors, z: Float[np.ndarray, "n d"],
+    weight: Float[np.ndarray, " n"], defensive: float,
+) -> Float[np.ndarray, " k"]:  # fmt: skip
     """Return the best share of each component of the anchors next to a mixture; the sum is <= 1.
 
     The best ones for the whole would leave an improbable region without samples, and its own
@@ -248,12 +244,9 @@ def _share_out(
 
 
 def sample_proposal(
-    limit_state: LimitState,
-    rng: np.random.Generator,
-    proposal: Mixture,
-    simulations: int,
+    limit_state: LimitState, rng: np.random.Generator, proposal: Mixture, simulations: int,
     clamped: Bool[np.ndarray, " d"] | None = None,
-) -> ImportanceSamples:
+) -> ImportanceSamples:  # fmt: skip
     """Simulate fresh samples of a frozen proposal.
 
     **Arguments:**

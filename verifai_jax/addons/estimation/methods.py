@@ -175,14 +175,9 @@ def _promised_by_counting(limit_state: LimitState, fitted: FittedProposal, count
 
 
 def _without_proposal(
-    limit_state: LimitState,
-    rng: np.random.Generator,
-    plan: Plan,
-    run: SplittingRun,
-    counts: Counts,
-    fitted: FittedProposal,
-    counted: float,
-) -> Answer:
+    limit_state: LimitState, rng: np.random.Generator, plan: Plan, run: SplittingRun,
+    counts: Counts, fitted: FittedProposal, counted: float,
+) -> Answer:  # fmt: skip
     """Answer by splitting or by counting, whichever promises more.
 
     Chains of a system that draws keep the failures that were lucky, and splitting is far too low
@@ -253,12 +248,9 @@ def _explore(limit_state: LimitState, rng: np.random.Generator) -> list[Explorat
 
 
 def _proposals(
-    limit_state: LimitState,
-    rng: np.random.Generator,
-    plan: Plan,
-    run: SplittingRun,
+    limit_state: LimitState, rng: np.random.Generator, plan: Plan, run: SplittingRun,
     explorations: list[Exploration],
-) -> tuple[np.ndarray, np.ndarray, list[Mixture]]:
+) -> tuple[np.ndarray, np.ndarray, list[Mixture]]:  # fmt: skip
     """Return failures, their chains, and a proposal of splitting and of each exploration."""
     proposals = [proposal_from(exploration, rng, DEFENSIVE) for exploration in explorations]
     if run.stopped is not None:

@@ -94,12 +94,9 @@ class Mixture:
 
 
 def fit_mixture(
-    z: Float[np.ndarray, "n d"],
-    weight: Float[np.ndarray, " n"],
-    chain_ids: Int[np.ndarray, " n"],
-    rng: np.random.Generator,
-    defensive: float = 0.1,
-) -> Mixture:
+    z: Float[np.ndarray, "n d"], weight: Float[np.ndarray, " n"], chain_ids: Int[np.ndarray, " n"],
+    rng: np.random.Generator, defensive: float = 0.1,
+) -> Mixture:  # fmt: skip
     """Fit a mixture to weighted failures.
 
     **Arguments:**
@@ -164,11 +161,9 @@ def optimal_shares(
 
 
 def fit_components(
-    z: Float[np.ndarray, "n d"],
-    weight: Float[np.ndarray, " n"],
-    rng: np.random.Generator,
+    z: Float[np.ndarray, "n d"], weight: Float[np.ndarray, " n"], rng: np.random.Generator,
     worth: float = 1.0,
-) -> list[Component]:
+) -> list[Component]:  # fmt: skip
     """Fit components of all kinds to points that are each worth `worth` independent ones."""
     d = z.shape[1]
     components: list[Component] = []

@@ -275,12 +275,9 @@ class LimitState:
         return self._counted(z, rho, failing, proper)
 
     def _counted(
-        self,
-        z: Float[np.ndarray, "n d"],
-        rho: Shaped[np.ndarray, " n"],
-        failing: Bool[np.ndarray, " n"],
-        proper: Bool[np.ndarray, " n"],
-    ) -> Scores:
+        self, z: Float[np.ndarray, "n d"], rho: Shaped[np.ndarray, " n"],
+        failing: Bool[np.ndarray, " n"], proper: Bool[np.ndarray, " n"],
+    ) -> Scores:  # fmt: skip
         """Count these simulations, and return their scores."""
         known = proper & np.isfinite(rho)
         score = np.where(known, np.maximum(rho, 0.0), np.inf).astype(np.float64)
@@ -370,11 +367,9 @@ def squared_distances(
 
 
 def farthest_first(
-    first: int,
-    gaps_from: Callable[[int], Float[np.ndarray, " n"]],
-    maximum: int,
+    first: int, gaps_from: Callable[[int], Float[np.ndarray, " n"]], maximum: int,
     min_gap: float = -1.0,
-) -> Int[np.ndarray, " chosen"]:
+) -> Int[np.ndarray, " chosen"]:  # fmt: skip
     """Choose points that are far from one another.
 
     **Arguments:**

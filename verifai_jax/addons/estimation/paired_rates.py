@@ -62,13 +62,9 @@ class PairedRates:
 
 
 def paired_rates(
-    only_first: int,
-    only_second: int,
-    pairs: int,
-    confidence: float = 0.95,
-    undecided: int = 0,
+    only_first: int, only_second: int, pairs: int, confidence: float = 0.95, undecided: int = 0,
     at_any_time: bool = True,
-) -> PairedRates:
+) -> PairedRates:  # fmt: skip
     """Compute the interval of a difference of failure rates on paired samples.
 
     **Arguments:**
@@ -97,13 +93,9 @@ def paired_rates(
 
 
 def _bound(
-    interval: Callable[[int, int, float], Rate],
-    first: int,
-    second: int,
-    pairs: int,
-    confidence: float,
-    side: int,
-) -> float:
+    interval: Callable[[int, int, float], Rate], first: int, second: int, pairs: int,
+    confidence: float, side: int,
+) -> float:  # fmt: skip
     """Return the least (-1) or greatest (1) difference that is not rejected."""
     each = 1 - (1 - confidence) / 2
     discordant = first + second

@@ -40,11 +40,9 @@ def connected(
 
 
 def halve(
-    limit_state: LimitState,
-    begin: Float[np.ndarray, "n d"],
-    end: Float[np.ndarray, "n d"],
+    limit_state: LimitState, begin: Float[np.ndarray, "n d"], end: Float[np.ndarray, "n d"],
     halvings: int,
-) -> tuple[Float[np.ndarray, "n d"], Float[np.ndarray, "n d"]]:
+) -> tuple[Float[np.ndarray, "n d"], Float[np.ndarray, "n d"]]:  # fmt: skip
     """Bisect straight lines to find how far they fail.
 
     **Arguments:**
@@ -62,10 +60,9 @@ def halve(
 
 
 def straight(
-    a: Float[np.ndarray, "n d"],
-    b: Float[np.ndarray, "n d"],
+    a: Float[np.ndarray, "n d"], b: Float[np.ndarray, "n d"],
     fraction: float | Float[np.ndarray, "n 1"],
-) -> Float[np.ndarray, "n d"]:
+) -> Float[np.ndarray, "n d"]:  # fmt: skip
     """Return points on straight lines."""
     return (1 - fraction) * a + fraction * b
 

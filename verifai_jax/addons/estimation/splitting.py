@@ -71,13 +71,9 @@ class SplittingRun:
 
 
 def run_splitting(
-    limit_state: LimitState,
-    rng: np.random.Generator,
-    per_level: int,
-    chains: int,
-    first: FirstLevel | None = None,
-    reserve: int = 0,
-) -> SplittingRun:
+    limit_state: LimitState, rng: np.random.Generator, per_level: int, chains: int,
+    first: FirstLevel | None = None, reserve: int = 0,
+) -> SplittingRun:  # fmt: skip
     """Run multilevel splitting once.
 
     **Arguments:**
@@ -153,14 +149,9 @@ def _level(score: Float[np.ndarray, " n"], share: float, above: float) -> float 
 
 
 def _walk(
-    limit_state: LimitState,
-    rng: np.random.Generator,
-    z: Float[np.ndarray, "chains d"],
-    score: Float[np.ndarray, " chains"],
-    level: float,
-    steps: int,
-    scale: float,
-) -> tuple[Float[np.ndarray, "states d"], Float[np.ndarray, " states"], float, float]:
+    limit_state: LimitState, rng: np.random.Generator, z: Float[np.ndarray, "chains d"],
+    score: Float[np.ndarray, " chains"], level: float, steps: int, scale: float,
+) -> tuple[Float[np.ndarray, "states d"], Float[np.ndarray, " states"], float, float]:  # fmt: skip
     """Walk chains of `steps` states that leave the prior below the level invariant.
 
     A move is `z' = sqrt(1 - s^2) z + s xi` in each coordinate, reversible for the standard normal,

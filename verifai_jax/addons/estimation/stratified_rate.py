@@ -163,13 +163,9 @@ class _Test:
     """Which rates the trials of two strata reject, at one end with half of the error each."""
 
     def __init__(
-        self,
-        observed: Sequence[tuple[int, int]],
-        share: float,
-        error: float,
-        allocated: bool,
+        self, observed: Sequence[tuple[int, int]], share: float, error: float, allocated: bool,
         at_any_time: bool,
-    ) -> None:
+    ) -> None:  # fmt: skip
         self.observed, self.share, self.error = tuple(observed), share, error
         self.at_any_time = at_any_time
         self.n = sum(trials for _, trials in observed)

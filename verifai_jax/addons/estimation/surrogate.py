@@ -135,11 +135,9 @@ def _known(limit_state: LimitState) -> tuple[Float[np.ndarray, "n d"], Float[np.
 
 
 def _learn(
-    limit_state: LimitState,
-    rng: np.random.Generator,
-    surrogate: Surrogate,
+    limit_state: LimitState, rng: np.random.Generator, surrogate: Surrogate,
     count: int | None = None,
-) -> None:
+) -> None:  # fmt: skip
     """Simulate where the surrogate is least sure of the sign, and where it knows least at all.
 
     Workers of an executor are given a round while the one before it is simulated: it is chosen by
@@ -285,13 +283,9 @@ def _proposal(limit_state: LimitState, rng: np.random.Generator, surrogate: Surr
 
 
 def _sample(
-    limit_state: LimitState,
-    rng: np.random.Generator,
-    proposal: Mixture,
-    plan: Plan,
-    control: Control,
-    again: bool = False,
-) -> tuple[ImportanceSamples, ControlledMean] | None:
+    limit_state: LimitState, rng: np.random.Generator, proposal: Mixture, plan: Plan,
+    control: Control, again: bool = False,
+) -> tuple[ImportanceSamples, ControlledMean] | None:  # fmt: skip
     """Simulate fresh samples until the interval is as short as wanted, or the budget is spent.
 
     Nearly no failures among the first ones end it, too: the rest is worth more elsewhere. None
@@ -332,14 +326,9 @@ def _sample(
 
 
 def _answer(
-    limit_state: LimitState,
-    rng: np.random.Generator,
-    plan: Plan,
-    counts: Counts,
-    samples: ImportanceSamples,
-    control: Control,
-    mean: ControlledMean,
-) -> Answer:
+    limit_state: LimitState, rng: np.random.Generator, plan: Plan, counts: Counts,
+    samples: ImportanceSamples, control: Control, mean: ControlledMean,
+) -> Answer:  # fmt: skip
     failing, drawn = samples.defensive_counts
     # The defensive part of the proposal is a sample of the prior.
     counts = counts + Counts(drawn, failing, int(np.sum(samples.without[samples.origin == 0] > 0)))

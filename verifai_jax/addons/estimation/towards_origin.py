@@ -89,12 +89,9 @@ def redraw_by_parts(
 
 
 def _replace_by_parts(
-    limit_state: LimitState,
-    rng: np.random.Generator,
-    z: Float[np.ndarray, "n d"],
-    values: Float[np.ndarray, "n d"],
-    among: Bool[np.ndarray, "n d"],
-) -> tuple[Float[np.ndarray, "n d"], Bool[np.ndarray, "n d"]]:
+    limit_state: LimitState, rng: np.random.Generator, z: Float[np.ndarray, "n d"],
+    values: Float[np.ndarray, "n d"], among: Bool[np.ndarray, "n d"],
+) -> tuple[Float[np.ndarray, "n d"], Bool[np.ndarray, "n d"]]:  # fmt: skip
     """Replace parts of the coordinates of failures by other values, as far as they still fail.
 
     Halves are tried first, then quarters, and so on down to single coordinates; where no quarter

@@ -25,13 +25,9 @@ GAIN = 1.5
 
 
 def walk_among_failures(
-    limit_state: LimitState,
-    rng: np.random.Generator,
-    z: Float[np.ndarray, "n d"],
-    deciding: Bool[np.ndarray, "n d"],
-    groups: Int[np.ndarray, " n"],
-    steps: int,
-) -> tuple[list[Float[np.ndarray, "n d"]], Float[np.ndarray, "n d"]]:
+    limit_state: LimitState, rng: np.random.Generator, z: Float[np.ndarray, "n d"],
+    deciding: Bool[np.ndarray, "n d"], groups: Int[np.ndarray, " n"], steps: int,
+) -> tuple[list[Float[np.ndarray, "n d"]], Float[np.ndarray, "n d"]]:  # fmt: skip
     """Walk from failures to other failures nearby.
 
     **Arguments:**

@@ -67,12 +67,9 @@ class Automaton(Domain):
     max_events: int
 
     def __init__(
-        self,
-        start: str,
-        events: Mapping[tuple[str, str], Mapping[str, Any]],
-        max_events: int = 6,
+        self, start: str, events: Mapping[tuple[str, str], Mapping[str, Any]], max_events: int = 6,
         min_events: int = 0,
-    ) -> None:
+    ) -> None:  # fmt: skip
         check_count("max_events", max_events)
         if (
             isinstance(min_events, bool)

@@ -42,12 +42,9 @@ class Reactive(Domain):
     scale: float
 
     def __init__(
-        self,
-        inputs: Inputs,
-        hidden: int = 0,
-        bounds: Sequence[float] = (-1.0, 1.0),
+        self, inputs: Inputs, hidden: int = 0, bounds: Sequence[float] = (-1.0, 1.0),
         scale: float = 3.0,
-    ) -> None:
+    ) -> None:  # fmt: skip
         entries = [inputs] if isinstance(inputs, str) else inputs
         if isinstance(entries, Mapping):
             entries = [(name, *_range(name, ends)) for name, ends in entries.items()]

@@ -109,12 +109,9 @@ class Events:
         return xp.any(self._past(time, (name,)) & (now < self.times + ends), axis=-1)
 
     def latest(
-        self,
-        parameter: str,
-        time: Real[Array | np.ndarray, "*times"] | float,
-        *names: str,
+        self, parameter: str, time: Real[Array | np.ndarray, "*times"] | float, *names: str,
         otherwise: Any = 0.0,
-    ) -> Any:
+    ) -> Any:  # fmt: skip
         """Return a parameter of the latest event with these names; `otherwise` before the first."""
         values, index = self[parameter], self.active(time, *names)
         xp = _library(self.waits)

@@ -230,12 +230,9 @@ def _min_depths(following: list[dict[int, int]]) -> list[int]:
 
 
 def _tables(
-    nodes: list[tuple[str, Past]],
-    transitions: tuple[Transition, ...],
-    following: list[dict[int, int]],
-    taken: set[int],
-    pairs: set[tuple[int, int]],
-) -> Graph:
+    nodes: list[tuple[str, Past]], transitions: tuple[Transition, ...],
+    following: list[dict[int, int]], taken: set[int], pairs: set[tuple[int, int]],
+) -> Graph:  # fmt: skip
     shape = (len(nodes), len(transitions))
     enabled, target = np.zeros(shape, bool), np.zeros(shape, np.int32)
     for node, leads in enumerate(following):

@@ -229,11 +229,9 @@ def where_there(there: Any, one: Any, other: Any) -> Any:
 
 
 def _own_entries(
-    groups: Mapping[Domain, tuple[int, ...]],
-    values: np.ndarray,
-    taken: Int[np.ndarray, " n"],
+    groups: Mapping[Domain, tuple[int, ...]], values: np.ndarray, taken: Int[np.ndarray, " n"],
     column: str,
-) -> dict[str, np.ndarray]:
+) -> dict[str, np.ndarray]:  # fmt: skip
     """Return columns of a parameter, empty in rows whose event does not have it."""
     parts = [(domain.to_columns(values, column), users) for domain, users in groups.items()]
     found = {}

@@ -35,13 +35,9 @@ from verifai_jax.cli.next_folder import given_or_next
 @arguments.PROGRESS
 @fail_on(counterexample="if a counterexample was found")
 def fuzz(
-    target: str,
-    cells: tuple[str, ...],
-    folder: Path | None,
-    pictures: bool,
-    fail_on: Gate | None,
+    target: str, cells: tuple[str, ...], folder: Path | None, pictures: bool, fail_on: Gate | None,
     **options: Any,
-) -> None:
+) -> None:  # fmt: skip
     """Look for failures of TARGET (specs/FILE.py:NAME) by covering its possible behaviour."""
     from verifai_jax import fuzz as run_fuzz
 

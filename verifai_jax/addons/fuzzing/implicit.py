@@ -199,13 +199,9 @@ def _unchecked(trace: Trace) -> Trace:
 
 
 def with_implicit(
-    problem: Problem | None,
-    space: FeatureSpace | Mapping[str, Domain] | None,
-    system: Callable[..., Trace] | None,
-    ranges: Ranges,
-    cells: Cells | None,
-    name: str,
-) -> Problem:
+    problem: Problem | None, space: FeatureSpace | Mapping[str, Domain] | None,
+    system: Callable[..., Trace] | None, ranges: Ranges, cells: Cells | None, name: str,
+) -> Problem:  # fmt: skip
     """Return a problem with the implicit properties added to its own formulas.
 
     **Raises:** `ValueError` unless either a problem or a space with a system is given, and for

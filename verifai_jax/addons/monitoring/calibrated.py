@@ -212,13 +212,9 @@ class DomainMonitor(_Follows[Distance]):
 
 
 def domain_monitor(
-    traces: Sequence[Trace],
-    *,
-    signals: Sequence[str] | None = None,
-    alpha: float = 0.05,
-    lags: Sequence[int] = (0,),
-    seed: int = 0,
-) -> DomainMonitor:
+    traces: Sequence[Trace], *, signals: Sequence[str] | None = None, alpha: float = 0.05,
+    lags: Sequence[int] = (0,), seed: int = 0,
+) -> DomainMonitor:  # fmt: skip
     """Learn which samples were tested, to recognise later ones that are unlike them.
 
     **Arguments:**

@@ -65,11 +65,9 @@ def matrix_column(array: np.ndarray) -> Any:
 
 
 def table_of_arrays(
-    arrays: Mapping[str, np.ndarray],
-    clock: str | None,
-    notes: dict[str, int],
+    arrays: Mapping[str, np.ndarray], clock: str | None, notes: dict[str, int],
     units: Mapping[str, str] | None = None,
-) -> Table:
+) -> Table:  # fmt: skip
     """Return arrays as a table, without those that are no signals, of which there is a note.
 
     **Arguments:**

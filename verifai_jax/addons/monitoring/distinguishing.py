@@ -123,14 +123,9 @@ def distinction(
 
 
 def free_difference(
-    one: Formula,
-    other: Formula,
-    like: Sequence[Trace] = (),
-    end: End = "hold",
-    dt: float | None = None,
-    duration: float | None = None,
-    seed: int = 0,
-) -> Trace | None:
+    one: Formula, other: Formula, like: Sequence[Trace] = (), end: End = "hold",
+    dt: float | None = None, duration: float | None = None, seed: int = 0,
+) -> Trace | None:  # fmt: skip
     """Return a trace of free signals that distinguishes two formulas; None if none was found.
 
     **Arguments:**

@@ -80,14 +80,9 @@ class Examples(Drawn, InNotebook):
 
 
 def examples(
-    formula: Formula | str,
-    like: Recordings | None = None,
-    *,
-    dt: float | None = None,
-    duration: float | None = None,
-    end: End = "hold",
-    seed: int = 0,
-) -> Examples:
+    formula: Formula | str, like: Recordings | None = None, *, dt: float | None = None,
+    duration: float | None = None, end: End = "hold", seed: int = 0,
+) -> Examples:  # fmt: skip
     """Find a trace that satisfies a formula, one that barely satisfies it, and one that breaks it.
 
     **Arguments:**
@@ -160,14 +155,9 @@ def _moved(formula: Formula, free: FreeTraces, signals: Signals, sign: int) -> S
 
 @jit_each(4)
 def _ascended(
-    formula: Formula,
-    dt: float,
-    end: End,
-    scales: tuple[tuple[str, float], ...],
-    start: dict[str, Array],
-    held: dict[str, Array],
-    sign: float | Array,
-) -> dict[str, Array]:
+    formula: Formula, dt: float, end: End, scales: tuple[tuple[str, float], ...],
+    start: dict[str, Array], held: dict[str, Array], sign: float | Array,
+) -> dict[str, Array]:  # fmt: skip
     optimizer = optax.adam(RATE)
 
     def loss(moving: dict[str, Array]) -> Float[Array, ""]:

@@ -152,14 +152,9 @@ REFUSED = (
 
 
 def export_fmu(
-    formulas: Formula | str | Mapping[str, Formula | str],
-    dt: float,
-    file: str | Path,
-    *,
-    semantics: Semantics = hard,
-    every: bool = False,
-    sizes: Mapping[str, int] | None = None,
-) -> Path:
+    formulas: Formula | str | Mapping[str, Formula | str], dt: float, file: str | Path, *,
+    semantics: Semantics = hard, every: bool = False, sizes: Mapping[str, int] | None = None,
+) -> Path:  # fmt: skip
     """Write a monitor as an FMU of FMI 2 for co-simulation, with its source in C.
 
     Its inputs are the signals of the formulas. Its outputs are, for each formula, the result of a

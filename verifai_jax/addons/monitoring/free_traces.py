@@ -63,13 +63,9 @@ class FreeTraces:
 
     @classmethod
     def of(
-        cls,
-        formulas: Sequence[Formula],
-        like: Sequence[Trace] = (),
-        dt: float | None = None,
-        duration: float | None = None,
-        end: End = "hold",
-    ) -> "FreeTraces":
+        cls, formulas: Sequence[Formula], like: Sequence[Trace] = (), dt: float | None = None,
+        duration: float | None = None, end: End = "hold",
+    ) -> "FreeTraces":  # fmt: skip
         """Return free traces with the levels and instants that formulas distinguish.
 
         **Arguments:**
@@ -115,12 +111,9 @@ class FreeTraces:
         return HostValues(signals, self.dt, self.end, lanes=1, blend=BLEND)
 
     def search(
-        self,
-        score: Callable[[HostValues], Values],
-        rng: np.random.Generator,
-        enough: float = math.inf,
-        generations: int = GENERATIONS,
-    ) -> tuple[Signals, float]:
+        self, score: Callable[[HostValues], Values], rng: np.random.Generator,
+        enough: float = math.inf, generations: int = GENERATIONS,
+    ) -> tuple[Signals, float]:  # fmt: skip
         """Find the trace with the highest score by repeatedly changing parts of the best ones.
 
         **Arguments:**

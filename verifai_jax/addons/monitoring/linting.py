@@ -44,12 +44,9 @@ Check = Iterator["Finding"]
 
 
 def lint(
-    formulas: Requirements,
-    signals: Recordings | None = None,
-    *,
-    units: Mapping[str, str] | None = None,
-    end: End = "hold",
-) -> Findings:
+    formulas: Requirements, signals: Recordings | None = None, *,
+    units: Mapping[str, str] | None = None, end: End = "hold",
+) -> Findings:  # fmt: skip
     """Find parts of formulas that may not say what their author meant.
 
     **Arguments:**

@@ -43,13 +43,9 @@ def simulated(problem: Problem, count: int = SIMULATED, seed: int = 0) -> tuple[
 
 @shows_progress("mining parameters")
 def mine_by_search(
-    template: Parametric,
-    problem: Problem,
-    budget: int = 2000,
-    seed: int = 0,
-    confidence: float = 0.95,
-    progress: bool | None = None,
-) -> Mined:
+    template: Parametric, problem: Problem, budget: int = 2000, seed: int = 0,
+    confidence: float = 0.95, progress: bool | None = None,
+) -> Mined:  # fmt: skip
     """Find the tightest parameters that no search breaks; each counterexample loosens them.
 
     **Arguments:**

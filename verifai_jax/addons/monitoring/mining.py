@@ -140,12 +140,9 @@ def mine(
 
 
 def mine_template(
-    template: Parametric,
-    traces: Sequence[Trace],
-    share: float = 1.0,
-    end: End = "hold",
+    template: Parametric, traces: Sequence[Trace], share: float = 1.0, end: End = "hold",
     confidence: float = 0.95,
-) -> Mined:
+) -> Mined:  # fmt: skip
     """Find the tightest parameters of a parsed formula; see `mine`."""
     if len(template.names) == 2 and template.together(*template.names):
         raise ValueError(

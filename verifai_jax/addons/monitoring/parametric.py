@@ -164,10 +164,9 @@ class Parametric:
 
 
 def read_parametric(
-    text: str,
-    constants: Mapping[str, float] | None = None,
+    text: str, constants: Mapping[str, float] | None = None,
     definitions: Mapping[str, Formula | str] | None = None,
-) -> Parametric:
+) -> Parametric:  # fmt: skip
     """Read a formula in which `?name` is a parameter for numbers or ends of intervals.
 
     **Arguments:**

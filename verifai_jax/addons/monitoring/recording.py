@@ -157,11 +157,9 @@ Columns = dict[str, Any]
 
 
 def _tables(
-    source: "str | Path | Episode | pd.DataFrame | Sequence[str | Path]",
-    time: str,
-    episode: int | None,
-    notes: dict[str, int],
-) -> tuple[str, list[tuple[Columns, dict[str, str]]]]:
+    source: "str | Path | Episode | pd.DataFrame | Sequence[str | Path]", time: str,
+    episode: int | None, notes: dict[str, int],
+) -> tuple[str, list[tuple[Columns, dict[str, str]]]]:  # fmt: skip
     """Return how a recording is called, and the columns of each of its clocks with their units."""
     if isinstance(source, Episode):
         source, episode = source.path, source.number

@@ -47,11 +47,9 @@ def requirements_of(formulas: Requirements) -> tuple[Requirement, ...]:
 
 
 def read_requirements(
-    path: str | Path,
-    constants: Mapping[str, float] | None = None,
-    definitions: Mapping[str, str] | None = None,
-    need_formulas: bool = True,
-) -> tuple[Requirement, ...]:
+    path: str | Path, constants: Mapping[str, float] | None = None,
+    definitions: Mapping[str, str] | None = None, need_formulas: bool = True,
+) -> tuple[Requirement, ...]:  # fmt: skip
     """Read requirements from a TOML, YAML, CSV or ReqIF file, or an archive `.reqifz` of these.
 
     A TOML file has a table `[[requirement]]` for each, and may have tables `[constants]` and

@@ -103,12 +103,9 @@ class NativeEngine:
         self._xla.compile()
 
     def evaluate(
-        self,
-        rows: Float[np.ndarray, "n d"],
-        key: Key[Array, ""],
-        first: int = 0,
+        self, rows: Float[np.ndarray, "n d"], key: Key[Array, ""], first: int = 0,
         temperature: Float[np.ndarray, " n"] | float = 1.0,
-    ) -> Verdicts:
+    ) -> Verdicts:  # fmt: skip
         """Simulate rows; see `Engine.evaluate`."""
         if not self._is_worth:
             return self.engine.evaluate(rows, key, first, temperature)

@@ -67,11 +67,9 @@ def in_fog(conditions: Conditions, channel: int, seen: Array, through: Array | N
 
 
 def taken(
-    image: Float[Array, "3 height width"],
-    conditions: Conditions,
-    key: Key[Array, ""] | None,
+    image: Float[Array, "3 height width"], conditions: Conditions, key: Key[Array, ""] | None,
     lens: Key[Array, ""] | None,
-) -> Float[Array, "3 height width"]:
+) -> Float[Array, "3 height width"]:  # fmt: skip
     """Return the image that a sensor with a lens records of `image`, in [0, 1].
 
     **Arguments:**

@@ -85,12 +85,9 @@ def mujoco_scene(
 
 
 def _solids(
-    kind: int,
-    position: Float[Array, "3"],
-    axes: Float[Array, "3 3"],
-    size: np.ndarray,
+    kind: int, position: Float[Array, "3"], axes: Float[Array, "3 3"], size: np.ndarray,
     colour: tuple[float, ...],
-) -> list[Solid]:
+) -> list[Solid]:  # fmt: skip
     """Return one geom as solids; ours stand on their position, MuJoCo's are about theirs."""
     if kind == SPHERE:
         return [Sphere(position, size[0], colour)]

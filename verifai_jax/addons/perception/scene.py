@@ -60,12 +60,9 @@ class Scene:
     sun: Sun = Sun()
 
     def render(
-        self,
-        camera: Camera,
-        conditions: Conditions | None = None,
-        key: Key[Array, ""] | None = None,
-        lens: Key[Array, ""] | None = None,
-    ) -> Float[Array, "height width 3"]:
+        self, camera: Camera, conditions: Conditions | None = None,
+        key: Key[Array, ""] | None = None, lens: Key[Array, ""] | None = None,
+    ) -> Float[Array, "height width 3"]:  # fmt: skip
         """Return the image taken by a camera.
 
         **Arguments:**

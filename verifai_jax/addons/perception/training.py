@@ -195,12 +195,9 @@ class Score(InNotebook):
 
 
 def score(
-    network: Detector,
-    images: Float[Array, "n height width 3"] | np.ndarray,
-    labels: Labels,
-    *,
+    network: Detector, images: Float[Array, "n height width 3"] | np.ndarray, labels: Labels, *,
     tolerance: float = 0.2,
-) -> Score:
+) -> Score:  # fmt: skip
     """Compare a detector's output with the truth.
 
     **Arguments:**

@@ -56,12 +56,9 @@ class Compiled:
 
 
 def compile_program(
-    program: str | Path,
-    mode2D: bool,
-    params: Mapping[str, Any],
-    model: str | None = None,
+    program: str | Path, mode2D: bool, params: Mapping[str, Any], model: str | None = None,
     scenario: str | None = None,
-) -> Compiled:
+) -> Compiled:  # fmt: skip
     """Compile a Scenic program.
 
     **Arguments:**

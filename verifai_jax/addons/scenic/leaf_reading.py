@@ -77,13 +77,9 @@ def _truncated(node: Any, name: str) -> leaves.Leaf:
 
 
 def _discrete(
-    node: Any,
-    name: str,
-    low: float,
-    high: float,
-    weights: Sequence[float] | None,
+    node: Any, name: str, low: float, high: float, weights: Sequence[float] | None,
     options: Sequence[Any] | None,
-) -> leaves.Leaf | None:
+) -> leaves.Leaf | None:  # fmt: skip
     first, last = math.ceil(low), math.floor(high)
     if last - first >= MAX_LEVELS:
         return leaves.ChoiceIndex(node, name, {f"{name}.share": Box(0, 1)})

@@ -107,12 +107,9 @@ def _is_own(node: Any) -> bool:
 
 
 def _visit(
-    root: Any,
-    label: str,
-    found: dict[int, str],
-    owners: Mapping[int, str],
+    root: Any, label: str, found: dict[int, str], owners: Mapping[int, str],
     variables: Mapping[int, str],
-) -> None:
+) -> None:  # fmt: skip
     """Name everything unnamed below a property, except what belongs to other objects."""
     stack = [(root, label, "")]
     seen: set[int] = set()

@@ -120,15 +120,9 @@ class ScenicProgram:
         return blackbox(OnScenes(self._recipe, function, seeded), seeded=True, **options)
 
     def simulator(
-        self,
-        steps: int,
-        records: tuple[str, ...] | list[str] = (),
-        *,
-        dt: float | None = None,
-        workers: int | None = None,
-        timeout: float | None = None,
-        **options: Any,
-    ) -> HostSystem:
+        self, steps: int, records: tuple[str, ...] | list[str] = (), *, dt: float | None = None,
+        workers: int | None = None, timeout: float | None = None, **options: Any,
+    ) -> HostSystem:  # fmt: skip
         """Return the program's simulator as a system, with behaviors, monitors and records.
 
         It is the simulator that the program names, or else Scenic's Newtonian one. Random numbers

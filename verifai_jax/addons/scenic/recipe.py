@@ -28,13 +28,9 @@ class Recipe:
 
     @classmethod
     def of(
-        cls,
-        program: str | Path,
-        planar: bool,
-        params: Mapping[str, Any],
-        model: str | None,
+        cls, program: str | Path, planar: bool, params: Mapping[str, Any], model: str | None,
         scenario: str | None,
-    ) -> "Recipe":
+    ) -> "Recipe":  # fmt: skip
         """Return a recipe that works in any process and working directory."""
         text = str(program)
         if "\n" not in text and Path(text).is_file():

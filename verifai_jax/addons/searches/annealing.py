@@ -223,10 +223,9 @@ def partners_of(chains: int) -> Int[np.ndarray, "matchings chains"]:
 
 
 def exchange(
-    energy: Float[Array, " chains"],
-    coldness: Float[Array, " chains"],
+    energy: Float[Array, " chains"], coldness: Float[Array, " chains"],
     chance: Float[Array, "matchings chains"],
-) -> Int[Array, " chains"]:
+) -> Int[Array, " chains"]:  # fmt: skip
     """Return for each chain the chain whose point it takes; hot ones get the remaining points."""
     index = jnp.arange(len(energy), dtype=jnp.int32)
 

@@ -146,14 +146,9 @@ class Bandit(Search[BanditState]):
         return groups
 
     def _density(
-        self,
-        state: BanditState,
-        reward: Float[Array, " window"],
-        indices: np.ndarray,
-        edges: Float[np.ndarray, "d edges"],
-        branching: tuple[int, ...],
-        batch: int,
-    ) -> Float[Array, "d edges-1"]:
+        self, state: BanditState, reward: Float[Array, " window"], indices: np.ndarray,
+        edges: Float[np.ndarray, "d edges"], branching: tuple[int, ...], batch: int,
+    ) -> Float[Array, "d edges-1"]:  # fmt: skip
         """Return the share of the next batch that each leaf gets."""
         d, leaves = len(indices), edges.shape[1] - 1
         find = jax.vmap(lambda edge, x: jnp.searchsorted(edge, x, side="right"), (0, 1), 1)
@@ -211,10 +206,9 @@ def fill_cells(
 
 
 def draw_cells(
-    density: Float[Array, "d leaves"],
-    edges: Float[np.ndarray, "d leaves+1"],
+    density: Float[Array, "d leaves"], edges: Float[np.ndarray, "d leaves+1"],
     even: Float[Array, "n d"],
-) -> Float[Array, "n d"]:
+) -> Float[Array, "n d"]:  # fmt: skip
     """Return quantiles of a density that is constant in each leaf."""
     limits = jnp.cumsum(density, axis=1)
     limits = limits / limits[:, -1:]

@@ -159,13 +159,9 @@ class Bayes(Search[BayesState]):
         )
 
     def _propose(
-        self,
-        key: Key[Array, ""],
-        state: BayesState,
-        cube: Cube,
-        batch: int,
+        self, key: Key[Array, ""], state: BayesState, cube: Cube, batch: int,
         anywhere: Float[Array, "half d"],
-    ) -> Float[Array, "batch d"]:
+    ) -> Float[Array, "batch d"]:  # fmt: skip
         """Return the points that the acquisition function ranks first."""
         memory = state.memory
         posterior, risk = memory.posterior(cube), _risk(memory, cube)
@@ -223,12 +219,9 @@ def _risk(memory: ProcessMemory, cube: Cube) -> Callable[[Float[Array, "m d"]], 
 
 
 def _refined(
-    memory: ProcessMemory,
-    risk: Callable[[Float[Array, "m d"]], Float[Array, " m"]],
-    cube: Cube,
-    anywhere: Float[Array, "half d"],
-    batch: int,
-) -> Float[Array, "batch d"]:
+    memory: ProcessMemory, risk: Callable[[Float[Array, "m d"]], Float[Array, " m"]], cube: Cube,
+    anywhere: Float[Array, "half d"], batch: int,
+) -> Float[Array, "batch d"]:  # fmt: skip
     """Return points of the greatest expected improvement by a process of those near the best.
 
     Over the box around them, which shrinks with them, and by the values in it: so it tells

@@ -179,11 +179,9 @@ class Coverage(Search[CoverageState]):
 
 
 def _edited(
-    cube: Cube,
-    parent: Float[Array, "n d"],
-    coins: Float[Array, "n coins"],
+    cube: Cube, parent: Float[Array, "n d"], coins: Float[Array, "n coins"],
     fresh: Float[Array, "n d"],
-) -> Float[Array, "n d"]:
+) -> Float[Array, "n d"]:  # fmt: skip
     """Put an item into an array, take one out, or change one or all from it on."""
     chosen = jnp.floor(coins[:, 0] * len(cube.sequences))
     result = parent

@@ -48,11 +48,9 @@ class Evolution(NamedTuple):
         return self.mean + self.size * normal @ jnp.linalg.cholesky(self.covariance).T
 
     def learn(
-        self,
-        points: Float[Array, "m n"],
-        weights: Float[Array, " m"],
+        self, points: Float[Array, "m n"], weights: Float[Array, " m"],
         worse: Float[Array, " m"] | float = 0.0,
-    ) -> "Evolution":
+    ) -> "Evolution":  # fmt: skip
         """Update from the points of a generation; comments give the names of the CMA-ES tutorial.
 
         **Arguments:**

@@ -233,12 +233,9 @@ class GaussianProcess:
 
 
 def adam(
-    loss: Callable[[Fitted], Array],
-    start: Fitted,
-    steps: int,
-    rate: float,
+    loss: Callable[[Fitted], Array], start: Fitted, steps: int, rate: float,
     bounded: Callable[[Fitted], Fitted],
-) -> Fitted:
+) -> Fitted:  # fmt: skip
     """Minimise a loss with Adam (Kingma, Ba, A method for stochastic optimization, ICLR 2015).
 
     Steps that are not finite are skipped; `bounded` maps the result of a step into its range.

@@ -25,14 +25,9 @@ CLIMBS, CLIMB = 24, 0.05  # steps to a maximum, and their first length. Chosen b
 
 
 def improving(
-    posterior: Posterior,
-    risk: Callable[[Float[Array, "m d"]], Float[Array, " m"]],
-    cube: Cube,
-    box: tuple[Array | float, Array | float],
-    doubt: float,
-    shared: Float[Array, "m d"],
-    batch: int,
-) -> Float[Array, "batch d"]:
+    posterior: Posterior, risk: Callable[[Float[Array, "m d"]], Float[Array, " m"]], cube: Cube,
+    box: tuple[Array | float, Array | float], doubt: float, shared: Float[Array, "m d"], batch: int,
+) -> Float[Array, "batch d"]:  # fmt: skip
     """Return points with the largest expected improvement, each away from the earlier ones.
 
     - `box`: its lowest corner and side lengths; process and candidates use its coordinates.

@@ -39,12 +39,9 @@ class TraceForm:
 
     @classmethod
     def of(
-        cls,
-        signals: tuple[tuple[str, int], ...],
-        dt: float,
-        length: int,
+        cls, signals: tuple[tuple[str, int], ...], dt: float, length: int,
         formulas: Iterable[Formula],
-    ) -> "TraceForm":
+    ) -> "TraceForm":  # fmt: skip
         """Return the form with the largest stride that the formulas allow.
 
         A model's trace has no more detail than its modelled samples. Monitoring it at every sample

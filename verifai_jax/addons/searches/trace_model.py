@@ -143,11 +143,9 @@ class Waves(NamedTuple):
 
 
 def fit(
-    hyper: TraceHyper,
-    x: Float[Array, "n x"],
-    mask: Bool[Array, " n"],
+    hyper: TraceHyper, x: Float[Array, "n x"], mask: Bool[Array, " n"],
     coefficients: Float[Array, "n c"],
-) -> TraceHyper:
+) -> TraceHyper:  # fmt: skip
     """Find the most probable hyper-parameters with Adam, starting from `hyper`.
 
     The variance of each component is the most probable one given the other parameters, in closed
@@ -184,12 +182,9 @@ def condition(
 
 
 def draw(
-    model: TraceModel,
-    key: Key[Array, ""],
-    count: int,
-    guess: Bool[Array, ""] | bool = True,
+    model: TraceModel, key: Key[Array, ""], count: int, guess: Bool[Array, ""] | bool = True,
     spread: Float[Array, ""] | float = 1.0,
-) -> tuple[Waves, Float[Array, "count terms c"]]:
+) -> tuple[Waves, Float[Array, "count terms c"]]:  # fmt: skip
     """Draw simulators from the posterior.
 
     **Arguments:**
@@ -291,11 +286,9 @@ def _squared_distances_jvp(
 
 @jax.custom_vjp
 def _surprise(
-    covariance: Float[Array, "n n"],
-    coefficients: Float[Array, "n c"],
-    worth: Float[Array, " c"],
+    covariance: Float[Array, "n n"], coefficients: Float[Array, "n c"], worth: Float[Array, " c"],
     count: Float[Array, ""],
-) -> Float[Array, ""]:
+) -> Float[Array, ""]:  # fmt: skip
     """Return the weighted sum of the components' negative log evidence, each at its best variance.
 
     Only its derivative by the covariance is there; algorithm 2.1 and section 5.4.1 of Rasmussen and

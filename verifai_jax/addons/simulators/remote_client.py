@@ -74,13 +74,9 @@ class Waveform:
     """
 
     def __init__(
-        self,
-        knots: Sequence[float] | np.ndarray,
-        hold: str,
-        duration: float | None,
-        times: Sequence[float] | None = None,
-        width: float | None = None,
-    ) -> None:
+        self, knots: Sequence[float] | np.ndarray, hold: str, duration: float | None,
+        times: Sequence[float] | None = None, width: float | None = None,
+    ) -> None:  # fmt: skip
         self.knots, self.hold, self.duration = np.asarray(knots, np.float64), hold, duration
         self.times, self.width = times, width
 
@@ -240,14 +236,9 @@ class _Connection:
     """One connection, from the greeting to its end."""
 
     def __init__(
-        self,
-        host: str,
-        port: int,
-        token: str | None,
-        capacity: int,
-        name: str | None,
+        self, host: str, port: int, token: str | None, capacity: int, name: str | None,
         tls: ssl.SSLContext | None = None,
-    ) -> None:
+    ) -> None:  # fmt: skip
         self.socket = socket.create_connection((host, port), timeout=10.0)
         self.welcome = False  # Whether the server has handed out a point.
         self.capacity = capacity

@@ -183,15 +183,9 @@ class _Repair:
     """State of a repair, from which a result can be made at any time."""
 
     def __init__(
-        self,
-        loop: Parametric,
-        start: Float[np.ndarray, " p"],
-        search: Search,
-        limits: Budget,
-        margin: float,
-        seed: int,
-        region: Region,
-    ) -> None:
+        self, loop: Parametric, start: Float[np.ndarray, " p"], search: Search, limits: Budget,
+        margin: float, seed: int, region: Region,
+    ) -> None:  # fmt: skip
         assert loop.environment is not None
         self.region = region
         self.loop, self.start, self.search, self.limits = loop, start, search, limits

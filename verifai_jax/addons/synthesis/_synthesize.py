@@ -169,13 +169,9 @@ def synthesize(
 
 
 def _check(
-    loop: Parametric,
-    theta: Float[np.ndarray, " p"],
-    count: int,
-    margin: float,
-    seed: int,
+    loop: Parametric, theta: Float[np.ndarray, " p"], count: int, margin: float, seed: int,
     limits: Budget,
-) -> HeldOut | None:
+) -> HeldOut | None:  # fmt: skip
     try:
         return held_out(loop, theta, count, margin, (seed, 1), limits)
     except KeyboardInterrupt:
@@ -186,15 +182,9 @@ class _Synthesis:
     """State of a synthesis, from which a result can be made at any time."""
 
     def __init__(
-        self,
-        loop: FeatureParameters,
-        search: Search,
-        limits: Budget,
-        margin: float,
-        environments: int,
-        seed: int,
-        region: Region | None,
-    ) -> None:
+        self, loop: FeatureParameters, search: Search, limits: Budget, margin: float,
+        environments: int, seed: int, region: Region | None,
+    ) -> None:  # fmt: skip
         self.region = region
         self.loop, self.search, self.limits, self.seed = loop, search, limits, seed
         self.margin = margin

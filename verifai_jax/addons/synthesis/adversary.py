@@ -62,18 +62,9 @@ class Attack(NamedTuple):
 
 
 def attack(
-    loop: Parametric,
-    theta: Float[np.ndarray, " p"],
-    level: float,
-    limits: Budget,
-    *,
-    search: Search,
-    batch: int,
-    seed: int,
-    region: Region,
-    enough: int = 64,
-    scale: float = 1.0,
-) -> Attack:
+    loop: Parametric, theta: Float[np.ndarray, " p"], level: float, limits: Budget, *,
+    search: Search, batch: int, seed: int, region: Region, enough: int = 64, scale: float = 1.0,
+) -> Attack:  # fmt: skip
     """Search for environments whose robustness is below `level`.
 
     **Arguments:**
@@ -123,14 +114,9 @@ def attack(
 
 
 def _descend(
-    loop: Parametric,
-    theta: Float[np.ndarray, " p"],
-    level: float,
-    limits: Budget,
-    first: Attack,
-    scale: float,
-    region: Region,
-) -> Attack:
+    loop: Parametric, theta: Float[np.ndarray, " p"], level: float, limits: Budget, first: Attack,
+    scale: float, region: Region,
+) -> Attack:  # fmt: skip
     assert loop.environment is not None
     free = np.array(loop.environment.levels) == 0
     order = np.argsort(np.where(np.isnan(first.rho), np.inf, first.rho), kind="stable")
@@ -162,12 +148,9 @@ def _descend(
 
 
 def _gradients(
-    loop: Parametric,
-    theta: Float[np.ndarray, " p"],
-    points: np.ndarray,
-    warmth: float,
+    loop: Parametric, theta: Float[np.ndarray, " p"], points: np.ndarray, warmth: float,
     free: np.ndarray,
-) -> tuple[Float[np.ndarray, "n d"], tuple[np.ndarray, Pairs]]:
+) -> tuple[Float[np.ndarray, "n d"], tuple[np.ndarray, Pairs]]:  # fmt: skip
     """Return gradients by the environment, or differences, and what was simulated for them."""
     if loop.differentiable:
         pairs = loop.evaluate(theta[None], points, warmth)

@@ -45,13 +45,9 @@ class FailureCounts:
     """
 
     def __init__(
-        self,
-        loop: FeatureParameters,
-        margin: float,
-        limits: Budget,
-        seed: int,
+        self, loop: FeatureParameters, margin: float, limits: Budget, seed: int,
         start: Float[np.ndarray, " p"] | None = None,
-    ) -> None:
+    ) -> None:  # fmt: skip
         if loop.environment is None:
             raise ValueError(
                 "aim='probability' needs features that vary: all are parameters here, so leave it "
@@ -100,11 +96,9 @@ class FailureCounts:
         return points
 
     def _evaluate(
-        self,
-        thetas: Float[np.ndarray, "k p"],
-        samples: Float[np.ndarray, "n d"],
+        self, thetas: Float[np.ndarray, "k p"], samples: Float[np.ndarray, "n d"],
         last: bool = False,
-    ) -> Float[np.ndarray, " k"]:
+    ) -> Float[np.ndarray, " k"]:  # fmt: skip
         """Return what is to be least: the share that fails, and where that ties, how nearly."""
         pairs = self.loop.evaluate(thetas, samples)
         happens = ~np.isposinf(pairs.rho)

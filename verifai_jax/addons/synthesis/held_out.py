@@ -72,13 +72,9 @@ class HeldOut:
 
 
 def held_out(
-    loop: Parametric,
-    theta: Float[np.ndarray, " p"],
-    count: int,
-    margin: float,
-    seed: tuple[int, int],
-    limits: Budget | None = None,
-) -> HeldOut:
+    loop: Parametric, theta: Float[np.ndarray, " p"], count: int, margin: float,
+    seed: tuple[int, int], limits: Budget | None = None,
+) -> HeldOut:  # fmt: skip
     """Simulate environments drawn from the prior.
 
     **Arguments:**

@@ -105,15 +105,9 @@ def evaluate(
 
 
 def explore(
-    loop: Parametric,
-    environments: Environments,
-    archive: Archive,
-    limits: Budget,
-    *,
-    merit: Merit,
-    batch: int,
-    rng: np.random.Generator,
-) -> None:
+    loop: Parametric, environments: Environments, archive: Archive, limits: Budget, *, merit: Merit,
+    batch: int, rng: np.random.Generator,
+) -> None:  # fmt: skip
     """Evaluate parameters over their whole space, then around the best ones."""
     size, half = max(1, len(environments)), limits.slice(limits.left // 2)
     refused = 0
@@ -138,18 +132,9 @@ def explore(
 
 
 def climb(
-    loop: Parametric,
-    thetas: Thetas,
-    environments: Environments,
-    archive: Archive,
-    limits: Budget,
-    *,
-    propose: Propose,
-    merit: Merit,
-    scale: float,
-    radius: float,
-    steps: int = 40,
-) -> list[Choice]:
+    loop: Parametric, thetas: Thetas, environments: Environments, archive: Archive, limits: Budget,
+    *, propose: Propose, merit: Merit, scale: float, radius: float, steps: int = 40,
+) -> list[Choice]:  # fmt: skip
     """Follow the gradients of the least robust environments from all starts in parallel.
 
     **Arguments:**
@@ -232,17 +217,9 @@ def _gradients(
 
 
 def cross_entropy(
-    loop: Parametric,
-    thetas: Thetas,
-    environments: Environments,
-    archive: Archive,
-    limits: Budget,
-    *,
-    merit: Merit,
-    batch: int,
-    rng: np.random.Generator,
-    rounds: int = 8,
-) -> None:
+    loop: Parametric, thetas: Thetas, environments: Environments, archive: Archive, limits: Budget,
+    *, merit: Merit, batch: int, rng: np.random.Generator, rounds: int = 8,
+) -> None:  # fmt: skip
     """Search around good parameters without gradients by sampling, elites and narrowing.
 
     De Boer, Kroese, Mannor, Rubinstein, A tutorial on the cross-entropy method (2005), algorithm
@@ -290,13 +267,9 @@ def cross_entropy(
 
 
 def _screen(
-    loop: Parametric,
-    thetas: np.ndarray,
-    environments: np.ndarray,
-    archive: Archive,
-    merit: Merit,
+    loop: Parametric, thetas: np.ndarray, environments: np.ndarray, archive: Archive, merit: Merit,
     level: tuple[float, ...],
-) -> tuple[np.ndarray, np.ndarray]:
+) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
     """Return parameters whose merit may exceed `level` after the first environments, and values."""
     if len(environments) < 2 * FIRST:
         return thetas, evaluate(loop, thetas, environments, archive)

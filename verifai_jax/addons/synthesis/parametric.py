@@ -75,15 +75,9 @@ class FeatureParameters:
     bounded = True
 
     def __init__(
-        self,
-        problem: Problem,
-        names: Sequence[str] | None = None,
-        *,
-        batch: int = 256,
-        gradient: bool = True,
-        precision: str = "float32",
-        seed: int = 0,
-    ) -> None:
+        self, problem: Problem, names: Sequence[str] | None = None, *, batch: int = 256,
+        gradient: bool = True, precision: str = "float32", seed: int = 0,
+    ) -> None:  # fmt: skip
         domains = problem.space.domains
         varied = [name for name, domain in domains.items() if domain.size]
         if isinstance(names, str):
@@ -204,15 +198,9 @@ class ArrayParameters:
     space = None
 
     def __init__(
-        self,
-        problem: Problem,
-        parameters: Any,
-        system_of: Callable[[Any], Any],
-        *,
-        batch: int = 256,
-        precision: str = "float32",
-        seed: int = 0,
-    ) -> None:
+        self, problem: Problem, parameters: Any, system_of: Callable[[Any], Any], *,
+        batch: int = 256, precision: str = "float32", seed: int = 0,
+    ) -> None:  # fmt: skip
         from jax.flatten_util import ravel_pytree
 
         for path, leaf in jax.tree_util.tree_leaves_with_path(parameters):

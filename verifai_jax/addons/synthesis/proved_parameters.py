@@ -53,15 +53,9 @@ class ProvedParameters:
 
 
 def prove_around(
-    problem: Problem,
-    point: Corner,
-    chosen: Bool[np.ndarray, " dim"],
-    low: Corner,
-    high: Corner,
-    seconds: float,
-    precision: str = "float32",
-    seed: int = 0,
-) -> ProvedParameters | None:
+    problem: Problem, point: Corner, chosen: Bool[np.ndarray, " dim"], low: Corner, high: Corner,
+    seconds: float, precision: str = "float32", seed: int = 0,
+) -> ProvedParameters | None:  # fmt: skip
     """Prove a box of parameters around a point; None if no box was proved in time.
 
     **Arguments:**

@@ -57,9 +57,8 @@ class PairedDifference:
 
 def paired_difference(
     values: Sequence[float] | Float[np.ndarray, " n"],
-    reference: Sequence[float] | Float[np.ndarray, " n"],
-    confidence: float = 0.95,
-) -> PairedDifference:
+    reference: Sequence[float] | Float[np.ndarray, " n"], confidence: float = 0.95,
+) -> PairedDifference:  # fmt: skip
     """Compute the mean of `values - reference` and its Student's t interval.
 
     **Arguments:**

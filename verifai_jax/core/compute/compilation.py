@@ -151,13 +151,9 @@ class Compilation:
     """
 
     def __init__(
-        self,
-        name: str,
-        lowered: jax.stages.Lowered,
-        effort: XlaOptimization = "most",
-        splits: bool = True,
-        wide: bool = False,
-    ) -> None:
+        self, name: str, lowered: jax.stages.Lowered, effort: XlaOptimization = "most",
+        splits: bool = True, wide: bool = False,
+    ) -> None:  # fmt: skip
         self.name = name
         self._how: tuple[XlaOptimization, bool, bool] = effort, splits, wide
         self._lowered: jax.stages.Lowered | None = lowered

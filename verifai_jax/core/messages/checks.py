@@ -51,13 +51,9 @@ def check_name(
 
 
 def check_fraction(
-    name: str,
-    value: object,
-    *,
-    zero: bool = False,
-    one: bool = False,
+    name: str, value: object, *, zero: bool = False, one: bool = False,
     error: type[ValueError] = ValueError,
-) -> float:
+) -> float:  # fmt: skip
     """Check a probability or another share.
 
     **Arguments:**

@@ -63,11 +63,9 @@ class Cache:
             log.warning("%s is damaged: its unreadable parts are computed again", self.path)
 
     def claim(
-        self,
-        fingerprint: Mapping[str, Any],
-        sources: Sources | None = None,
+        self, fingerprint: Mapping[str, Any], sources: Sources | None = None,
         even_if_changed: bool = False,
-    ) -> tuple[Mapping[str, Any], ...]:
+    ) -> tuple[Mapping[str, Any], ...]:  # fmt: skip
         """Record which work this cache belongs to, or refuse the cache of other work.
 
         **Arguments:**

@@ -72,12 +72,9 @@ def read_member(
 
 
 def read_arrays(
-    source: bytes | Path,
-    what: str,
-    max_bytes: int = MAX_BYTES,
-    within: Path | None = None,
+    source: bytes | Path, what: str, max_bytes: int = MAX_BYTES, within: Path | None = None,
     left_out: dict[str, str] | None = None,
-) -> dict[str, np.ndarray]:
+) -> dict[str, np.ndarray]:  # fmt: skip
     """Return the arrays of an `.npz` archive by name; nothing in it is unpickled.
 
     **Raises:** as `open_archive`, and `ForeignFileError` for a member that is not an array, unless

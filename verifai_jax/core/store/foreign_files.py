@@ -217,12 +217,9 @@ def _yaml_parts(node: Any) -> list[Any]:
 
 
 def check_shared(
-    root: Any,
-    parts: Callable[[Any], Iterable[Any]],
-    max_count: int,
-    what: str,
+    root: Any, parts: Callable[[Any], Iterable[Any]], max_count: int, what: str,
     cycles: bool = False,
-) -> None:
+) -> None:  # fmt: skip
     """Refuse a value that has too many values when each that it shares is written out.
 
     **Arguments:**

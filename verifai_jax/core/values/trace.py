@@ -166,12 +166,9 @@ class Trace(InNotebook):
 
     @classmethod
     def from_dataframe(
-        cls,
-        frame: "pd.DataFrame",
-        time: str = "time",
-        dt: float | None = None,
+        cls, frame: "pd.DataFrame", time: str = "time", dt: float | None = None,
         time_unit: str | None = None,
-    ) -> "Trace":
+    ) -> "Trace":  # fmt: skip
         """Make a trace from a `pandas.DataFrame` with a column for each signal.
 
         Columns `p[0]`, `p[1]`, ... make one vector signal `p`; columns without numbers are left

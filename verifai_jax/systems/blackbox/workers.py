@@ -72,13 +72,9 @@ class Pool:
     """The word for a call in messages."""
 
     def __init__(
-        self,
-        simulation: Callable[[Any, int], Trace],
-        function: Callable[..., object],
-        workers: int,
-        timeout: float | None,
-        retries: int,
-    ) -> None:
+        self, simulation: Callable[[Any, int], Trace], function: Callable[..., object],
+        workers: int, timeout: float | None, retries: int,
+    ) -> None:  # fmt: skip
         check_count("workers", workers)
         if timeout is not None and not (isinstance(timeout, int | float) and timeout > 0):
             raise ValueError(f"timeout must be a positive number of seconds; got {timeout!r}")

@@ -148,12 +148,9 @@ class Ode(System):
         return replace(self, links=joined(self.links, links))
 
     def fold(
-        self,
-        features: Features,
-        key: Seed,
-        carry: Carry,
+        self, features: Features, key: Seed, carry: Carry,
         update: Callable[[Carry, dict[str, Array]], Carry],
-    ) -> tuple[Any, Int[Array, ""]]:
+    ) -> tuple[Any, Int[Array, ""]]:  # fmt: skip
         features = set_durations(features, self.duration)
         rollout = _Rollout(self, features, key)
         return rollout.fold(as_floating(self.initial(features, key), "initial"), carry, update)
@@ -228,12 +225,9 @@ class _Rollout:
         return carry, _status(last, self.channels.valid())
 
     def run(
-        self,
-        state: PyTree,
-        memory: PyTree,
-        collected: PyTree,
+        self, state: PyTree, memory: PyTree, collected: PyTree,
         collect: Callable[[PyTree, dict[str, Array]], tuple[PyTree, PyTree]],
-    ) -> tuple[Any, Any, Any, Any]:
+    ) -> tuple[Any, Any, Any, Any]:  # fmt: skip
         """Return the last state, the number of steps, the last `collected` and the outputs."""
         loop, start = self.loop, state
 
@@ -269,15 +263,9 @@ class _Rollout:
         return state, age, collected, outputs
 
     def decide(
-        self,
-        k: Int[Array, ""],
-        age: Int[Array, ""],
-        time: Time,
-        frozen: Bool[Array, ""],
-        state: PyTree,
-        memory: PyTree,
-        held: PyTree,
-    ) -> Any:
+        self, k: Int[Array, ""], age: Int[Array, ""], time: Time, frozen: Bool[Array, ""],
+        state: PyTree, memory: PyTree, held: PyTree,
+    ) -> Any:  # fmt: skip
         """Return the control from sample `k` on, and the controller's memory then."""
         if held is None:
             return self.control(time, frozen, state, memory)

@@ -79,14 +79,9 @@ def latch(on: Any, condition: Any) -> Any:
 
 
 def switched_step(
-    advance: Integrator,
-    dynamics: Callable[[Time, PyTree, Inputs], PyTree],
-    time: Time,
-    state: PyTree,
-    dt: Step,
-    switches: Sequence[Switch],
-    inputs: Inputs,
-) -> Any:
+    advance: Integrator, dynamics: Callable[[Time, PyTree, Inputs], PyTree], time: Time,
+    state: PyTree, dt: Step, switches: Sequence[Switch], inputs: Inputs,
+) -> Any:  # fmt: skip
     """Take one step, locating its first switch and applying the others at its end.
 
     A step in which no lane of a batch switches costs as much as one without switches. JAX traces

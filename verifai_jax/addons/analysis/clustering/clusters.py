@@ -278,12 +278,9 @@ def _partition(
 
 
 def _dense(
-    samples: Samples,
-    count: int | None,
-    radius: float | None,
-    scale: Scale,
+    samples: Samples, count: int | None, radius: float | None, scale: Scale,
     rng: np.random.Generator,
-) -> Clusters:
+) -> Clusters:  # fmt: skip
     if count is not None:
         raise ValueError(f"dbscan finds the number of clusters itself; got count={count!r}")
     if radius is not None:

@@ -14,11 +14,9 @@ ROUNDS = 100
 
 
 def prototypes(
-    coordinates: Float[np.ndarray, "n p"],
-    codes: Int[np.ndarray, "n m"],
-    count: int,
+    coordinates: Float[np.ndarray, "n p"], codes: Int[np.ndarray, "n m"], count: int,
     rng: np.random.Generator,
-) -> Int[np.ndarray, " n"]:
+) -> Int[np.ndarray, " n"]:  # fmt: skip
     """Return the cluster of each row, from 0; the best of 8 starts.
 
     The cost is a sum over rows: the squared distance of the coordinates from the cluster's mean,

@@ -61,12 +61,9 @@ class Samples:
 
     @classmethod
     def of(
-        cls,
-        source: "Source",
-        which: Which = "counterexamples",
-        columns: Sequence[str] | None = None,
-        space: Problem | FeatureSpace | None = None,
-    ) -> "Samples":
+        cls, source: "Source", which: Which = "counterexamples",
+        columns: Sequence[str] | None = None, space: Problem | FeatureSpace | None = None,
+    ) -> "Samples":  # fmt: skip
         """Select samples of a run, of its table, or of any DataFrame with feature columns.
 
         **Arguments:**

@@ -114,12 +114,9 @@ def plot_sensitivity(sensitivity: Sensitivity, path: str | Path | None = None) -
 
 
 def plot_bars(
-    table: pd.DataFrame,
-    columns: Mapping[str, str],
-    title: str,
-    label: str,
+    table: pd.DataFrame, columns: Mapping[str, str], title: str, label: str,
     path: str | Path | None = None,
-) -> Figure:
+) -> Figure:  # fmt: skip
     """Draw one horizontal bar for each row and column of a table.
 
     **Arguments:**

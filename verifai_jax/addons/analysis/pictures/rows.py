@@ -45,13 +45,9 @@ def positions(samples: Samples, name: str, frame: pd.DataFrame) -> Float[np.ndar
 
 
 def draw_rows(
-    axes: Axes,
-    samples: Samples,
-    rows: Int[np.ndarray, " k"],
-    color: str,
-    label: str,
+    axes: Axes, samples: Samples, rows: Int[np.ndarray, " k"], color: str, label: str,
     names: Sequence[str] | None = None,
-) -> Float[np.ndarray, "drawn 2"]:
+) -> Float[np.ndarray, "drawn 2"]:  # fmt: skip
     """Draw all samples faintly and `rows` (numbers) as rings; return the positions of these."""
     across, up = names or two_columns(samples)
     everything = samples.frame.iloc[:: max(1, len(samples) // DOTS)]

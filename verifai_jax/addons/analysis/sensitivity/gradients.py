@@ -10,14 +10,9 @@ from verifai_jax.problem.problem import Problem
 
 @shows_progress("finding gradients of")
 def gradient_sensitivity(
-    problem: Problem,
-    samples: int = 1024,
-    *,
-    seed: int = 0,
-    batch: int = 1024,
-    temperature: float | None = None,
-    progress: bool | None = None,
-) -> sensitivity.Sensitivity:
+    problem: Problem, samples: int = 1024, *, seed: int = 0, batch: int = 1024,
+    temperature: float | None = None, progress: bool | None = None,
+) -> sensitivity.Sensitivity:  # fmt: skip
     """Measure the mean squared gradient of the robustness by each feature, and the bound it gives.
 
     `bound` is an upper bound on the total Sobol index: a feature whose bound is near 0 can be

@@ -23,15 +23,9 @@ from verifai_jax.problem.problem import Problem
 
 @shows_progress("finding elementary effects in")
 def morris(
-    problem: Problem,
-    trajectories: int = 32,
-    levels: int = 4,
-    *,
-    seed: int = 0,
-    batch: int = 1024,
-    of: str | None = None,
-    progress: bool | None = None,
-) -> Sensitivity:
+    problem: Problem, trajectories: int = 32, levels: int = 4, *, seed: int = 0, batch: int = 1024,
+    of: str | None = None, progress: bool | None = None,
+) -> Sensitivity:  # fmt: skip
     """Measure elementary effects: how the robustness changes when one feature makes a large step.
 
     `mu_star` is the mean size of the effect over the whole range. `sigma` is its standard

@@ -13,14 +13,9 @@ NOISE = "(simulation noise)"
 
 @shows_progress("finding Sobol indices of")
 def sobol_indices(
-    problem: Problem,
-    samples: int = 4096,
-    *,
-    seed: int = 0,
-    batch: int = 1024,
-    of: str | None = None,
-    progress: bool | None = None,
-) -> sensitivity.Sensitivity:
+    problem: Problem, samples: int = 4096, *, seed: int = 0, batch: int = 1024,
+    of: str | None = None, progress: bool | None = None,
+) -> sensitivity.Sensitivity:  # fmt: skip
     """Compute each feature's share of the robustness's variance, alone and with interactions.
 
     `first` is the share of the variance that vanishes when the feature is known; `total` is the
@@ -91,11 +86,9 @@ def sobol_indices(
 
 
 def _sobol_estimates(
-    f_a: Float[np.ndarray, " n"],
-    f_b: Float[np.ndarray, " n"],
-    f_ab: Float[np.ndarray, "n d"],
+    f_a: Float[np.ndarray, " n"], f_b: Float[np.ndarray, " n"], f_ab: Float[np.ndarray, "n d"],
     proper: Bool[np.ndarray, " n"],
-) -> tuple[Float[np.ndarray, " d"], Float[np.ndarray, " d"]]:
+) -> tuple[Float[np.ndarray, " d"], Float[np.ndarray, " d"]]:  # fmt: skip
     pairs = proper[:, None] & np.isfinite(f_ab)
     count = np.maximum(pairs.sum(axis=0), 1)
     both = np.concatenate([f_a[proper], f_b[proper]])

@@ -56,11 +56,9 @@ class Leader(NamedTuple):
 
 
 def find_leader(
-    failures: Int[np.ndarray, " n"],
-    simulations: Int[np.ndarray, " n"],
-    tie: float,
+    failures: Int[np.ndarray, " n"], simulations: Int[np.ndarray, " n"], tie: float,
     margins: Float[np.ndarray, " n"] | None = None,
-) -> Leader:
+) -> Leader:  # fmt: skip
     """Find the policy that is most likely the safest.
 
     Ties of the mean go to the policy with more samples, then to the one with the larger entry of
@@ -110,11 +108,9 @@ class Allocation:
         return (1 + self.confidence) / 2
 
     def next(
-        self,
-        failures: Int[np.ndarray, " n"],
-        simulations: Int[np.ndarray, " n"],
+        self, failures: Int[np.ndarray, " n"], simulations: Int[np.ndarray, " n"],
         margins: Float[np.ndarray, " n"] | None = None,
-    ) -> Int[np.ndarray, " n"]:
+    ) -> Int[np.ndarray, " n"]:  # fmt: skip
         """Return the number of blocks to simulate for each policy; all zero if all is decided.
 
         - `margins`: numbers that decide between equal leaders; see `find_leader`.
@@ -226,15 +222,9 @@ class RaceResult(NamedTuple):
 
 
 def race(
-    draw: Callable[[int, int], int],
-    arms: int,
-    *,
-    confidence: float = 0.95,
-    tie: float = 0.001,
-    first: int = 16,
-    block: int = 16,
-    budget: int = 1_000_000,
-) -> RaceResult:
+    draw: Callable[[int, int], int], arms: int, *, confidence: float = 0.95, tie: float = 0.001,
+    first: int = 16, block: int = 16, budget: int = 1_000_000,
+) -> RaceResult:  # fmt: skip
     """Find the arm that fails least often.
 
     - `draw(arm, n)`: a function that returns the number of failures in the next `n` samples of an

@@ -81,12 +81,9 @@ def check_attack(problem: Problem, search: str | Search) -> Search:
 
 
 def attack_policies(
-    blocks: Blocks,
-    records: list[PolicyRecord],
-    search: Search,
-    rounds: int,
+    blocks: Blocks, records: list[PolicyRecord], search: Search, rounds: int,
     report: Callable[[int], None],
-) -> None:
+) -> None:  # fmt: skip
     """Attack every policy in rounds of one block each, and add the simulations to `records`.
 
     **Arguments:**

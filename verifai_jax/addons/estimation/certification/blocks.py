@@ -184,13 +184,9 @@ class Blocks:
         yield from self._verdicts(blocks, self._attacked_key)
 
     def again(
-        self,
-        policy: int,
-        points: Float[np.ndarray, "n d"],
-        numbers: Int[np.ndarray, " n"],
-        of_attack: bool,
-        attempt: int,
-    ) -> tuple[Float[np.ndarray, " n"], Bool[np.ndarray, " n"]]:
+        self, policy: int, points: Float[np.ndarray, "n d"], numbers: Int[np.ndarray, " n"],
+        of_attack: bool, attempt: int,
+    ) -> tuple[Float[np.ndarray, " n"], Bool[np.ndarray, " n"]]:  # fmt: skip
         """Simulate rows of a policy once more on the host.
 
         **Arguments:**

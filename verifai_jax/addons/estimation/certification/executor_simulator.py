@@ -51,14 +51,9 @@ class ExecutorSimulator:
     """
 
     def __init__(
-        self,
-        shipment: executors.Shipment[Callable[[Any], Problem]],
-        policies: Sequence[Any],
-        structure: str | None,
-        lanes: int,
-        dim: int,
-        executor: executors.Executor,
-    ) -> None:
+        self, shipment: executors.Shipment[Callable[[Any], Problem]], policies: Sequence[Any],
+        structure: str | None, lanes: int, dim: int, executor: executors.Executor,
+    ) -> None:  # fmt: skip
         self.lanes, self.messages = lanes, dict[int, str]()
         self._shipment, self._policies, self._structure = shipment, policies, structure
         self._dim, self._executor = dim, executor
@@ -71,12 +66,9 @@ class ExecutorSimulator:
         return 3 * executors.count_workers(self._executor) * self._each
 
     def __call__(
-        self,
-        members: Sequence[int],
-        points: Float[np.ndarray, "blocks lanes d"],
-        first: Int[np.ndarray, " blocks"],
-        key: Key[Array, ""],
-    ) -> list[Verdicts]:
+        self, members: Sequence[int], points: Float[np.ndarray, "blocks lanes d"],
+        first: Int[np.ndarray, " blocks"], key: Key[Array, ""],
+    ) -> list[Verdicts]:  # fmt: skip
         """Return the verdicts of the blocks, in order; arguments as of `simulators.Simulator`."""
         words = np.asarray(jax.random.key_data(key))
         share = -(-len(members) // executors.count_workers(self._executor))
@@ -148,11 +140,9 @@ def simulate_blocks(
 
 
 def _separate(
-    shipment: executors.Shipment[Callable[[Any], Problem]],
-    policies: Sequence[tuple[int, Any]],
-    lanes: int,
-    name: str,
-) -> SeparateSimulators:
+    shipment: executors.Shipment[Callable[[Any], Problem]], policies: Sequence[tuple[int, Any]],
+    lanes: int, name: str,
+) -> SeparateSimulators:  # fmt: skip
     """Return the simulators of policies by themselves, whose problems this worker keeps."""
     if name not in shipment.made:
         problems: dict[int, Problem] = {}

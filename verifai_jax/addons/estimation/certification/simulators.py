@@ -39,12 +39,9 @@ class Simulator(Protocol):
     lanes: int
 
     def __call__(
-        self,
-        members: Sequence[int],
-        points: Float[np.ndarray, "blocks lanes d"],
-        first: Int[np.ndarray, " blocks"],
-        key: Key[Array, ""],
-    ) -> list[Verdicts]:
+        self, members: Sequence[int], points: Float[np.ndarray, "blocks lanes d"],
+        first: Int[np.ndarray, " blocks"], key: Key[Array, ""],
+    ) -> list[Verdicts]:  # fmt: skip
         """Return the verdicts of the blocks, in order.
 
         **Arguments:**
@@ -82,12 +79,9 @@ class SharedSimulator:
         return self._program.blocks_per_call()
 
     def __call__(
-        self,
-        members: Sequence[int],
-        points: Float[np.ndarray, "blocks lanes d"],
-        first: Int[np.ndarray, " blocks"],
-        key: Key[Array, ""],
-    ) -> list[Verdicts]:
+        self, members: Sequence[int], points: Float[np.ndarray, "blocks lanes d"],
+        first: Int[np.ndarray, " blocks"], key: Key[Array, ""],
+    ) -> list[Verdicts]:  # fmt: skip
         verdicts: list[Verdicts] = []
         maximum = self._program.capacity * len(self._program.devices)
         for start in range(0, len(members), maximum):
@@ -96,12 +90,9 @@ class SharedSimulator:
         return verdicts
 
     def _call(
-        self,
-        members: Sequence[int],
-        points: Float[np.ndarray, "blocks lanes d"],
-        first: Int[np.ndarray, " blocks"],
-        key: Key[Array, ""],
-    ) -> list[Verdicts]:
+        self, members: Sequence[int], points: Float[np.ndarray, "blocks lanes d"],
+        first: Int[np.ndarray, " blocks"], key: Key[Array, ""],
+    ) -> list[Verdicts]:  # fmt: skip
         policies = [self._group.weights[member] for member in members]
         rho, status = self._program("evaluate", policies, points, first, key)
         flat = rho.reshape(-1, rho.shape[2])
@@ -118,12 +109,9 @@ class SharedSimulator:
 
 
 def shared_simulator(
-    problem_of: Callable[[Any], Problem],
-    group: PolicyGroup,
-    lanes: int,
-    dim: int,
+    problem_of: Callable[[Any], Problem], group: PolicyGroup, lanes: int, dim: int,
     devices: Sequence[Device] | None = None,
-) -> SharedSimulator:
+) -> SharedSimulator:  # fmt: skip
     """Return the simulator of a group; its programs live as long as `problem_of`."""
     where = tuple(jax.local_devices() if devices is None else devices)
     try:
@@ -135,12 +123,9 @@ def shared_simulator(
 
 @lru_cache(maxsize=16)
 def _known_program(
-    problem_of: Callable[[Any], Problem],
-    structure: str,
-    lanes: int,
-    dim: int,
+    problem_of: Callable[[Any], Problem], structure: str, lanes: int, dim: int,
     devices: tuple[Device, ...],
-) -> "_Program":
+) -> "_Program":  # fmt: skip
     return _Program(problem_of, lanes, dim, devices)
 
 
@@ -148,12 +133,9 @@ class _Program:
     """The compiled programs of one structure: blocks in, robustness and status out."""
 
     def __init__(
-        self,
-        problem_of: Callable[[Any], Problem],
-        lanes: int,
-        dim: int,
+        self, problem_of: Callable[[Any], Problem], lanes: int, dim: int,
         devices: tuple[Device, ...],
-    ) -> None:
+    ) -> None:  # fmt: skip
         self.problem_of, self.lanes, self.dim, self.devices = problem_of, lanes, dim, devices
         self.capacity = MAX_BLOCKS
         self._seconds: float | None = None  # Of a block, on one device.
@@ -169,13 +151,9 @@ class _Program:
         return each * len(self.devices)
 
     def __call__(
-        self,
-        mode: Mode,
-        policies: Sequence[PyTree],
-        points: Float[np.ndarray, "blocks lanes d"],
-        first: Int[np.ndarray, " blocks"],
-        key: Key[Array, ""],
-    ) -> list[np.ndarray]:
+        self, mode: Mode, policies: Sequence[PyTree], points: Float[np.ndarray, "blocks lanes d"],
+        first: Int[np.ndarray, " blocks"], key: Key[Array, ""],
+    ) -> list[np.ndarray]:  # fmt: skip
         """Return results `[blocks, lanes, ...]` of as many blocks as there are policies."""
         count, devices = len(policies), len(self.devices)
         share = -(-count // devices)
@@ -269,12 +247,9 @@ class SeparateSimulators:
         return 1
 
     def __call__(
-        self,
-        members: Sequence[int],
-        points: Float[np.ndarray, "blocks lanes d"],
-        first: Int[np.ndarray, " blocks"],
-        key: Key[Array, ""],
-    ) -> list[Verdicts]:
+        self, members: Sequence[int], points: Float[np.ndarray, "blocks lanes d"],
+        first: Int[np.ndarray, " blocks"], key: Key[Array, ""],
+    ) -> list[Verdicts]:  # fmt: skip
         verdicts = []
         for member, u, number in zip(members, points, first, strict=True):
             if member not in self._evaluators:

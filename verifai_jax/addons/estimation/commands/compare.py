@@ -36,14 +36,9 @@ from verifai_jax.cli.json_output import as_plain, command, give_result, say
 @arguments.ERRORS
 @fail_on(regression="if a candidate fails more often, by more than the margin")
 def compare(
-    target: str,
-    candidates: tuple[str, ...],
-    cluster: str | None,
-    report: Path | None,
-    errors: int | None,
-    fail_on: Gate | None,
-    **options: Any,
-) -> None:
+    target: str, candidates: tuple[str, ...], cluster: str | None, report: Path | None,
+    errors: int | None, fail_on: Gate | None, **options: Any,
+) -> None:  # fmt: skip
     """Compare failure rates of CANDIDATES (specs/FILE.py:NAME) with that of TARGET, in pairs.
 
     specs/FILE.py:NAME@REVISION is the problem at a revision of git; the checkout is not touched.

@@ -50,16 +50,9 @@ if TYPE_CHECKING:
     counterexample="if any simulation failed",
 )
 def estimate(
-    target: str,
-    only: str | None,
-    p0: float | None,
-    cluster: str | None,
-    plot: Path | None,
-    report: Path | None,
-    errors: int | None,
-    fail_on: Gate | None,
-    **options: Any,
-) -> None:
+    target: str, only: str | None, p0: float | None, cluster: str | None, plot: Path | None,
+    report: Path | None, errors: int | None, fail_on: Gate | None, **options: Any,
+) -> None:  # fmt: skip
     """Estimate the probability that TARGET (FILE.py:NAME) fails, with an interval and a bound."""
     from verifai_jax import estimate as run
 

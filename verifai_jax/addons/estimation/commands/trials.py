@@ -31,14 +31,9 @@ from verifai_jax.cli.json_output import as_plain, command, give_result, say
 @arguments.PRECISION
 @arguments.CLUSTER
 def trials(
-    target: str,
-    trials: Path | None,
-    count: int | None,
-    sheet: Path | None,
-    seed: int,
-    cluster: str | None,
-    **options: Any,
-) -> None:
+    target: str, trials: Path | None, count: int | None, sheet: Path | None, seed: int,
+    cluster: str | None, **options: Any,
+) -> None:  # fmt: skip
     """Estimate how often TARGET (FILE.py:NAME) fails in reality, by TRIALS and simulations.
 
     TRIALS is a CSV or Parquet file with a column for each feature, and `failed` (yes or no) or

@@ -199,13 +199,9 @@ class _Pairs:
     """Pairs of simulations, and their results so far."""
 
     def __init__(
-        self,
-        problems: tuple[Problem, Problem],
-        batch: int,
-        precision: str,
-        seed: int,
+        self, problems: tuple[Problem, Problem], batch: int, precision: str, seed: int,
         tolerance: float,
-    ) -> None:
+    ) -> None:  # fmt: skip
         self.tolerance, self.space = tolerance, problems[0].space
         chosen = [resolved(p, batch=batch, budget=batch, precision=precision) for p in problems]
         self._evaluators = [

@@ -179,15 +179,9 @@ class _Work:
     """The simulations of a budget, each variant on the same points under the same random keys."""
 
     def __init__(
-        self,
-        sides: list[Problem],
-        pairs: int,
-        seed: int,
-        precision: str,
-        each: float,
-        number: _Number,
-        result: Number,
-    ) -> None:
+        self, sides: list[Problem], pairs: int, seed: int, precision: str, each: float,
+        number: _Number, result: Number,
+    ) -> None:  # fmt: skip
         self.sides, self.pairs, self.seed, self.precision = sides, pairs, seed, precision
         self.each, self.number, self.result, self.simulations = each, number, result, 0
         self.points = _prior_points(sides[0], pairs, seed)

@@ -260,13 +260,9 @@ def _under_keys(simulated: DoublePrecisionEvaluator, limit_state: LimitState) ->
 
 
 def _divide(
-    limit_state: LimitState,
-    held: Held,
-    rng: np.random.Generator,
-    answer: Answer,
-    more: Float[np.ndarray, "n d"] | None,
-    black_box: bool,
-) -> Divided | None:
+    limit_state: LimitState, held: Held, rng: np.random.Generator, answer: Answer,
+    more: Float[np.ndarray, "n d"] | None, black_box: bool,
+) -> Divided | None:  # fmt: skip
     """Divide the weighted failures into regions; return None without any, or when time ends."""
     if answer.samples is None or not answer.samples.x.any():
         return None

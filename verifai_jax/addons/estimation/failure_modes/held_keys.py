@@ -87,12 +87,9 @@ class Divided:
 
 
 def divide_under_keys(
-    limit_state: LimitState,
-    held: Held,
-    rng: np.random.Generator,
-    samples: ImportanceSamples,
+    limit_state: LimitState, held: Held, rng: np.random.Generator, samples: ImportanceSamples,
     starts: Float[np.ndarray, "m d"],
-) -> Divided | None:
+) -> Divided | None:  # fmt: skip
     """Find the failing regions of a system that draws random numbers, within the remaining budget.
 
     **Arguments:**
@@ -182,13 +179,9 @@ def _choose_keys(
 
 
 def _same_regions(
-    under: LimitState,
-    held: Held,
-    regions: Regions,
-    numbers: Int[np.ndarray, " m"],
-    found: Regions,
+    under: LimitState, held: Held, regions: Regions, numbers: Int[np.ndarray, " m"], found: Regions,
     key: int,
-) -> Int[np.ndarray, " k"]:
+) -> Int[np.ndarray, " k"]:  # fmt: skip
     """Return for each region under a key the earlier one that it is, -1 where it is a new one."""
     same = np.full(found.count, -1)
     if not regions.count:

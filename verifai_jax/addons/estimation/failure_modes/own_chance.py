@@ -111,12 +111,9 @@ def _count(
 
 
 def _join(
-    limit_state: LimitState,
-    ends: Float[np.ndarray, "k d"],
-    failing: Int[np.ndarray, " k"],
-    times: int,
-    region: Int[np.ndarray, " k"],
-) -> None:
+    limit_state: LimitState, ends: Float[np.ndarray, "k d"], failing: Int[np.ndarray, " k"],
+    times: int, region: Int[np.ndarray, " k"],
+) -> None:  # fmt: skip
     """Give one number to groups that a path joins, the least distant ones first."""
     placed: list[int] = []
     for i in np.argsort(np.sum(ends**2, axis=1)).tolist():
@@ -133,13 +130,9 @@ def _join(
 
 
 def _connected(
-    limit_state: LimitState,
-    ends: Float[np.ndarray, "k d"],
-    failing: Int[np.ndarray, " k"],
-    times: int,
-    i: int,
-    j: int,
-) -> bool:
+    limit_state: LimitState, ends: Float[np.ndarray, "k d"], failing: Int[np.ndarray, " k"],
+    times: int, i: int, j: int,
+) -> bool:  # fmt: skip
     """Return whether one of two paths fails all along about as often as its ends."""
     lower = int(min(failing[i], failing[j]))
     ways = ([path(ends[[i]], ends[[j]], at) for at in FRACTIONS] for path in (straight, arc))

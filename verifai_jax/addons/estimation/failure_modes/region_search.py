@@ -40,12 +40,9 @@ SHRINKING = 60
 
 
 def find_regions(
-    limit_state: LimitState,
-    rng: np.random.Generator,
-    z: Float[np.ndarray, "n d"],
-    share: Float[np.ndarray, " n"],
-    nearest: Float[np.ndarray, "m d"],
-) -> Regions:
+    limit_state: LimitState, rng: np.random.Generator, z: Float[np.ndarray, "n d"],
+    share: Float[np.ndarray, " n"], nearest: Float[np.ndarray, "m d"],
+) -> Regions:  # fmt: skip
     """Find the failing regions that contain weighted failures.
 
     **Arguments:**
@@ -64,13 +61,9 @@ def find_regions(
 
 
 def _find(
-    limit_state: LimitState,
-    rng: np.random.Generator,
-    regions: Regions,
-    z: Float[np.ndarray, "n d"],
-    share: Float[np.ndarray, " n"],
-    nearest: Float[np.ndarray, "m d"],
-) -> None:
+    limit_state: LimitState, rng: np.random.Generator, regions: Regions,
+    z: Float[np.ndarray, "n d"], share: Float[np.ndarray, " n"], nearest: Float[np.ndarray, "m d"],
+) -> None:  # fmt: skip
     """Add the regions that are found."""
     maximum = _scaled(limit_state, CANDIDATES)
     near = z[np.argsort(np.sum(z * z, axis=1))[: max(1, maximum // 4)]]
@@ -88,12 +81,9 @@ def _find(
 
 
 def share_explained(
-    limit_state: LimitState,
-    rng: np.random.Generator,
-    regions: Regions,
-    z: Float[np.ndarray, "n d"],
-    share: Float[np.ndarray, " n"],
-) -> tuple[int, int]:
+    limit_state: LimitState, rng: np.random.Generator, regions: Regions,
+    z: Float[np.ndarray, "n d"], share: Float[np.ndarray, " n"],
+) -> tuple[int, int]:  # fmt: skip
     """Draw failures; return the number that paths join to a region, and the total."""
     count = min(LOOKED_AT, max(2, limit_state.left // A_LOOK))
     _, joined = _look(limit_state, rng, regions, z, share, count)
@@ -122,13 +112,9 @@ def _spread(points: Float[np.ndarray, "m d"], maximum: int) -> Float[np.ndarray,
 
 
 def _look(
-    limit_state: LimitState,
-    rng: np.random.Generator,
-    regions: Regions,
-    z: Float[np.ndarray, "n d"],
-    share: Float[np.ndarray, " n"],
-    count: int,
-) -> tuple[Int[np.ndarray, " k"], Bool[np.ndarray, " k"]]:
+    limit_state: LimitState, rng: np.random.Generator, regions: Regions,
+    z: Float[np.ndarray, "n d"], share: Float[np.ndarray, " n"], count: int,
+) -> tuple[Int[np.ndarray, " k"], Bool[np.ndarray, " k"]]:  # fmt: skip
     """Draw failures by their share; return their rows, and which a path joins to a region.
 
     These are points of their regions from then on, so that others are assigned by more of them.
@@ -150,11 +136,9 @@ def _look(
 
 
 def _extend(
-    limit_state: LimitState,
-    rng: np.random.Generator,
-    regions: Regions,
+    limit_state: LimitState, rng: np.random.Generator, regions: Regions,
     candidates: Float[np.ndarray, "n d"],
-) -> None:
+) -> None:  # fmt: skip
     """Move candidates towards the origin, and add them to their regions, or as regions."""
     if limit_state.gradient is not None:
         candidates = approach_origin(limit_state, candidates, 15)

@@ -101,11 +101,9 @@ class Mode(InNotebook):
         return explain(self.run, self._row(), nominal=nominal)
 
     def shrink(
-        self,
-        nominal: Mapping[str, Any] | None = None,
-        by: Literal["count", "distance"] = "count",
+        self, nominal: Mapping[str, Any] | None = None, by: Literal["count", "distance"] = "count",
         budget: int = 2000,
-    ) -> Shrunk:
+    ) -> Shrunk:  # fmt: skip
         """Find the smallest departure from nominal that still fails in this mode.
 
         It stays on the same side of nominal as the likeliest failure.

@@ -76,13 +76,9 @@ class Calibration(InNotebook):
 
 @suggests_options
 def calibrate(
-    problem: Problem,
-    trials: TrialTable,
-    features: Sequence[str],
-    *,
-    simulations: int = 20_000,
+    problem: Problem, trials: TrialTable, features: Sequence[str], *, simulations: int = 20_000,
     seed: int = 0,
-) -> Calibration:
+) -> Calibration:  # fmt: skip
     """Find values of features that make the simulation agree with trials.
 
     **Arguments:**

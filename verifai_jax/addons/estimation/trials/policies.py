@@ -78,14 +78,9 @@ class TrialComparison(InNotebook):
 
 
 def compare_trials(
-    trials: reading.TrialTable,
-    baseline: str,
-    candidate: str,
-    *,
-    key: str | Path | None = None,
-    margin: float = 0.0,
-    confidence: float = 0.95,
-) -> TrialComparison:
+    trials: reading.TrialTable, baseline: str, candidate: str, *, key: str | Path | None = None,
+    margin: float = 0.0, confidence: float = 0.95,
+) -> TrialComparison:  # fmt: skip
     """Compare two policies by pairs of real trials; valid after any number of pairs.
 
     **Arguments:**

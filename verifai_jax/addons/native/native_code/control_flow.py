@@ -148,12 +148,9 @@ def is_uniform(value: Value) -> bool:
 
 
 def until_settled(
-    t: Translator,
-    forms: Forms,
-    uniform: list[bool],
-    emit: Callable[[Carry], list[Value] | None],
+    t: Translator, forms: Forms, uniform: list[bool], emit: Callable[[Carry], list[Value] | None],
     changed: Sequence[Value] = (),
-) -> list[Value]:
+) -> list[Value]:  # fmt: skip
     """Translate a loop or branch, repeatedly as long as more of its values turn out to differ.
 
     - `changed`: the initial values of a branch; those that nothing else uses are changed in place.

@@ -51,14 +51,9 @@ class Library:
         ]  # fmt: skip
 
     def __call__(
-        self,
-        rows: Float[np.ndarray, "n d"],
-        key: UInt32[np.ndarray, "2"],
-        first: int,
-        temperatures: Float[np.ndarray, " n"],
-        numbers: Float[np.ndarray, " numbers"],
-        threads: int,
-    ) -> UInt32[np.ndarray, "n count"]:
+        self, rows: Float[np.ndarray, "n d"], key: UInt32[np.ndarray, "2"], first: int,
+        temperatures: Float[np.ndarray, " n"], numbers: Float[np.ndarray, " numbers"], threads: int,
+    ) -> UInt32[np.ndarray, "n count"]:  # fmt: skip
         """Simulate rows whose first one has this number, on several threads."""
         rows = np.ascontiguousarray(rows, np.float32)
         key, numbers = np.ascontiguousarray(key, np.uint32), np.ascontiguousarray(numbers)

@@ -81,12 +81,9 @@ class BraxTask:
 
 @suggests_options
 def brax_task(
-    env: "str | Env",
-    *,
-    backend: str | None = None,
-    time_limit: int = 1000,
+    env: "str | Env", *, backend: str | None = None, time_limit: int = 1000,
     options: Mapping[str, Option] | None = None,
-) -> BraxTask:
+) -> BraxTask:  # fmt: skip
     """Make a `Task` from an environment of Brax.
 
     **Arguments:**

@@ -49,12 +49,9 @@ class LookupTable:
     beyond: str = field(default="clip", metadata={"static": True})
 
     def __init__(
-        self,
-        *axes_and_values: Any,
-        beyond: str = "clip",
-        axes: tuple[tuple[float, ...], ...] | None = None,
-        values: Any = None,
-    ) -> None:
+        self, *axes_and_values: Any, beyond: str = "clip",
+        axes: tuple[tuple[float, ...], ...] | None = None, values: Any = None,
+    ) -> None:  # fmt: skip
         if axes is None:
             if len(axes_and_values) < 2:
                 raise ValueError(

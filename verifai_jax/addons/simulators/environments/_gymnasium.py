@@ -371,13 +371,9 @@ class EpisodeFunction:
         self._first = None
 
     def _sample(
-        self,
-        env: Env,
-        observation: object,
-        action: object,
-        reward: float | np.number,
+        self, env: Env, observation: object, action: object, reward: float | np.number,
         features: Mapping[str, Any],
-    ) -> dict[str, np.ndarray]:
+    ) -> dict[str, np.ndarray]:  # fmt: skip
         custom = callable(self.signals)
         seen = episode_signals.as_arrays(observation)
         if isinstance(seen, Mapping | tuple) and not custom:

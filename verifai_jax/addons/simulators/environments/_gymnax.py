@@ -278,12 +278,9 @@ def _differentiable(
         return [leaf for leaf in after if jnp.issubdtype(jnp.result_type(leaf), jnp.floating)]
 
     def tangents(
-        values: Sequence[Array],
-        directions: Sequence[Array],
-        others: Sequence[Array],
-        action: PyTree,
-        key: Key[Array, ""],
-    ) -> Any:
+        values: Sequence[Array], directions: Sequence[Array], others: Sequence[Array],
+        action: PyTree, key: Key[Array, ""],
+    ) -> Any:  # fmt: skip
         return jax.jvp(lambda v: stepped(v, others, action, key), (values,), (directions,))[1]
 
     def stops() -> bool:

@@ -116,11 +116,9 @@ def fold(
 
 
 def _run(
-    episode: Episode,
-    key: Seed,
-    collected: PyTree,
+    episode: Episode, key: Seed, collected: PyTree,
     collect: Callable[[PyTree, dict[str, Array]], tuple[PyTree, PyTree]],
-) -> tuple[Moment, Any, Any, Any]:
+) -> tuple[Moment, Any, Any, Any]:  # fmt: skip
     """Return the last moment, the number of steps, the last `collected` and the outputs."""
     keys = episode_keys(key)
     first, memory, action = _first_moment(episode, episode.start(keys.start), keys)

@@ -22,13 +22,9 @@ SignalsOption: TypeAlias = (
 
 
 def read_signals(
-    signals: SignalsOption,
-    moment: Moment,
-    action: PyTree,
-    features: Features,
-    named: Mapping[str, Any],
-    name: str,
-) -> Any:
+    signals: SignalsOption, moment: Moment, action: PyTree, features: Features,
+    named: Mapping[str, Any], name: str,
+) -> Any:  # fmt: skip
     """Return one sample of the signals given by the option `signals`.
 
     - `signals`: a function `(state, observation, action, reward, features) -> dict`; names of the

@@ -73,12 +73,9 @@ class PolicyLoop(System):
         return rollout(self._episode(features), key)
 
     def fold(
-        self,
-        features: Features,
-        key: Seed,
-        carry: Carry,
+        self, features: Features, key: Seed, carry: Carry,
         update: Callable[[Carry, dict[str, Array]], Carry],
-    ) -> tuple[Carry, Int[Array, ""]]:
+    ) -> tuple[Carry, Int[Array, ""]]:  # fmt: skip
         return fold(self._episode(features), key, carry, update)
 
     def _configured(self, features: Features) -> Any:

@@ -120,10 +120,9 @@ class Bindings:
         return _set(leaves, groups[2], features, self._base)
 
     def start(
-        self,
-        features: Mapping[str, Any],
+        self, features: Mapping[str, Any],
         begin: Mapping[str, Float[Array | np.ndarray, " k"]] | None = None,
-    ) -> dict[str, Float[Array, " k"]]:
+    ) -> dict[str, Float[Array, " k"]]:  # fmt: skip
         """Return `qpos`, `qvel` and `act` at time 0, and the positions of mocap bodies if bound.
 
         - `begin`: their values if no feature sets them; those of the model's keyframe if None.
@@ -262,11 +261,9 @@ def _claim(taken: dict[tuple[str, int], str], where: Location, feature: str) -> 
 
 
 def _set(
-    arrays: dict[str, Any],
-    bound: Iterable[Binding],
-    features: Mapping[str, Any],
+    arrays: dict[str, Any], bound: Iterable[Binding], features: Mapping[str, Any],
     base: Callable[[str], np.ndarray],
-) -> dict[str, Any]:
+) -> dict[str, Any]:  # fmt: skip
     arrays = dict(arrays)
     for binding in bound:
         where = binding.location

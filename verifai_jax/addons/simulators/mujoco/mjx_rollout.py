@@ -61,10 +61,9 @@ def rollout(loop: Loop, features: Features, key: Seed) -> Trace:
     form: Sample = jax.eval_shape(lambda: loop.sample(jnp.int32(0), arrays, progress, features)[0])
 
     def step(
-        physics: Physics,
-        time: Array,
+        physics: Physics, time: Array,
         decide: Callable[[MjxData], tuple[Iterable[tuple[str, Array]], PyTree]],
-    ) -> tuple[Physics, Any]:
+    ) -> tuple[Physics, Any]:  # fmt: skip
         data = blank.replace(time=time, **physics._asdict())
         data = mjx.sensor_pos(model, mjx.fwd_position(model, data))
         data = mjx.sensor_vel(model, mjx.fwd_velocity(model, data))

@@ -147,12 +147,9 @@ class _Program:
         return needed
 
     def _sample(
-        self,
-        k: Int[Array, ""],
-        packed: Float[Array, " packed"],
-        progress: Progress,
+        self, k: Int[Array, ""], packed: Float[Array, " packed"], progress: Progress,
         features: Features,
-    ) -> tuple[Sample, Progress]:
+    ) -> tuple[Sample, Progress]:  # fmt: skip
         parts = jnp.split(packed, np.cumsum(self.sizes)[:-1])
         arrays = {
             name: part.reshape(self.loop.shapes[name])
@@ -178,14 +175,9 @@ class _Part:
     """A half of the rows, or all of them, on their way through a simulation."""
 
     def __init__(
-        self,
-        native: Native,
-        program: _Program,
-        number: int,
-        features: Features,
-        keys: Key[Array, " n"],
-        alive: np.ndarray,
-    ) -> None:
+        self, native: Native, program: _Program, number: int, features: Features,
+        keys: Key[Array, " n"], alive: np.ndarray,
+    ) -> None:  # fmt: skip
         self.loop, self.program = native.loop, program
         self.alive = alive
         self.failed = np.broadcast_to(

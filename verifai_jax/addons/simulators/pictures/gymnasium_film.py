@@ -40,11 +40,9 @@ class EpisodeFilm:
 
 
 def film_episode(
-    episode: EpisodeFunction,
-    replay: Replay,
-    size: Sequence[int] | None = None,
+    episode: EpisodeFunction, replay: Replay, size: Sequence[int] | None = None,
     fps: float | None = None,
-) -> bytes:
+) -> bytes:  # fmt: skip
     """Simulate an episode again in this process, and return the environment's pictures as a GIF.
 
     **Arguments:**

@@ -43,13 +43,9 @@ ARROW = np.array([0.82, 0.2, 0.3, 1.0], np.float32)
 
 
 def film(
-    motion: Motion,
-    path: str | Path,
-    size: tuple[int, int] | None = None,
-    *,
-    camera: str | None = None,
-    fps: float | None = None,
-) -> Path:
+    motion: Motion, path: str | Path, size: tuple[int, int] | None = None, *,
+    camera: str | None = None, fps: float | None = None,
+) -> Path:  # fmt: skip
     """Write an animated GIF, in real time unless there are too many frames.
 
     **Arguments:**
@@ -72,12 +68,9 @@ def film(
 
 
 def strip(
-    motion: Motion,
-    path: str | Path,
-    count: int = 6,
-    size: tuple[int, int] = (280, 300),
+    motion: Motion, path: str | Path, count: int = 6, size: tuple[int, int] = (280, 300),
     camera: str | None = None,
-) -> Path:
+) -> Path:  # fmt: skip
     """Write a PNG of `count` frames side by side, from the start to the end.
 
     For a failure the frames are concentrated around the deciding sample.
@@ -107,12 +100,9 @@ def strip(
 
 
 def frames(
-    motion: Motion,
-    samples: Sequence[int],
-    size: tuple[int, int] = SIZE,
-    *,
+    motion: Motion, samples: Sequence[int], size: tuple[int, int] = SIZE, *,
     camera: str | None = None,
-) -> list[Frame]:
+) -> list[Frame]:  # fmt: skip
     """Draw the motion at some samples.
 
     **Arguments:**

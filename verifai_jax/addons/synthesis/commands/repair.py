@@ -31,16 +31,9 @@ from verifai_jax.cli.json_output import command, draw, give_result, say, show_re
 @arguments.PLOT
 @fail_on(unsafe="unless the repair held in the check")
 def repair(
-    target: str,
-    parameters: str,
-    nominal: tuple[str, ...],
-    folder: Path | None,
-    budget: int,
-    estimate: int | None,
-    plot: Path | None,
-    fail_on: Gate | None,
-    **keywords: Any,
-) -> None:
+    target: str, parameters: str, nominal: tuple[str, ...], folder: Path | None, budget: int,
+    estimate: int | None, plot: Path | None, fail_on: Gate | None, **keywords: Any,
+) -> None:  # fmt: skip
     """Remove the failures of TARGET (specs/FILE.py:NAME) by a small change of its parameters."""
     from verifai_jax import repair as run_repair
 

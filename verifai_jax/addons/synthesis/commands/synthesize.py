@@ -18,13 +18,9 @@ from verifai_jax.cli.json_output import command, say, show_result
 @option("--table", type=PATH, metavar="CSV", help="Write the candidates into a CSV file.")
 @fail_on(unsafe="unless the formula holds with the parameters, in the check too")
 def synthesize(
-    target: str,
-    parameters: str | None,
-    budget: int,
-    table: Path | None,
-    fail_on: Gate | None,
+    target: str, parameters: str | None, budget: int, table: Path | None, fail_on: Gate | None,
     **keywords: Any,
-) -> None:
+) -> None:  # fmt: skip
     """Find parameters for which TARGET (specs/FILE.py:NAME) holds, whatever its other features."""
     from verifai_jax import synthesize as run_synthesize
 

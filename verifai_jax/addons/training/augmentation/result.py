@@ -152,12 +152,9 @@ class Augmentation(InNotebook):
         return draw(self, path, metric, reference)
 
     def montage(
-        self,
-        path: str | Path | None = None,
-        arm: str = "counterexamples",
-        seed: int = 0,
+        self, path: str | Path | None = None, arm: str = "counterexamples", seed: int = 0,
         count: int = 24,
-    ) -> Figure:
+    ) -> Figure:  # fmt: skip
         """Draw inputs that an arm added, for tasks whose inputs are images.
 
         **Arguments:**

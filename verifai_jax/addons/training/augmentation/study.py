@@ -258,12 +258,9 @@ class Seed:
         return self._finished(numbers, addition, judged.wrongness, weights)
 
     def _finished(
-        self,
-        numbers: dict[str, float] | None,
-        addition: Addition,
-        wrongness: Float[np.ndarray, " n"],
-        weights: Weights | None,
-    ) -> "Finished":
+        self, numbers: dict[str, float] | None, addition: Addition,
+        wrongness: Float[np.ndarray, " n"], weights: Weights | None,
+    ) -> "Finished":  # fmt: skip
         entry: dict[str, Any] = {
             "status": NOT_FINITE if numbers is None else TRAINED,
             "added": len(addition.rows),

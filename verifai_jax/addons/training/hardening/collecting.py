@@ -52,15 +52,9 @@ class Collected(NamedTuple):
 
 
 def collect(
-    problem: Problem,
-    failing: pd.DataFrame,
-    earlier: Float[np.ndarray, "m d"],
-    *,
-    seed: int,
-    added: int,
-    table: int,
-    shrunk: int,
-) -> Collected:
+    problem: Problem, failing: pd.DataFrame, earlier: Float[np.ndarray, "m d"], *, seed: int,
+    added: int, table: int, shrunk: int,
+) -> Collected:  # fmt: skip
     """Confirm failures and convert them to points to train around.
 
     **Arguments:**

@@ -70,12 +70,9 @@ class Mixture:
 
     @classmethod
     def of(
-        cls,
-        space: FeatureSpace,
-        shares: Shares,
-        centres: Float[np.ndarray, "n d"],
+        cls, space: FeatureSpace, shares: Shares, centres: Float[np.ndarray, "n d"],
         radii: Float[np.ndarray, " n"] | float = RADIUS,
-    ) -> "Mixture":
+    ) -> "Mixture":  # fmt: skip
         """Return a mixture with neighbourhoods of these points; without points it has none."""
         count = len(centres)
         if not count:

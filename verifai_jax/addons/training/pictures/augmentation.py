@@ -14,11 +14,9 @@ from verifai_jax.pictures.style import BOUND, FAILING, SAFE, new_figure, show_or
 
 
 def plot_arms(
-    result: Augmentation,
-    path: str | Path | None = None,
-    metric: str = "error",
+    result: Augmentation, path: str | Path | None = None, metric: str = "error",
     reference: str = "none",
-) -> Figure:
+) -> Figure:  # fmt: skip
     """Draw a metric of each arm and seed, and the paired difference of each arm and the reference.
 
     **Arguments:**
@@ -59,12 +57,9 @@ def plot_arms(
 
 
 def plot_montage(
-    result: Augmentation,
-    path: str | Path | None = None,
-    arm: str = "counterexamples",
-    seed: int = 0,
-    count: int = 24,
-) -> Figure:
+    result: Augmentation, path: str | Path | None = None, arm: str = "counterexamples",
+    seed: int = 0, count: int = 24,
+) -> Figure:  # fmt: skip
     """Draw images that an arm added.
 
     **Arguments:**

@@ -76,10 +76,9 @@ def curve_trace(
 
 
 def curve_robustness(
-    formula: Formula | str,
-    steps: Int[np.ndarray, " updates"],
+    formula: Formula | str, steps: Int[np.ndarray, " updates"],
     mean_return: Float[np.ndarray, " updates"],
-) -> float:
+) -> float:  # fmt: skip
     """Return the robustness of a formula on a learning curve.
 
     **Arguments:**

@@ -184,14 +184,9 @@ class _Input:
 
 
 def hyperparameter_importance(
-    table: "pd.DataFrame",
-    hyperparameters: Sequence[str],
-    space: FeatureSpace | None,
-    *,
-    name: str = "sweep",
-    repeats: int = 5,
-    seed: int = 0,
-) -> HyperparameterImportance:
+    table: "pd.DataFrame", hyperparameters: Sequence[str], space: FeatureSpace | None, *,
+    name: str = "sweep", repeats: int = 5, seed: int = 0,
+) -> HyperparameterImportance:  # fmt: skip
     """Measure the importance of hyper-parameters from the rows of a sweep's table.
 
     Nothing is trained or simulated.
@@ -268,12 +263,9 @@ def _forest(inputs: int, seed: int) -> "ExtraTreesRegressor":
 
 
 def _permutation_losses(
-    matrix: Float[np.ndarray, "n d"],
-    values: Float[np.ndarray, " n"],
-    groups: Int[np.ndarray, " n"],
-    repeats: int,
-    seed: int,
-) -> tuple[float, Float[np.ndarray, "repeats d"]]:
+    matrix: Float[np.ndarray, "n d"], values: Float[np.ndarray, " n"],
+    groups: Int[np.ndarray, " n"], repeats: int, seed: int,
+) -> tuple[float, Float[np.ndarray, "repeats d"]]:  # fmt: skip
     """Return R^2 on held-out configurations, and its loss when each column is shuffled."""
     generator = np.random.default_rng(seed)
     rows, dimensions = matrix.shape
@@ -380,11 +372,9 @@ class Trends(NamedTuple):
 
 
 def trends(
-    inputs: Float[np.ndarray, "n d"],
-    outcome: Float[np.ndarray, " n"],
-    groups: Int[np.ndarray, " n"],
-    seed: int = 0,
-) -> Trends:
+    inputs: Float[np.ndarray, "n d"], outcome: Float[np.ndarray, " n"],
+    groups: Int[np.ndarray, " n"], seed: int = 0,
+) -> Trends:  # fmt: skip
     """Correlate inputs with an outcome over groups of rows, using the mean of each group."""
     distinct, member = np.unique(groups, return_inverse=True)
     counts = np.bincount(member)

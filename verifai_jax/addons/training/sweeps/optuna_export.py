@@ -39,14 +39,9 @@ _ATTRIBUTES = (
 
 
 def export_to_optuna(
-    configurations: "pd.DataFrame",
-    hyperparameters: Sequence[str],
-    space: FeatureSpace | None,
-    used: Mapping[str, Sequence[str]],
-    *,
-    name: str,
-    storage: "str | BaseStorage | None" = None,
-) -> "optuna.Study":
+    configurations: "pd.DataFrame", hyperparameters: Sequence[str], space: FeatureSpace | None,
+    used: Mapping[str, Sequence[str]], *, name: str, storage: "str | BaseStorage | None" = None,
+) -> "optuna.Study":  # fmt: skip
     """Make an Optuna study with one trial for each configuration; see `Sweep.to_optuna`.
 
     A configuration without a certificate becomes a failed trial, one stopped by halving a pruned
@@ -106,11 +101,9 @@ def _distribution(
 
 
 def _trial(
-    optuna: ModuleType,
-    number: int,
-    row: Mapping[str, Any],
+    optuna: ModuleType, number: int, row: Mapping[str, Any],
     distributions: "Mapping[str, BaseDistribution]",
-) -> "FrozenTrial":
+) -> "FrozenTrial":  # fmt: skip
     values = [float(row["failure_high"]), float(row["nominal_return"])]
     state = optuna.trial.TrialState.COMPLETE
     if not np.isfinite(values).all():

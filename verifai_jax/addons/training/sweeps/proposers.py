@@ -122,11 +122,9 @@ class SearchProposer:
 
 
 def objective(
-    failure_rate: float,
-    worst_robustness: float,
-    nominal_return: float,
+    failure_rate: float, worst_robustness: float, nominal_return: float,
     return_range: tuple[float, float],
-) -> float | None:
+) -> float | None:  # fmt: skip
     """Return the objective of a policy, between 0 and 1.11, which searches minimise.
 
     The failure rate counts most; the worst robustness, scaled to a tenth, decides between equal

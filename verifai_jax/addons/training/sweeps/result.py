@@ -244,13 +244,9 @@ class Sweep(Drawn, Reported):
 
     @suggests_options
     def counterexamples(
-        self,
-        i: int | np.integer | None = None,
-        *,
-        simulations: int = 0,
-        search: str | Search = "portfolio",
-        seed: int = 0,
-    ) -> "pd.DataFrame":
+        self, i: int | np.integer | None = None, *, simulations: int = 0,
+        search: str | Search = "portfolio", seed: int = 0,
+    ) -> "pd.DataFrame":  # fmt: skip
         """Return features with which the policy of a row fails, the worst first.
 
         An empty table does not prove the absence of failures; see the certificate.
