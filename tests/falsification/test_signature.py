@@ -28,6 +28,7 @@ def constant(f, key):
 PROBLEM = vj.Problem("flat", vj.FeatureSpace({"x": vj.Box(0, 1)}), constant, "always x <= 0.9")
 
 
+@pytest.mark.addons
 @pytest.mark.parametrize("verb", VERBS)
 def test_verbs_take_few_arguments_and_share_their_words(verb):
     arguments = set(inspect.signature(getattr(vj, verb)).parameters)
@@ -35,6 +36,7 @@ def test_verbs_take_few_arguments_and_share_their_words(verb):
     assert not arguments & JOINED
 
 
+@pytest.mark.addons
 @pytest.mark.parametrize(
     ("make", "error", "message"),
     [
@@ -74,6 +76,7 @@ def test_a_pool_that_forks_is_refused_when_it_is_named():
         vj.RunOn(executor=pool)
 
 
+@pytest.mark.addons
 def test_a_verb_refuses_what_it_does_not_use():
     with pytest.raises(ValueError, match=r"does not use after= of vj.Stop; it uses seconds="):
         vj.estimate(PROBLEM, stop=vj.Stop(after=1))
