@@ -362,12 +362,9 @@ class Repetitions:
     def joined(self, other: "Repetitions") -> "Repetitions":
         """Return the sums of both counts."""
         return Repetitions(
-            self.rows + other.rows,
-            self.moved + other.moved,
-            self.rounded + other.rounded,
-            self.lost + other.lost,
-            max(self.max_difference, other.max_difference),
-        )
+            self.rows + other.rows, self.moved + other.moved, self.rounded + other.rounded,
+            self.lost + other.lost, max(self.max_difference, other.max_difference),
+        )  # fmt: skip
 
     def __str__(self) -> str:
         """Say what that means of the system; empty if all rows came again bit for bit."""

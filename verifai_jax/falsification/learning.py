@@ -104,14 +104,9 @@ class Learning:
         space = self.problem.space
         improve = None if self.surrogate is None else self.surrogate.improve
         self.proposals = Proposals(
-            self.search,
-            space.cube,
-            batch,
-            self._key,
-            space.constraint,
-            self.coverage_id_count,
+            self.search, space.cube, batch, self._key, space.constraint, self.coverage_id_count,
             improve,
-        )
+        )  # fmt: skip
 
     @property
     def distinct(self) -> int | None:
@@ -182,14 +177,9 @@ class Learning:
             return None if values is None else values.astype(np.float32)
 
         self.proposals.tell(
-            objective.astype(np.float32),
-            verdicts.proper,
-            single(verdicts.gradient),
-            single(verdicts.clauses),
-            single(verdicts.clause_gradients),
-            coverage_ids,
-            outcomes,
-        )
+            objective.astype(np.float32), verdicts.proper, single(verdicts.gradient),
+            single(verdicts.clauses), single(verdicts.clause_gradients), coverage_ids, outcomes,
+        )  # fmt: skip
 
     def _with_guide(
         self, rho: Float[np.ndarray, " n"], value: Float[np.ndarray, " n"]

@@ -180,11 +180,9 @@ class Rounds:
         """Simulate the points of a round; `first` is the number of its first row in the run."""
         compiled, proposals = self._simulations.compile_seconds, self.learning.proposals
         verdicts = self._simulations(
-            batch.points,
-            first,
-            differentiate=not batch.given and proposals.differentiate,
+            batch.points, first, differentiate=not batch.given and proposals.differentiate,
             temperature=1.0 if batch.given else proposals.temperature,
-        )
+        )  # fmt: skip
         # A robustness of exactly zero compiles a program of its own.
         self.watch.move(self._simulations.compile_seconds - compiled, COMPILE)
         return verdicts

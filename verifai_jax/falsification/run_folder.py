@@ -139,13 +139,9 @@ def _as_recorded(folder: Path, record: Mapping[str, Any], problem: Problem | Non
         table = ErrorTable.load(folder, features, _numeric_features(record))
     checkpoint, damage = _read_state(folder, record, table)
     run = Run(
-        table=table,
-        folder=folder,
-        problem=problem,
-        checkpoint=checkpoint,
-        damage="; ".join(damage),
-        **{name: record[name] for name in RECORDED},
-    )
+        table=table, folder=folder, problem=problem, checkpoint=checkpoint,
+        damage="; ".join(damage), **{name: record[name] for name in RECORDED},
+    )  # fmt: skip
     return as_made(run)
 
 

@@ -177,12 +177,9 @@ class Simulations:
         if len(points) <= count:
             return known
         rest = self.evaluate(
-            np.asarray(points)[count:],
-            first=first + count,
-            padded_to=self._full_batch,
-            keep_traces=self.keep_traces,
-            journals=self._journals,
-        )
+            np.asarray(points)[count:], first=first + count, padded_to=self._full_batch,
+            keep_traces=self.keep_traces, journals=self._journals,
+        )  # fmt: skip
         if not self.keep_traces:
             known = known._replace(traces=None)
         return Verdicts.concatenate([known, rest])

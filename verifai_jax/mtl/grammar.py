@@ -132,12 +132,9 @@ def parser() -> Any:
         %ignore /\s+/
     """
     return lark.Lark(
-        grammar,
-        parser="lalr",
-        lexer="contextual",
-        propagate_positions=True,
+        grammar, parser="lalr", lexer="contextual", propagate_positions=True,
         maybe_placeholders=True,
-    )
+    )  # fmt: skip
 
 
 _GROUPS = (

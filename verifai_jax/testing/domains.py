@@ -54,11 +54,9 @@ def check_domain(domain: Domain, *, samples: int = 64, seed: int = 0) -> None:
     # With all lengths at their most, every coordinate matters.
     longest = u.at[:, list(domain.lengths)].set(1.0)
     np.testing.assert_allclose(
-        np.asarray(both(longest)[1])[:, cube.discrete],
-        cube.centres(cube.cells(longest)),
-        atol=1e-6,
-        err_msg="to_unit(from_unit(u)) must be the middle of the cell of u",
-    )
+        np.asarray(both(longest)[1])[:, cube.discrete], cube.centres(cube.cells(longest)),
+        atol=1e-6, err_msg="to_unit(from_unit(u)) must be the middle of the cell of u",
+    )  # fmt: skip
     columns = domain.columns("value")
     rows = domain.to_columns(jax.tree.map(np.asarray, values), "value")
     assert tuple(rows) == columns, f"to_columns must give {columns}; got {tuple(rows)}"

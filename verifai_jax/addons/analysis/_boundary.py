@@ -193,11 +193,9 @@ def boundary(source: Source, *, seed: int = 0) -> Boundary:
     key = jax.random.key(seed, impl="threefry2x32")
     prior = pd.DataFrame(samples.space.rows(samples.space.sample(key, PRIOR)))
     return replace(
-        found,
-        share=float(np.mean(found._answer(_inputs(samples, prior)))),
-        unsampled=float(np.mean(~found._near(prior))),
-        _prior=prior,
-    )
+        found, share=float(np.mean(found._answer(_inputs(samples, prior)))),
+        unsampled=float(np.mean(~found._near(prior))), _prior=prior,
+    )  # fmt: skip
 
 
 def _frame(points: Points, samples: Samples) -> pd.DataFrame:

@@ -212,15 +212,9 @@ def rules(
     values, codes = samples.values(), samples.codes()
     made, weights = _thinned(failing, ~aside, seed)
     regions = _select_regions(
-        values[made],
-        codes[made],
-        failing[made],
-        weights,
-        samples.unordered,
-        depth,
-        cover,
+        values[made], codes[made], failing[made], weights, samples.unordered, depth, cover,
         max_rules,
-    )
+    )  # fmt: skip
     integer = [column.integer for column in samples.ordered]
     regions = [region.round(values[made], codes[made], integer) for region in regions]
     found: list[Rule] = []
@@ -239,15 +233,9 @@ def rules(
             union |= inside
     coverage, precision = _measured(union, failing[aside]) or (0.0, None)
     return Rules(
-        rules=tuple(found),
-        coverage=coverage,
-        precision=precision,
-        unsupported=unsupported,
-        made=len(made),
-        measured=int(aside.sum()),
-        doubt=doubt,
-        samples=samples,
-    )
+        rules=tuple(found), coverage=coverage, precision=precision, unsupported=unsupported,
+        made=len(made), measured=int(aside.sum()), doubt=doubt, samples=samples,
+    )  # fmt: skip
 
 
 def _too_few(failing: Bool[np.ndarray, " n"]) -> str:

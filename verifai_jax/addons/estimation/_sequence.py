@@ -139,12 +139,9 @@ class _Stage:
             _signal(v)[0] for v in hands.values() if v not in problem.space.domains
         )
         self.evaluate = Evaluator(
-            problem,
-            options["batch"],
-            seed=self.seed,
-            precision=options["precision"],
+            problem, options["batch"], seed=self.seed, precision=options["precision"],
             keep_traces=tuple(kept),
-        )
+        )  # fmt: skip
 
     def simulated(
         self, arrivals: _Arrivals | None, samples: int, confidence: float
@@ -276,14 +273,9 @@ def _estimate(
         share * failures, share * (failures + without), effective, confidence
     )
     return PartEstimate(
-        name=name,
-        probability=failures / known if known else float("nan"),
-        low=low,
-        high=high,
-        samples=count,
-        without=without,
-        effective=effective,
-    )
+        name=name, probability=failures / known if known else float("nan"), low=low, high=high,
+        samples=count, without=without, effective=effective,
+    )  # fmt: skip
 
 
 def _signal(source: str) -> tuple[str, int | None]:

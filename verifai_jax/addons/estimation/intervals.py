@@ -36,13 +36,9 @@ def weighted_mean(x: Float[np.ndarray, " n"]) -> WeightedMean:
     skewness = float(np.mean((x - mean) ** 3)) / std**3 if std > 0 else 0.0
     effective = total**2 / float(np.sum(x * x))
     return WeightedMean(
-        mean,
-        std / math.sqrt(n) / mean,
-        skewness,
-        effective,
-        float(x.max()) / total,
+        mean, std / math.sqrt(n) / mean, skewness, effective, float(x.max()) / total,
         tail_index(x[x > 0]),
-    )
+    )  # fmt: skip
 
 
 def skewed_interval(x: Float[np.ndarray, " n"], confidence: float) -> tuple[float, float]:

@@ -149,13 +149,9 @@ def estimate_by_importance_sampling(
             return _without_samples(limit_state, rng, plan, run, counts)
         found = [exploration.points for exploration in explorations]
         agreement = compare_explorations(
-            limit_state,
-            rng,
-            samples.failures,
-            samples.x[samples.failing],
-            proposals,
+            limit_state, rng, samples.failures, samples.x[samples.failing], proposals,
             [points, *found] if run.stopped is None else found,
-        )
+        )  # fmt: skip
     except Ended:
         return _without_samples(limit_state, rng, plan, run, counts)
     answer = _with_chance(

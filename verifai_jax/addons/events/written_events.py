@@ -79,10 +79,8 @@ class WrittenEvents:
             parameters[name] = jnp.stack([jnp.asarray(value, middle.dtype) for value in values])
         return Events(
             jnp.asarray(np.array(kinds, np.int32)),
-            jnp.stack([wait.astype(dtype) for wait in waits]),
-            parameters,
-            tables.names,
-        )
+            jnp.stack([wait.astype(dtype) for wait in waits]), parameters, tables.names,
+        )  # fmt: skip
 
     def _absent(self, dtype: Any) -> dict[str, jax.Array]:
         """Return the value of each parameter in an empty slot."""

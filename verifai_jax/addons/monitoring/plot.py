@@ -41,15 +41,9 @@ def draw(explanation: Explanation, path: str | Path | None = None) -> Figure:
     figure = new_figure(figsize=size, facecolor="white")
     top, bottom = 1 - head / size[1], 0.5 / size[1]
     grid = figure.add_gridspec(
-        len(rows),
-        1,
-        height_ratios=heights,
-        left=0.34,
-        right=0.9,
-        top=top,
-        bottom=bottom,
+        len(rows), 1, height_ratios=heights, left=0.34, right=0.9, top=top, bottom=bottom,
         hspace=0.22,
-    )
+    )  # fmt: skip
     verdict = "holds" if explanation.holds else "fails"
     decided = (
         f"{verdict} with robustness {explanation.robustness:z.4g}: decided by  "
@@ -98,16 +92,9 @@ def draw(explanation: Explanation, path: str | Path | None = None) -> Figure:
     for n, (axis, t, y) in enumerate(ticks):
         final = n == len(ticks) - 1
         axis.plot(
-            [t],
-            [y],
-            "o",
-            ms=9 if final else 5,
-            zorder=21,
-            clip_on=False,
-            mfc=(HOLDS if explanation.holds else FAILS) if final else "white",
-            mec=PATH,
-            mew=1.4,
-        )
+            [t], [y], "o", ms=9 if final else 5, zorder=21, clip_on=False,
+            mfc=(HOLDS if explanation.holds else FAILS) if final else "white", mec=PATH, mew=1.4,
+        )  # fmt: skip
     if path is not None:
         with replacing(path) as partial:
             figure.savefig(partial, dpi=130)
@@ -148,15 +135,9 @@ def _label(figure: Figure, axis: Axes, depth: int, node: Node, width: float) -> 
     figure.text(indent, middle, text, va="center", fontsize=10.5, weight=weight, color=color)
     value = "" if np.isnan(node.robustness) else f"{node.robustness:+z.3g}"
     figure.text(
-        0.91,
-        middle,
-        f"{value}\nat {format_seconds(node.time, 4)}",
-        va="center",
-        fontsize=9,
-        weight=weight,
-        color=HOLDS if node.robustness >= 0 else FAILS,
-        linespacing=1.15,
-    )
+        0.91, middle, f"{value}\nat {format_seconds(node.time, 4)}", va="center", fontsize=9,
+        weight=weight, color=HOLDS if node.robustness >= 0 else FAILS, linespacing=1.15,
+    )  # fmt: skip
 
 
 def _dress(axis: Axes, clock: np.ndarray, last: bool) -> None:
@@ -188,14 +169,9 @@ def _strip(axis: Axes, node: Node, clock: np.ndarray) -> float:
     edges = _edges(clock)
     for first, after, good in _runs(node.series >= 0):
         axis.axvspan(
-            edges[first],
-            edges[after],
-            0.22,
-            0.78,
-            color=HOLDS if good else FAILS,
-            alpha=0.75 if node.decides else 0.35,
-            lw=0,
-        )
+            edges[first], edges[after], 0.22, 0.78, color=HOLDS if good else FAILS,
+            alpha=0.75 if node.decides else 0.35, lw=0,
+        )  # fmt: skip
     axis.set_ylim(0, 1)
     axis.set_yticks([])
     return 0.5
@@ -214,12 +190,9 @@ def _predicate(axis: Axes, explanation: Explanation, node: Node, clock: np.ndarr
     edges = _edges(clock)
     for first, after, good in _runs(node.series >= 0):
         axis.axvspan(
-            edges[first],
-            edges[after],
-            color=HOLDS if good else FAILS,
-            alpha=(0.16 if good else 0.3) if node.decides else 0.1,
-            lw=0,
-        )
+            edges[first], edges[after], color=HOLDS if good else FAILS,
+            alpha=(0.16 if good else 0.3) if node.decides else 0.1, lw=0,
+        )  # fmt: skip
     # An expression by itself is compared with zero, and TRUE and FALSE have nothing to plot.
     sides = [side(term) for term in node.formula.terms()]
     main, bound = (*sides, *[np.zeros(len(clock))] * (2 - len(sides)))

@@ -47,14 +47,9 @@ def rectangle_of(body: Body) -> Rectangle:
     position = as_vec(body.get("position"))
     yaw = jnp.asarray(body.get("orientation").angle, jnp.result_type(float))
     return Rectangle(
-        position.x,
-        position.y,
-        yaw,
-        jnp.cos(yaw),
-        jnp.sin(yaw),
-        body.get("width") / 2,
+        position.x, position.y, yaw, jnp.cos(yaw), jnp.sin(yaw), body.get("width") / 2,
         body.get("length") / 2,
-    )
+    )  # fmt: skip
 
 
 def boxes_apart(one: Rectangle, other: Rectangle) -> Bool[Array, ""]:

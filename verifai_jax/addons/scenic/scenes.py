@@ -34,17 +34,12 @@ def draw_scene(program: Any, scene: Any, path: str | Path | None = None) -> Figu
         ahead = -math.sin(yaw) * reach, math.cos(yaw) * reach
         axes.plot(
             [body.position.x, body.position.x + ahead[0]],
-            [body.position.y, body.position.y + ahead[1]],
-            color="black",
-            linewidth=1.0,
-        )
+            [body.position.y, body.position.y + ahead[1]], color="black", linewidth=1.0,
+        )  # fmt: skip
         axes.annotate(
-            name,
-            (box[:, 0].max(), box[:, 1].max()),
-            xytext=(3, 3),
-            textcoords="offset points",
+            name, (box[:, 0].max(), box[:, 1].max()), xytext=(3, 3), textcoords="offset points",
             fontsize=8,
-        )
+        )  # fmt: skip
         corners.append(box)
     whole = np.concatenate(corners)
     low, high = whole.min(axis=0) - MARGIN, whole.max(axis=0) + MARGIN

@@ -79,11 +79,9 @@ class Bandit(Search[BanditState]):
     def init(self, key: Key[Array, ""], cube: Cube, batch: int) -> BanditState:
         window = max(self.window, 2 * batch)
         return BanditState(
-            key=key,
-            round=jnp.uint32(0),
-            u=jnp.full((window, cube.dim), 0.5, jnp.float32),
+            key=key, round=jnp.uint32(0), u=jnp.full((window, cube.dim), 0.5, jnp.float32),
             score=jnp.full(window, jnp.inf, jnp.float32),
-        )
+        )  # fmt: skip
 
     def ask(self, state: BanditState, cube: Cube, batch: int) -> Asked[BanditState]:
         key = jax.random.fold_in(state.key, state.round)

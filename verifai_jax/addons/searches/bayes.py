@@ -101,13 +101,9 @@ class Bayes(Search[BayesState]):
 
     def init(self, key: Key[Array, ""], cube: Cube, batch: int) -> BayesState:
         return BayesState(
-            key=key,
-            round=jnp.uint32(0),
-            proposals=jnp.uint32(0),
-            explored=jnp.uint32(0),
-            stale=jnp.int32(0),
-            memory=ProcessMemory.nothing(self.capacity, cube),
-        )
+            key=key, round=jnp.uint32(0), proposals=jnp.uint32(0), explored=jnp.uint32(0),
+            stale=jnp.int32(0), memory=ProcessMemory.nothing(self.capacity, cube),
+        )  # fmt: skip
 
     def ask(self, state: BayesState, cube: Cube, batch: int) -> Asked[BayesState]:
         key = jax.random.fold_in(state.key, state.round)

@@ -98,13 +98,9 @@ class Evolution(NamedTuple):
             spread = (signed * steps.T) @ steps
             covariance = kept * self.covariance + one * jnp.outer(path, path) + many * spread
         return Evolution(
-            mean=self.mean + self.size * step,
-            size=self.size * jnp.exp(jnp.minimum(growth, 1.0)),
-            covariance=covariance,
-            path=path,
-            whitened=whitened,
-            age=self.age + 1,
-        )
+            mean=self.mean + self.size * step, size=self.size * jnp.exp(jnp.minimum(growth, 1.0)),
+            covariance=covariance, path=path, whitened=whitened, age=self.age + 1,
+        )  # fmt: skip
 
     def widened(self, min_std: Float[np.ndarray, " n"]) -> "Evolution":
         """Raise standard deviations to at least `min_std`, and scale the covariance by a factor."""

@@ -132,12 +132,9 @@ class ProcessMemory(NamedTuple):
         luck = jnp.concatenate([luck, self.luck])
         rows = rows_to_keep(score, luck, len(self.score))
         return self._replace(
-            results=self.results + np.uint32(len(usable)),
-            u=u[rows],
-            score=score[rows],
-            luck=luck[rows],
-            verdicts=self.verdicts + verdicts,
-        )
+            results=self.results + np.uint32(len(usable)), u=u[rows], score=score[rows],
+            luck=luck[rows], verdicts=self.verdicts + verdicts,
+        )  # fmt: skip
 
     def refitted(self, cube: Cube, initial: int, steps: int) -> "ProcessMemory":
         """Refit the hyper-parameters, starting from the last ones, if there are 25 % more rows."""

@@ -163,11 +163,9 @@ class TuRBO(Search[TuRBOState]):
         side = jnp.where(wider, jnp.minimum(2 * state.side, SIDES[2]), state.side)
         side = jnp.where(narrower, side / 2, side)
         state = state._replace(
-            memory=memory.with_rows(observations.u, score),
-            side=side,
-            successes=jnp.where(wider, 0, successes),
-            failures=jnp.where(narrower, 0, failures),
-        )
+            memory=memory.with_rows(observations.u, score), side=side,
+            successes=jnp.where(wider, 0, successes), failures=jnp.where(narrower, 0, failures),
+        )  # fmt: skip
         # Where the region has become too small it is forgotten, and its points.
         state = choose(side < SIDES[0], _begun(state, state.memory.emptied(cube)), state)
         return state._replace(memory=state.memory.refitted(cube, self.initial, FIT_STEPS))

@@ -582,13 +582,9 @@ def main(arguments: list[str] | None = None) -> int:
     ]
     try:
         serve(
-            simulate,
-            host,
-            port,
-            capacity=given.capacity,
-            reconnect=given.reconnect,
+            simulate, host, port, capacity=given.capacity, reconnect=given.reconnect,
             certificate=given.certificate,
-        )
+        )  # fmt: skip
     except (ConnectionError, ValueError) as error:
         print(error, file=sys.stderr)
         return 1

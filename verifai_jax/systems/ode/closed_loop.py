@@ -206,13 +206,9 @@ class _Rollout:
         last, age, _, samples = self.run(state, memory, None, lambda _, sample: (None, sample))
         ends = loop.terminate is not None
         return Trace(
-            samples,
-            dt=loop.dt,
-            valid=age + 1 if ends else None,
-            status=_status(last, self.channels.valid()),
-            held=ends,
-            finite=finite,
-        )
+            samples, dt=loop.dt, valid=age + 1 if ends else None,
+            status=_status(last, self.channels.valid()), held=ends, finite=finite,
+        )  # fmt: skip
 
     def fold(
         self, state: PyTree, carry: Carry, update: Callable[[Carry, dict[str, Array]], Carry]
@@ -255,11 +251,9 @@ class _Rollout:
         # One iteration more than there are steps: it samples the final state and moves nothing,
         # which is cheaper than copying all samples to append one.
         ((state, _, _, age), collected), outputs = checkpointed_scan(
-            sample,
-            ((state, memory, held, jnp.int32(0)), collected),
-            loop.steps + 1,
+            sample, ((state, memory, held, jnp.int32(0)), collected), loop.steps + 1,
             unroll=loop.unroll,
-        )
+        )  # fmt: skip
         return state, age, collected, outputs
 
     def decide(

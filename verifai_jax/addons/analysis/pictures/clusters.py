@@ -54,26 +54,16 @@ def plot_clusters(clusters: Clusters, path: str | Path | None = None) -> Figure:
         if cluster >= 0:
             one = samples.at([int(clusters.entry(cluster, "representative"))])
             axes.scatter(
-                positions(samples, across, one),
-                positions(samples, up, one),
-                c=color,
-                marker="*",
-                s=190,
-                edgecolors="white",
-                linewidths=1.1,
-                zorder=4,
-            )
+                positions(samples, across, one), positions(samples, up, one), c=color, marker="*",
+                s=190, edgecolors="white", linewidths=1.1, zorder=4,
+            )  # fmt: skip
     name_axes(axes, samples, across, up)
     tidy(axes)
     handles, labels = axes.get_legend_handles_labels()
     axes.legend(
-        handles[::-1],
-        labels[::-1],
-        frameon=False,
-        fontsize=8,
-        loc="center left",
+        handles[::-1], labels[::-1], frameon=False, fontsize=8, loc="center left",
         bbox_to_anchor=(1, 0.5),
-    )
+    )  # fmt: skip
     figure.suptitle(
         f"{samples.kind}: {clusters.count} cluster{'' if clusters.count == 1 else 's'} "
         f"({clusters.method}); stars are typical rows",
@@ -117,12 +107,9 @@ def plot_diverse(diverse: Diverse, path: str | Path | None = None) -> Figure:
             style = {"xytext": (5, 4), "textcoords": "offset points", "fontsize": 8}
             cloud.annotate(str(i + 1), (x, y), **style)
     curve.plot(
-        np.arange(2, len(diverse.rows) + 1),
-        diverse.distances[1:],
-        "o-",
-        color=FAILING,
+        np.arange(2, len(diverse.rows) + 1), diverse.distances[1:], "o-", color=FAILING,
         markersize=3,
-    )
+    )  # fmt: skip
     curve.set_ylim(bottom=0)
     curve.set_xlabel("rows chosen")
     curve.set_ylabel("distance of the last from those before")

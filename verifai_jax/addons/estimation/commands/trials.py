@@ -58,9 +58,6 @@ def trials(
         trial_protocol(problem, sheet, trials=chosen, seed=seed)
         say(f"sheet {sheet}, to fill in {sheet.with_suffix('.csv')}")
     give_result(
-        rate=as_plain(found.rate),
-        simulated=as_plain(found.simulated),
-        wrong=len(found.wrong),
-        notes=found.notes,
-        next=None if chosen is None else chosen.to_dict("records"),
-    )
+        rate=as_plain(found.rate), simulated=as_plain(found.simulated), wrong=len(found.wrong),
+        notes=found.notes, next=None if chosen is None else chosen.to_dict("records"),
+    )  # fmt: skip

@@ -200,12 +200,9 @@ class _Tally:
     def rates(self, confidence: float) -> PairedRates:
         one, other, proper = self.columns()
         return paired_rates(
-            int(np.sum(one & ~other & proper)),
-            int(np.sum(other & ~one & proper)),
-            self.pairs,
-            confidence,
-            int(np.sum(~proper)),
-        )
+            int(np.sum(one & ~other & proper)), int(np.sum(other & ~one & proper)), self.pairs,
+            confidence, int(np.sum(~proper)),
+        )  # fmt: skip
 
 
 def _failing(evaluate: Evaluator, u: Any, first: int) -> tuple[Any, Any]:

@@ -368,11 +368,9 @@ def _list_modes(
 def _part_of(samples: ImportanceSamples, own: Bool[np.ndarray, " n"]) -> ImportanceSamples:
     """Return the samples with the weights of one region only."""
     return replace(
-        samples,
-        x=np.where(own, samples.x, 0.0),
-        edge=np.where(own, samples.edge, 0.0),
+        samples, x=np.where(own, samples.x, 0.0), edge=np.where(own, samples.edge, 0.0),
         without=np.zeros_like(samples.without),
-    )
+    )  # fmt: skip
 
 
 def _columns(space: FeatureSpace, z: Float[np.ndarray, "n d"]) -> pd.DataFrame:
@@ -390,13 +388,9 @@ def _simulate(
     points = np.concatenate([factor * design for factor in outward])
     frame = _columns(numbers.problem.space, points)
     run = simulate(
-        numbers.problem,
-        frame,
-        seed=numbers.seed,
-        precision=numbers.precision,
-        run_on=RunOn(backend=numbers.backend),
-        progress=False,
-    )
+        numbers.problem, frame, seed=numbers.seed, precision=numbers.precision,
+        run_on=RunOn(backend=numbers.backend), progress=False,
+    )  # fmt: skip
     failing = set(run.table.counterexamples.index)
     if numbers.problem.black_box and failing and len(outward) > 1:
         # What it claims has been simulated at least once more.

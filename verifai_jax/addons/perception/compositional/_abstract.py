@@ -187,11 +187,9 @@ def _image_problem(problem: Problem, loop: AbstractLoop, frame: Frame) -> Proble
         return uncertain if given is None else uncertain & given(features)
 
     return Problem(
-        f"{problem.name}, one image",
-        FeatureSpace(problem.space.domains, where=where),
-        DecisiveImage(loop, frame, problem.system.lanes),
-        ~loop.error,
-    )
+        f"{problem.name}, one image", FeatureSpace(problem.space.domains, where=where),
+        DecisiveImage(loop, frame, problem.system.lanes), ~loop.error,
+    )  # fmt: skip
 
 
 class _Stages:

@@ -244,11 +244,9 @@ def stack_frames(policy: Policy, count: int, size: int) -> Policy:
             f"observations of {size}: it must be of {size} or {count * size}"
         )
     return Policy(
-        weights=(policy.weights, policy.normaliser),
-        compute=Stacked(policy.compute, count),
-        initial_memory=(jnp.zeros(count * size), policy.initial_memory),
-        actions=policy.actions,
-    )
+        weights=(policy.weights, policy.normaliser), compute=Stacked(policy.compute, count),
+        initial_memory=(jnp.zeros(count * size), policy.initial_memory), actions=policy.actions,
+    )  # fmt: skip
 
 
 def bounds(values: object, name: str) -> tuple[float, ...]:

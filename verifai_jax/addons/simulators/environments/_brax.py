@@ -239,12 +239,9 @@ def brax(
         }
     brax_model.check_parts_are_read(env, name, locations)
     return Brax(
-        **{**shared, "features": locations},
-        env=env,
-        name=name,
-        steps=step_count(steps, duration, shared["dt"]),
-        exact_step=exact_step,
-    )
+        **{**shared, "features": locations}, env=env, name=name,
+        steps=step_count(steps, duration, shared["dt"]), exact_step=exact_step,
+    )  # fmt: skip
 
 
 def import_quietly(module: str, extra: str = "brax") -> Any:

@@ -151,12 +151,9 @@ def playground(
             "change it by configure=(env, features) -> env"
         )
     return Playground(
-        **shared,
-        env=env,
-        name=name,
-        bindings=bindings,
+        **shared, env=env, name=name, bindings=bindings,
         steps=step_count(steps, duration, shared["dt"]),
-    )
+    )  # fmt: skip
 
 
 def loaded(env: Env, options: Mapping[str, object] | None = None) -> tuple[Any, str]:

@@ -125,16 +125,9 @@ class PolicyLoop(System):
             return self._action(action), memory
 
         return Episode(
-            self.name,
-            start,
-            step,
-            decide,
-            self.policy_memory,
-            sample,
-            self.steps,
-            self.dt,
+            self.name, start, step, decide, self.policy_memory, sample, self.steps, self.dt,
             Channels(self.links, self.dt, features),
-        )
+        )  # fmt: skip
 
     def check(self, features: Features) -> None:
         starts = self.initial if isinstance(self.initial, Mapping) else {}

@@ -109,13 +109,9 @@ class Native:
         status = np.where(failed, Status.ERROR, status).astype(np.int32)
         ends = self.loop.terminate is not None
         form = Trace(
-            {name: signal[0] for name, signal in signals.items()},
-            dt=self.loop.control_period,
-            valid=1 if ends else None,
-            status=0,
-            held=ends,
-            finite=self.loop.finite_signals(),
-        )
+            {name: signal[0] for name, signal in signals.items()}, dt=self.loop.control_period,
+            valid=1 if ends else None, status=0, held=ends, finite=self.loop.finite_signals(),
+        )  # fmt: skip
         leaves = [*signals.values(), *([(age + 1).astype(np.int32)] if ends else []), status]
         return jax.tree.unflatten(jax.tree.structure(form), leaves)
 

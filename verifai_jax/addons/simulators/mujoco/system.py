@@ -200,13 +200,9 @@ class MuJoCo(System):
             }
             ends = loop.terminate is not None
             return Trace(
-                signals,
-                dt=loop.control_period,
-                valid=progress.age if ends else None,
-                status=jnp.int32(0),
-                held=ends,
-                finite=loop.finite_signals(),
-            )
+                signals, dt=loop.control_period, valid=progress.age if ends else None,
+                status=jnp.int32(0), held=ends, finite=loop.finite_signals(),
+            )  # fmt: skip
 
         return jax.eval_shape(trace, features)
 

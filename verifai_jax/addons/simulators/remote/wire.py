@@ -151,10 +151,8 @@ def trace_of(message: Message) -> Trace:
             raise WireError("times must be numbers that increase strictly, in seconds")
     trace = Trace(
         {name: _array(f"signal {name!r}", value, raw) for name, value in signals.items()},
-        dt=None if dt is None else float(dt),
-        times=times,
-        valid=valid,
-    )
+        dt=None if dt is None else float(dt), times=times, valid=valid,
+    )  # fmt: skip
     if valid is not None and not (_is_integer(valid) and 1 <= valid <= trace.length):
         raise WireError(
             f"valid must be how many samples count, from 1 to {trace.length}; got {brief(valid)}"

@@ -69,14 +69,9 @@ class Augmentation(InNotebook):
     @cached_property
     def _outcome(self) -> Outcome:
         return Outcome(
-            self.task.name,
-            self.arms,
-            self.table,
-            self.error_tables,
-            self.options,
-            self.confidence,
+            self.task.name, self.arms, self.table, self.error_tables, self.options, self.confidence,
             self.complete,
-        )
+        )  # fmt: skip
 
     @property
     def metrics(self) -> tuple[str, ...]:

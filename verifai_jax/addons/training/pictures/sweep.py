@@ -104,15 +104,9 @@ def _draw_safety(axes: Axes, sweep: Sweep) -> None:
             )
     front = shown.loc[shown.index.isin(sweep.pareto().index)].sort_values("nominal_return")
     axes.scatter(
-        front["nominal_return"],
-        front["failure_rate"],
-        facecolors="none",
-        edgecolors=style.BOUND,
-        s=110 if crowded else 130,
-        linewidths=1.1,
-        label=f"Pareto front ({len(front)})",
-        zorder=4,
-    )
+        front["nominal_return"], front["failure_rate"], facecolors="none", edgecolors=style.BOUND,
+        s=110 if crowded else 130, linewidths=1.1, label=f"Pareto front ({len(front)})", zorder=4,
+    )  # fmt: skip
     # Linear up to the least rate, so that none at all has a place; logarithmic from there on.
     axes.set_yscale("symlog", linthresh=lowest, linscale=0.6)
     axes.set_ylim(-0.25 * lowest, 1.6)
@@ -148,14 +142,9 @@ def _draw_intervals(axes: Axes, rows: "pd.DataFrame", colour: str, alpha: float)
 def _legend_below(axes: Axes, columns: int) -> None:
     """Put the legend below the panel, where it hides nothing."""
     axes.legend(
-        frameon=False,
-        fontsize=8,
-        loc="upper center",
-        bbox_to_anchor=(0.5, -0.16),
-        ncols=columns,
-        columnspacing=1.0,
-        handletextpad=0.4,
-    )
+        frameon=False, fontsize=8, loc="upper center", bbox_to_anchor=(0.5, -0.16), ncols=columns,
+        columnspacing=1.0, handletextpad=0.4,
+    )  # fmt: skip
 
 
 def _lowest_shown(table: "pd.DataFrame", wanted: float | None) -> float:
@@ -277,13 +266,9 @@ def _draw_shares(axes: Axes, importance: HyperparameterImportance) -> None:
         )
         alone = shown[f"{target}_first"].to_numpy(float)
         axes.vlines(
-            alone,
-            at - 0.45 * height,
-            at + 0.45 * height,
-            color=style.BOUND,
-            linewidth=1.6,
+            alone, at - 0.45 * height, at + 0.45 * height, color=style.BOUND, linewidth=1.6,
             label="without interactions" if k == len(targets) - 1 else "",
-        )
+        )  # fmt: skip
     axes.set_yticks(position, [style.wrap_name(str(name), 18) for name in shown.index])
     axes.invert_yaxis()
     axes.set_xlim(0, 1.02)

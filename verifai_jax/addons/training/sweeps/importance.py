@@ -254,12 +254,9 @@ def _forest(inputs: int, seed: int) -> "ExtraTreesRegressor":
     from sklearn.ensemble import ExtraTreesRegressor
 
     return ExtraTreesRegressor(
-        n_estimators=TREES,
-        min_samples_leaf=2,
-        max_leaf_nodes=48,
-        max_features=min(1.0, max(0.6, 3 / inputs)),
-        random_state=seed,
-    )
+        n_estimators=TREES, min_samples_leaf=2, max_leaf_nodes=48,
+        max_features=min(1.0, max(0.6, 3 / inputs)), random_state=seed,
+    )  # fmt: skip
 
 
 def _permutation_losses(

@@ -382,13 +382,9 @@ class Sweep(Drawn, Reported):
         **Raises:** `MissingExtra` without the package.
         """
         return export_to_optuna(
-            self.configurations,
-            self.hyperparameters,
-            self.space,
-            self.used,
-            name=self.name if name is None else name,
-            storage=storage,
-        )
+            self.configurations, self.hyperparameters, self.space, self.used,
+            name=self.name if name is None else name, storage=storage,
+        )  # fmt: skip
 
 
 def load_sweep(folder: str | Path, study: Study | str | None = None) -> Sweep:

@@ -247,11 +247,9 @@ class RunningSweep:
             seed = int(np.random.SeedSequence([self.options["seed"], 1]).generate_state(1)[0])
             policies = [self._policy(entry) for entry in finite]
             screening = replace(
-                self.certified,
-                samples=samples,
-                budget=samples * len(policies),
+                self.certified, samples=samples, budget=samples * len(policies),
                 attack_simulations=min(SCREENING, self.options["attack_simulations"]),
-            )
+            )  # fmt: skip
             certificates = self._certify_policies(policies, screening, seed, progress=None)
             # A half-finished screening would change the proposals of a resumed sweep.
             end_if_interrupted(certificates.stopped)
@@ -310,15 +308,9 @@ class RunningSweep:
             return self.cache.remember(f"certify/{name}", compute)
 
         return certify(
-            self.study.problem,
-            policies,
-            p=self.study.p,
-            certification=certification,
-            seed=seed,
-            remember=remember,
-            run_on=RunOn(executor=self.executor),
-            progress=progress,
-        )
+            self.study.problem, policies, p=self.study.p, certification=certification, seed=seed,
+            remember=remember, run_on=RunOn(executor=self.executor), progress=progress,
+        )  # fmt: skip
 
     # The record
 
