@@ -1,10 +1,12 @@
 """A process that falsifies many problems keeps nothing of those that are gone."""
 
+import ast
 import collections
 import gc
 import os
 import subprocess
 import sys
+from pathlib import Path
 
 import jax.numpy as jnp
 import pytest
@@ -94,3 +96,11 @@ def test_sixty_problems_need_little_more_memory_than_ten(tmp_path):
     )  # fmt: skip
     few, many = map(float, done.stdout.split())
     assert many - few < 40
+
+
+def test_no_function_of_a_module_keeps_all_its_static_arguments():
+    for file in Path(vj.__file__).parent.rglob("*.py"):
+        for node in ast.parse(file.read_text()).body:
+            decorators = getattr(node, "decorator_list", [])
+            for each in decorators:
+                assert "static_arg" not in ast.unparse(each), f"{file}:{each.lineno}: use jit_each"

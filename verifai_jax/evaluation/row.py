@@ -314,7 +314,7 @@ def streaming_monitor(problem: Problem) -> Monitor | None:
     if not system.can_fold or system.dt is None or problem.end != "hold":
         return None
     try:
-        monitors = [online(formula, system.dt) for formula in problem.formulas.values()]
+        monitors = [online(f, system.dt, gaps=False) for f in problem.formulas.values()]
         if sum(monitor.memory for monitor in monitors) > SMALL:
             return None
     except ValueError:

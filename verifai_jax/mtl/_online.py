@@ -9,13 +9,12 @@
 It steps through a `Plan` of `streams` in JAX; `watch` does the same on the host.
 
 Source: the interval is from J. Deshmukh et al., "Robust online monitoring of signal temporal
-logic", RV 2015; unknown predicates range from -inf to inf.
+logic", RV 2015; unknown predicates, of gaps and of samples to come, range from -inf to inf.
 
 The step, `advance`, reads whole windows, fast for batches; the step of `watch` updates them.
 """
 
 import functools
-import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -37,11 +36,15 @@ from verifai_jax.mtl.tree import missing_case
 
 
 class State(NamedTuple):
-    """A pytree: the number of samples so far, the last predicates, and the operators' memory."""
+    """A pytree: the number of samples so far, the last predicates, and the operators' memory.
+
+    The memory is there once, or three times: with unknown predicates as NaN, as the lowest value,
+    and as the greatest.
+    """
 
     count: Array
     last: tuple[Array, ...]
-    cells: tuple[Array, ...]
+    cells: tuple[tuple[Array, ...], ...]
 
 
 @dataclass(frozen=True)
@@ -51,6 +54,7 @@ class Online:
     formula: Formula
     dt: float
     kind: Kind = "hard"
+    gaps: bool = True
 
     @property
     def plan(self) -> Plan:
@@ -60,7 +64,7 @@ class Online:
     def init(self) -> State:
         """Return the state before any sample."""
         leaves = tuple(jnp.asarray(jnp.nan) for _ in self.plan.leaves)
-        return State(jnp.int32(0), leaves, first_cells(self.plan))
+        return State(jnp.int32(0), leaves, (first_cells(self.plan),) * len(self._unknown))
 
     def step(self, state: State, sample: Mapping[str, Any]) -> State:
         """Return the state after one more sample: numbers (or vectors `[k]`) by signal name.
@@ -74,8 +78,11 @@ class Online:
         return _step(self, state, own)
 
     def interval(self, state: State) -> tuple[Float[Array, ""], Float[Array, ""]]:
-        """Return the minimum and maximum robustness at time 0 that further samples allow."""
-        return _end_with(self, -math.inf, None, state), _end_with(self, math.inf, None, state)
+        """Return the minimum and maximum robustness at time 0 that samples to come may give.
+
+        So may samples that were unknown, with `gaps`; without, both are NaN after one that counts.
+        """
+        return _end_with(self, -1, None, state), _end_with(self, 1, None, state)
 
     def finish(self, state: State, count: int | None = None) -> Float[Array, ""]:
         """Return the robustness at time 0 if the trace ends here and is held, as computed offline.
@@ -86,7 +93,12 @@ class Online:
         - `count`: number of samples so far, if it is known while JAX traces; the program then skips
           windows that have passed.
         """
-        return _end_with(self, None, count, state)
+        return _end_with(self, 0, count, state)
+
+    @property
+    def _unknown(self) -> tuple[float, ...]:
+        """What unknown predicates are taken for in each memory; 0 if they stay unknown."""
+        return (0.0, -self.plan.top, self.plan.top) if self.gaps else (0.0,)
 
     @property
     def memory(self) -> int:
@@ -94,18 +106,21 @@ class Online:
         return sum(leaf.size for leaf in jax.tree.leaves(jax.eval_shape(self.init)))
 
 
-def online(formula: Formula | str, dt: float, semantics: Semantics = hard) -> Online:
+def online(
+    formula: Formula | str, dt: float, semantics: Semantics = hard, gaps: bool = True
+) -> Online:
     """Make an online monitor of `formula` for samples `dt` seconds apart.
 
     **Arguments:**
     - `semantics`: `hard`, or `boolean`: values are above zero if the formula holds and below if
       not, even if its robustness is exactly zero.
+    - `gaps`: whether `interval` is known after unknown samples (NaN), for three times the memory.
     **Raises:** `IntervalError` for an interval that is not a multiple of `dt`; `ValueError` for
     smooth semantics, and for an unbounded future operator inside another temporal operator, which
     would need unbounded memory.
     """
     formula = parse(formula) if isinstance(formula, str) else formula
-    monitor = Online(formula, dt, semantics.kind)
+    monitor = Online(formula, dt, semantics.kind, gaps)
     if counted := durations_in(formula):
         raise ValueError(f"{counted[0]} is counted by watch and export_c, and not by online")
     _plan(monitor)
@@ -126,17 +141,20 @@ def _step(monitor: Online, state: State, sample: dict[str, Any]) -> State:
     evaluator = Evaluator(signals, 1, monitor.dt, kind=monitor.kind, truths=truths)
     margins = [(evaluator.value(f, 0, 0)[0], sign) for f, sign in monitor.plan.leaves]
     last = tuple(jnp.asarray(m if sign > 0 else -m, dtype) for m, sign in margins)
-    _, cells = advance(monitor.plan, state.count, last, state.cells)
-    return State(state.count + 1, last, cells)
+    cells: list[tuple[Array, ...]] = []
+    for unknown, own in zip(monitor._unknown, state.cells, strict=True):
+        leaves = [jnp.where(jnp.isnan(x), unknown, x) for x in last] if unknown else last
+        cells.append(advance(monitor.plan, state.count, leaves, own)[1])
+    return State(state.count + 1, last, tuple(cells))
 
 
 @jit_each(3, inline=True)
-def _end_with(monitor: Online, unknown: float | None, count: int | None, state: State) -> Array:
-    """Compute the value at time 0 if all further margins are `unknown` (the last, if None)."""
+def _end_with(monitor: Online, side: int, count: int | None, state: State) -> Array:
+    """Compute the value at time 0 if further margins are the last ones, or a bound by `side`."""
     plan, leaves = monitor.plan, state.last
-    if unknown is not None:
-        unknown = max(-plan.top, min(plan.top, unknown))
-        leaves = tuple(jnp.full_like(leaf, unknown) for leaf in leaves)
+    if side:
+        leaves = tuple(jnp.full_like(leaf, side * plan.top) for leaf in leaves)
+    last = state.cells[{0: 0, -1: 1, 1: 2}[side] if monitor.gaps else 0]
     settling, ends = plan.outputs[0].wait - 1, plan.outputs[0].ends
     now = state.count if count is None else count
 
@@ -144,15 +162,15 @@ def _end_with(monitor: Online, unknown: float | None, count: int | None, state: 
         return advance(plan, now + i, leaves, cells)[1]
 
     def settled() -> tuple[Array, ...]:
-        return jax.lax.fori_loop(0, settling, more, state.cells)
+        return jax.lax.fori_loop(0, settling, more, last)
 
     if not (settling and ends):
         cells = settled()
     elif count is not None:
-        cells = state.cells if count > settling else settled()
+        cells = last if count > settling else settled()
     else:
         # Once every window is past nothing changes any more: all that came is enough.
-        cells = jax.lax.cond(state.count > settling, lambda: state.cells, settled)
+        cells = jax.lax.cond(state.count > settling, lambda: last, settled)
     (value,), _ = advance(plan, jnp.asarray(now + settling), leaves, cells)
     return value
 

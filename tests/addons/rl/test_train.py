@@ -142,6 +142,8 @@ def test_statistics_of_observations_merge():
         ({"environments": 0}, r"PPO's environments must be at least 1; got 0"),
         ({"minibatches": 3}, r"divisor of environments \* horizon = 1024; got 3"),
         ({"hidden": (4, 0)}, r"PPO's hidden must be positive widths; got \(4, 0\)"),
+        ({"hidden": "relu"}, "PPO's hidden must be positive widths; got relu"),
+        ({"hidden": 64, "horizon": "long"}, "PPO's horizon must be at least 1; got long"),
     ],
 )
 def test_hyper_parameters_that_cannot_train_are_refused(options, message):

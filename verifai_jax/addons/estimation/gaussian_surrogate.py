@@ -5,7 +5,6 @@ surrogate.learn(z, rho)
 mean, std = surrogate.predict(z)        # a failure is below zero
 """
 
-from functools import partial
 from typing import Any
 
 import jax
@@ -15,7 +14,7 @@ from jaxtyping import Array, Float
 from verifai_jax.addons.estimation.answers import Cheap
 from verifai_jax.addons.estimation.normal_space import to_unit_cube
 from verifai_jax.addons.searches.gaussian import GaussianProcess, Hyper, Posterior, TrainingData
-from verifai_jax.core.compute.compilation import power_of_two
+from verifai_jax.core.compute.compilation import jit_each, power_of_two
 
 REACH = 16.0
 """Width of the box of normal space that is the cube of the Gaussian process."""
@@ -96,18 +95,18 @@ def _boxed(z: Float[np.ndarray, "n d"]) -> Float[np.ndarray, "n d"]:
     return np.asarray(0.5 + z / REACH, np.float32)
 
 
-@partial(jax.jit, static_argnums=0)
+@jit_each()
 def _fitted(process: GaussianProcess, hyper: Hyper, data: TrainingData) -> tuple[Hyper, Posterior]:
     hyper = process.fit(hyper, data, STEPS)
     return hyper, process.condition(hyper, data)
 
 
-@partial(jax.jit, static_argnums=0)
+@jit_each()
 def _predicted(process: GaussianProcess, posterior: Posterior, x: Array) -> tuple[Array, Array]:
     return process.predict(posterior, x)
 
 
-@partial(jax.jit, static_argnums=0)
+@jit_each()
 def _covariance(process: GaussianProcess, posterior: Posterior, x: Array) -> Array:
     cross = process.cross(posterior, x)
     left = jax.scipy.linalg.solve_triangular(posterior.factor, cross.T, lower=True)

@@ -73,6 +73,20 @@ static inline void vj_fill(double *to, int32_t n, double number)
   for (int32_t i = 0; i < n; i++) { to[i] = number; }
 }
 
+/* Whether one of the margins is NaN. */
+static inline bool vj_unknown(const double *leaf, int32_t n)
+{
+  bool unknown = false;
+  for (int32_t i = 0; i < n; i++) { unknown = unknown || (leaf[i] != leaf[i]); }
+  return unknown;
+}
+
+/* The margins, with a bound for each that is NaN. */
+static inline void vj_bound(double *to, const double *leaf, int32_t n, double bound)
+{
+  for (int32_t i = 0; i < n; i++) { to[i] = (leaf[i] != leaf[i]) ? bound : leaf[i]; }
+}
+
 /* Seconds of the last n samples in which something held; NaN while one of them is unknown. */
 static inline double vj_count(
   double *ring, int32_t n, int32_t *at, double *held, double *unknown, double dt, double truth)
@@ -178,10 +192,18 @@ typedef struct {
   double leaf[@leaves];
   int64_t count;
 @fields
+} @name_stream;
+
+/* Unknown margins (NaN) are the lowest and the greatest in low and high, used from the first on. */
+typedef struct {
+  double out[@outputs];
+  bool gaps;
+  @name_stream now, low, high;
+@counted
 } @name;
 
 /* Before any sample. */
-static inline void @name_start(@name *m)
+static inline void @name_clear(@name_stream *m)
 {
   vj_fill(m->out, @outputs, (double)NAN);
   vj_fill(m->leaf, @leaves, (double)NAN);
@@ -189,8 +211,16 @@ static inline void @name_start(@name *m)
 @starts
 }
 
+static inline void @name_start(@name *m)
+{
+  vj_fill(m->out, @outputs, (double)NAN);
+  m->gaps = false;
+  @name_clear(&m->now);
+@counted_starts
+}
+
 /* One more instant, at which the margins are those of m->leaf. */
-static inline void @name_follow(@name *m)
+static inline void @name_follow(@name_stream *m)
 {
 @ops
   m->count++;
@@ -200,12 +230,24 @@ static inline void @name_follow(@name *m)
 static inline void @name_step(@name *m, const double x[@columns])
 {
 @margins
-  @name_follow(m);
+  if (!m->gaps && vj_unknown(m->now.leaf, @leaves)) {
+    m->gaps = true;
+    m->low = m->now;
+    m->high = m->now;
+  }
+  if (m->gaps) {
+    vj_bound(m->low.leaf, m->now.leaf, @leaves, @lowest);
+    vj_bound(m->high.leaf, m->now.leaf, @leaves, @top);
+    @name_follow(&m->low);
+    @name_follow(&m->high);
+  }
+  @name_follow(&m->now);
+  for (int32_t k = 0; k < @outputs; k++) { m->out[k] = m->now.out[k]; }
 }
 
 /* What the results will be if all margins are held (or, if not, of this value) from now on. */
 static inline void @name_end(
-  const @name *m, @name *scratch, bool held, double leaf, double out[@outputs])
+  const @name_stream *m, @name_stream *scratch, bool held, double leaf, double out[@outputs])
 {
   static const int32_t waits[@outputs] = { @waits };
   *scratch = *m;
@@ -218,18 +260,18 @@ static inline void @name_end(
   }
 }
 
-/* The lowest and the greatest robustness that further samples allow. */
+/* The lowest and the greatest robustness that further samples, and unknown ones, allow. */
 static inline void @name_interval(
   const @name *m, @name *scratch, double low[@outputs], double high[@outputs])
 {
-  @name_end(m, scratch, false, @lowest, low);
-  @name_end(m, scratch, false, @top, high);
+  @name_end(m->gaps ? &m->low : &m->now, &scratch->now, false, @lowest, low);
+  @name_end(m->gaps ? &m->high : &m->now, &scratch->now, false, @top, high);
 }
 
 /* The robustness if this was the last sample. */
 static inline void @name_finish(const @name *m, @name *scratch, double out[@outputs])
 {
-  @name_end(m, scratch, true, 0.0, out);
+  @name_end(&m->now, &scratch->now, true, 0.0, out);
 }
 """
 
@@ -287,11 +329,11 @@ def export_c(
 
 def monitor_code(plan: Plan, front: Margins, name: str) -> str:
     """Return the type of a monitor and its functions, without the functions they call."""
-    code = _Code(plan.top)
+    code, counted = _Code(plan.top), _Code(plan.top)
     inner, counts = [], []
     for k, (count, (own, columns)) in enumerate(zip(plan.counts, front.counts, strict=True)):
         inner.append(monitor_code(count.plan, own, f"{name}_counted{k}"))
-        counts += code.count(k, count, columns, f"{name}_counted{k}")
+        counts += counted.count(k, count, columns, f"{name}_counted{k}")
     values = [
         f"({_number(op.number)})" if op.kind == "number" else f"v{k}"
         for k, op in enumerate(plan.ops)
@@ -303,12 +345,14 @@ def monitor_code(plan: Plan, front: Margins, name: str) -> str:
     ]
     waits = [output.wait for output in plan.outputs]
     lines, texts = _margin_lines(front)
-    given = [f"m->leaf[{k}] = {texts[i]};" for k, i in enumerate(front.leaves)]
+    given = [f"m->now.leaf[{k}] = {texts[i]};" for k, i in enumerate(front.leaves)]
+    given = given or ["(void)x;", "m->now.leaf[0] = 0.0;"]
     parts = {
         "outputs": len(outputs), "leaves": max(1, len(front.leaves)),
         "columns": max(1, len(front.columns)), "fields": _lines(code.fields),
         "starts": _lines(code.starts), "ops": _lines([*ops, *outputs]),
-        "margins": _lines([*counts, *lines, *given] or ["(void)x;"]), "longest": max(waits),
+        "counted": _lines(counted.fields), "counted_starts": _lines(counted.starts),
+        "margins": _lines([*counts, *lines, *given]), "longest": max(waits),
         "waits": ", ".join(map(str, waits)), "lowest": _number(-plan.top), "top": _number(plan.top),
     }  # fmt: skip
     text = re.sub(r"@(name)", name, MONITOR)

@@ -8,6 +8,7 @@ Each operation has a list of numbers as its memory, and corresponds to the opera
 name in `c_monitor`.
 """
 
+import copy
 import math
 from collections import deque
 from collections.abc import Callable, Sequence
@@ -30,8 +31,11 @@ class PythonMachine:
     """
 
     def __init__(self, plan: Plan, front: Margins) -> None:
-        self.out = [math.nan] * len(plan.outputs)
-        self._outputs = plan.outputs
+        now = _Stream(plan)
+        self.out = now.out
+        self._top = plan.top
+        # By what unknown margins are taken for; the bounds are there from the first of them on.
+        self._streams: dict[float | None, _Stream] = {None: now}
         self._counts = [
             _counted(count, PythonMachine(count.plan, own), own_columns)
             for count, (own, own_columns) in zip(plan.counts, front.counts, strict=True)
@@ -46,8 +50,6 @@ class PythonMachine:
         ]
         self._margin_of_leaf = front.leaves
         self._leaves = [math.nan] * len(plan.leaves)
-        self._steps = [(_STEPS[op.kind], op, _first(op, plan.top)) for op in plan.ops]
-        self._now = 0
 
     def step(self, sample: Sequence[float]) -> None:
         """Process one sample."""
@@ -57,8 +59,12 @@ class PythonMachine:
         for function, inputs in self._margins:
             of = numbers[inputs[0]] if function is None else function(*[v[i] for i in inputs])
             v.append(of)
-        self._leaves = [v[i] for i in self._margin_of_leaf]
-        self._follow()
+        leaves = self._leaves = [v[i] for i in self._margin_of_leaf]
+        if len(self._streams) == 1 and any(x != x for x in leaves):
+            now = self._streams[None]
+            self._streams |= {bound: now.copy() for bound in (-self._top, self._top)}
+        for bound, stream in self._streams.items():
+            stream.follow(leaves if bound is None else [bound if x != x else x for x in leaves])
 
     def steps(self, rows: np.ndarray) -> np.ndarray:
         """Process samples `[time, columns]`, and return the results `[time, formulas]`."""
@@ -69,27 +75,42 @@ class PythonMachine:
         return out
 
     def ahead(self, steps: int, leaf: float | None) -> np.ndarray:
-        """Return the results `[steps, formulas]` of further steps without changing the state.
+        """Return the results `[1 + steps, formulas]` of now and of further steps.
 
         **Arguments:**
-        - `leaf`: the margin of all leaves from now on; None keeps their present margins.
+        - `leaf`: the margin of all leaves from now on, and of those that were unknown: the lowest
+          or the greatest; None keeps their present margins.
         """
-        before = self._now, list(self.out), self._leaves, self._steps
-        self._steps = [(step, op, list(memory)) for step, op, memory in self._steps]
-        if leaf is not None:
-            self._leaves = [leaf] * len(self._leaves)
-        out = np.empty((steps, len(self.out)))
-        for row in out:
-            self._follow()
-            row[:] = self.out
-        self._now, self.out[:], self._leaves, self._steps = before
+        stream = self._streams.get(leaf, self._streams[None]).copy()
+        leaves = self._leaves if leaf is None else [leaf] * len(self._leaves)
+        out = np.empty((1 + steps, len(self.out)))
+        out[0] = stream.out
+        for row in out[1:]:
+            stream.follow(leaves)
+            row[:] = stream.out
         return out
 
-    def _follow(self) -> None:
+
+class _Stream:
+    """The memory of the operations, and their results."""
+
+    def __init__(self, plan: Plan) -> None:
+        self.out = [math.nan] * len(plan.outputs)
+        self._outputs = plan.outputs
+        self._steps = [(_STEPS[op.kind], op, _first(op, plan.top)) for op in plan.ops]
+        self._now = 0
+
+    def copy(self) -> "_Stream":
+        new = copy.copy(self)
+        new.out = list(self.out)
+        new._steps = [(step, op, list(memory)) for step, op, memory in self._steps]
+        return new
+
+    def follow(self, leaves: Sequence[float]) -> None:
         v: list[float] = []
         for step, op, memory in self._steps:
             if op.kind == "leaf":
-                v.append(self._leaves[op.n])
+                v.append(leaves[op.n])
             else:
                 v.append(step(op, memory, self._now - op.n, *[v[i] for i in op.inputs]))
         now = self._now

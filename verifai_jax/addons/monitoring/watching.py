@@ -45,11 +45,12 @@ void steps(monitor *m, long n, const double *x, double *out) {
   }
 }
 void ahead(const monitor *m, monitor *scratch, long n, int held, double leaf, double *out) {
-  *scratch = *m;
-  if (!held) vj_fill(scratch->leaf, sizeof(m->leaf) / sizeof(double), leaf);
-  for (long i = 0; i < n; i++) {
-    monitor_follow(scratch);
-    for (int k = 0; k < @outputs; k++) out[i * @outputs + k] = scratch->out[k];
+  monitor_stream *s = &scratch->now;
+  *s = (held || !m->gaps) ? m->now : (leaf < 0.0) ? m->low : m->high;
+  if (!held) vj_fill(s->leaf, sizeof(s->leaf) / sizeof(double), leaf);
+  for (long i = 0; i <= n; i++) {
+    for (int k = 0; k < @outputs; k++) out[i * @outputs + k] = s->out[k];
+    monitor_follow(s);
   }
 }
 """
@@ -94,8 +95,8 @@ class CompiledMachine:
         return out
 
     def ahead(self, steps: int, leaf: float | None) -> np.ndarray:
-        """Return the results `[steps, formulas]` of further steps without changing the state."""
-        out = np.empty((steps, len(self.out)))
+        """Return the results of now and of further steps; see `PythonMachine.ahead`."""
+        out = np.empty((1 + steps, len(self.out)))
         value = ctypes.c_double(0.0 if leaf is None else leaf)
         to = ctypes.c_void_p(out.ctypes.data)
         count, held = ctypes.c_long(steps), ctypes.c_int(leaf is None)
@@ -166,9 +167,10 @@ class Watch(Generic[R]):
         return self._columns_of(out)
 
     def interval(self) -> tuple[R, R]:
-        """Return the minimum and maximum robustness that further samples allow.
+        """Return the minimum and maximum robustness that further samples, and gaps so far, allow.
 
-        It is the robustness at time 0, or with `every` at the latest sample.
+        It is the robustness at time 0, or with `every` at the latest sample. What is certain
+        despite gaps is known here: a maximum below zero is a violation whatever they hid.
         """
         low, high = (self._end_with(value) for value in (-self._top, self._top))
         return self._result(low), self._result(high)
@@ -186,15 +188,14 @@ class Watch(Generic[R]):
 
         Together with the results of `steps` they are the robustness at every sample.
         """
-        return self._columns_of(self._machine.ahead(max(self.delays), None))
+        return self._columns_of(self._machine.ahead(max(self.delays), None)[1:])
 
     def _columns_of(self, out: np.ndarray) -> np.ndarray:
         return out[:, 0] if isinstance(self._result(self._out), float) else out
 
     def _end_with(self, leaf: float | None) -> list[float]:
-        now = list(self._out)
         out = self._machine.ahead(max(self._waits), leaf)
-        return [float(out[wait - 1, k]) if wait else now[k] for k, wait in enumerate(self._waits)]
+        return [float(out[wait, k]) for k, wait in enumerate(self._waits)]
 
     def _numbers(self, sample: Mapping[str, Any]) -> list[float]:
         return [_number(name, sample, index) for name, index in self._columns]

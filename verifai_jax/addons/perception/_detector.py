@@ -202,21 +202,21 @@ def load_detector(path: str | Path) -> Detector:
         if about["format"] != FORMAT:
             raise DetectorFileError(f"{path} has the format {about['format']!r}, not {FORMAT!r}")
         centre, scale = map(jax.device_put, np.asarray(arrays["values"], np.float32))
-        return Detector(
-            _layers(arrays, "convolution"),
-            _layers(arrays, "dense"),
-            centre,
-            scale,
-            int(about["kinds"]),
-            (int(about["shape"][0]), int(about["shape"][1])),
-        )
+        kinds, (height, width) = int(about["kinds"]), map(int, about["shape"])
+        layers = _layers(arrays, "convolution"), _layers(arrays, "dense")
+        network = Detector(*layers, centre, scale, kinds, (height, width))
+        seen = jax.eval_shape(network, jax.ShapeDtypeStruct((height, width, 3), np.float32))
+        if (seen.kinds.shape, seen.values.shape) != ((kinds,), centre.shape):
+            raise ValueError("its last layer does not fit its kinds and values")
+        return network
     except FileNotFoundError:
         raise
-    except (OSError, ValueError, KeyError, TypeError, IndexError, AttributeError) as error:
+    except (OSError, ValueError, KeyError, TypeError, IndexError, AttributeError,
+            OverflowError) as error:  # fmt: skip
         if isinstance(error, DetectorFileError):
             raise
         raise DetectorFileError(
-            f"{path} is not a detector that save_detector wrote: {error}"
+            f"{path} is not a detector that save_detector wrote: {' '.join(str(error).split())}"
         ) from error
 
 

@@ -10,6 +10,7 @@ are its leaves, so one compiled program serves all their values. Hyper-parameter
 shape are static fields (`static_field`); each combination of them is compiled once.
 """
 
+import contextlib
 import dataclasses
 from collections.abc import Callable, Iterable
 from typing import Any, ClassVar, NamedTuple, Protocol, TypeAlias, TypeVar, runtime_checkable
@@ -101,7 +102,10 @@ def check_values(
     **Raises:** `ValueError`: "PPO's clip must be positive; got -1".
     """
     for name in names:
-        if not holds(value := getattr(algorithm, name)):
+        value, good = getattr(algorithm, name), False
+        with contextlib.suppress(TypeError, ValueError):  # A text where a number belongs.
+            good = holds(value)
+        if not good:
             raise ValueError(f"{type(algorithm).__name__}'s {name} must be {wanted}; got {value}")
 
 

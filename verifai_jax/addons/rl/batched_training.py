@@ -16,7 +16,7 @@ with it.
 import time
 from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import lru_cache
 from typing import NamedTuple, TypeAlias
 
 import jax
@@ -26,7 +26,7 @@ from jaxtyping import Array, ArrayLike, Float, Int, Integer, PyTree
 
 from verifai_jax.addons.rl.algorithm import Algorithm, AlgorithmState, check_fit
 from verifai_jax.addons.rl.task.task import Task
-from verifai_jax.core.compute.compilation import jit_each, power_of_two
+from verifai_jax.core.compute.compilation import KEPT, jit_each, power_of_two
 from verifai_jax.core.compute.devices import (
     Device,
     enable_compile_cache,
@@ -170,7 +170,7 @@ class BatchedTraining:
         """Return the present policy of a run, on the host, without exploration."""
         configuration, lane = self.configurations[number], self._lanes[number]
         task, index = StaticTask(configuration.task), np.int32(lane.index)
-        return jax.device_get(_policy(configuration.algorithm, task, lane.batch.states, index))
+        return jax.device_get(_policy(task, configuration.algorithm, lane.batch.states, index))
 
     def curve(
         self, number: int
@@ -212,9 +212,8 @@ class BatchedTraining:
             seeds = np.array([self.configurations[n].seed for n in filled], np.uint32)
             updates = np.array([self.configurations[n].updates for n in filled], np.int32)
             states, curves = _start(*arguments, seeds, updates)
-        compiled = _advance_updates.lower(
-            *arguments, states, curves, np.int32(0), np.int32(0)
-        ).compile()
+        program = _advance_updates(*arguments[:3])
+        compiled = program.lower(*arguments[3:], states, curves, np.int32(0), np.int32(0)).compile()
         seconds = 0.0
         while done < until:
             # Short at first, until it is known how long an update takes.
@@ -359,12 +358,12 @@ def _start(
     return _over_lanes(layout, one, shared=0)(tasks, algorithms, seeds, updates)
 
 
-@partial(jax.jit, static_argnums=(0, 1, 2))
+@lru_cache(KEPT)
 def _advance_updates(
-    layout: _Layout, static_task: StaticTask, structure: PyTreeDef, tasks: list[Array],
-    algorithms: list[Array], states: AlgorithmState, curves: Float[Array, "lanes capacity"],
-    done: Int[Array, ""], until: Int[Array, ""],
-) -> tuple[AlgorithmState, Float[Array, "lanes capacity"]]:  # fmt: skip
+    layout: _Layout, static_task: StaticTask, structure: PyTreeDef
+) -> jax.stages.Wrapped:
+    """Return the program of further updates: of `jit_each`, to be compiled before it is timed."""
+
     def one(
         task_numbers: list[Array], numbers: list[Array], state: AlgorithmState,
         curve: Float[Array, " capacity"], done: Int[Array, ""], until: Int[Array, ""],
@@ -381,8 +380,7 @@ def _advance_updates(
 
         return jax.lax.fori_loop(done, until, update, (state, curve))
 
-    spread = _over_lanes(layout, one, shared=2)
-    return spread(tasks, algorithms, states, curves, done, until)
+    return jax.jit(_over_lanes(layout, one, shared=2))
 
 
 @jax.jit
@@ -395,9 +393,9 @@ def _select_lanes(
     return jax.tree.map(lambda *leaves: jnp.stack(leaves), *lanes)
 
 
-@partial(jax.jit, static_argnums=1)
+@jit_each()
 def _policy(
-    algorithm: Algorithm, static_task: StaticTask, states: AlgorithmState, index: Int[Array, ""]
+    static_task: StaticTask, algorithm: Algorithm, states: AlgorithmState, index: Int[Array, ""]
 ) -> Policy:
     # A policy is made of the state alone, so any numbers of the task will do.
     numbers = [0.0] * static_task.structure.num_leaves

@@ -8,7 +8,7 @@ import difflib
 import functools
 import importlib
 import inspect
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from numbers import Number
 from typing import Any, ParamSpec, TypeVar, cast
 
@@ -53,17 +53,37 @@ def check_names(kind: str, names: Iterable[str], known: Iterable[str]) -> None:
 def suggests_options(function: Callable[P, R]) -> Callable[P, R]:
     """Make a misspelt keyword of `function` raise `UnknownNameError` with the nearest keywords.
 
-    NumPy numbers are converted to Python's, since arithmetic, JSON and JAX treat them differently.
+    Arguments in another order raise `TypeError` with the right order. NumPy numbers are converted
+    to Python's, since arithmetic, JSON and JAX treat them differently.
     """
-    known = list(inspect.signature(function).parameters)
+    known = inspect.signature(function).parameters
 
     @functools.wraps(function)
     def checked(*arguments: P.args, **options: P.kwargs) -> R:
         check_names(f"option of {function.__name__}", options, known)
+        _check_order(function.__name__, list(known.values()), arguments)
         plain = {name: _plain_number(value) for name, value in options.items()}
         return cast(Callable[..., R], function)(*map(_plain_number, arguments), **plain)
 
     return checked
+
+
+def _check_order(
+    name: str, parameters: Sequence[inspect.Parameter], arguments: Sequence[object]
+) -> None:
+    """Refuse an object of our own in the place of another argument, while its own has none."""
+    wanted = [str(getattr(p.annotation, "__name__", p.annotation)) for p in parameters]
+    given = [
+        {c.__name__ for c in type(value).__mro__ if c.__module__.startswith("verifai_jax.")}
+        for value in arguments
+    ]
+    for kind, kinds in zip(wanted, given, strict=False):
+        if kind not in kinds and any(
+            kind in others and other != kind for other, others in zip(wanted, given, strict=False)
+        ):
+            order = ", ".join(p.name for p in parameters if p.kind is p.POSITIONAL_OR_KEYWORD)
+            got = ", ".join(type(value).__name__ for value in arguments)
+            raise TypeError(f"{name} takes its arguments as {name}({order}); got ({got})")
 
 
 def _plain_number(value: object) -> object:

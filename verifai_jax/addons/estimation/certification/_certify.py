@@ -104,7 +104,8 @@ def certify(
     if not callable(problem_of) or isinstance(problem_of, Problem) or callable(policies):
         raise ValueError(
             "certify is called with a function from a policy to its problem, and a list of "
-            f"policies; got {type(problem_of).__name__} and {type(policies).__name__}"
+            "policies, certify(lambda policy: Problem(...), policies); got "
+            f"{type(problem_of).__name__} and {type(policies).__name__}"
         )
     policies = list(policies)
     certified = options_of("certify", Certification, certification)

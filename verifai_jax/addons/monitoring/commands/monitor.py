@@ -216,7 +216,8 @@ def monitor_stream(
     - `show`: a function that prints a line.
     - `hold`: whether a gap keeps the last value of its signal.
     **Returns:** whether the formula holds; if the samples have ended, with the last one held.
-    **Raises:** `ValueError` for lines that are not evenly spaced samples; `CommandError` for a NaN.
+    **Raises:** `ValueError` for lines that are not evenly spaced samples; `CommandError` if a NaN
+    leaves the verdict open.
     """
     vectors: dict[str, int] = {}
     samples = _samples(lines, formula, None if dt is not None else time, vectors, time_unit)
@@ -227,7 +228,7 @@ def monitor_stream(
         vj.mtl.watch(formula, period, semantics=semantics, sizes=vectors)
         for semantics in (vj.mtl.hard, vj.mtl.boolean)
     )
-    count, begin, last = 0, None, dict[str, Any]()
+    count, begin, last, gap = 0, None, dict[str, Any](), ""
     for count, sample in enumerate(samples, 1):
         begin = sample.time if begin is None else begin
         due = (count - 1) * period + (begin or 0.0)
@@ -242,7 +243,7 @@ def monitor_stream(
         if hold:
             last = {name: _held(last.get(name), value) for name, value in sample.signals.items()}
             sample = sample._replace(signals=last)
-        _refuse_nan(sample, now)
+        gap = gap or _gap(sample, now)
         robustness.step(sample.signals)
         truth.step(sample.signals)
         lowest, highest = truth.interval()
@@ -254,6 +255,8 @@ def monitor_stream(
             show(f"whatever follows {format_time(now, 10)} s, it {verdict}")
             return lowest > 0
     rho, holds = robustness.finish(), truth.finish() > 0
+    if math.isnan(rho) and gap:
+        raise CommandError(gap, BROKEN)
     show(
         f"undecided at the end: with the last of {count} sample{'s' * (count != 1)} held, it "
         f"{'holds' if holds else 'fails'} with robustness {rho:z.10g}"
@@ -386,9 +389,10 @@ def _held(last: Any, value: Any) -> Any:
     return last if math.isnan(value) and last is not None else value
 
 
-def _refuse_nan(sample: Sample, now: float) -> None:
+def _gap(sample: Sample, now: float) -> str:
+    """Return why a NaN leaves the verdict open, or nothing."""
     for name, value in sample.signals.items():
         values = value if isinstance(value, list) else [value]
         if any(math.isnan(v) for v in values):
-            message = f"no verdict: signal {name!r} is NaN at {format_time(now)} s"
-            raise CommandError(message, BROKEN)
+            return f"no verdict: signal {name!r} is NaN at {format_time(now)} s"
+    return ""

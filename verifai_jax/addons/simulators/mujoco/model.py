@@ -87,8 +87,7 @@ def load(
             )
         spec, compiled = None, copy.copy(source)
     else:
-        spec = _spec(mujoco, source)
-        plain = spec.compile()
+        spec, plain = _spec(mujoco, source)
         for k, path in enumerate(contacts):
             _add_contact_sensor(mujoco, spec, plain, path, f"__contact{k}")
         compiled = spec.compile() if contacts else plain
@@ -191,24 +190,30 @@ def mjx_module() -> Any:
         return require("mujoco.mjx", extra="mujoco")
 
 
-def _spec(mujoco: ModuleType, source: ModelSource) -> Any:
-    if isinstance(source, mujoco.MjSpec):
-        return source.copy()
-    if not isinstance(source, str | Path):
+def _spec(mujoco: ModuleType, source: ModelSource) -> tuple[Any, Any]:
+    """Return a specification of its own, and the model that it is compiled to."""
+    spec: Any = source
+    given = isinstance(source, mujoco.MjSpec)
+    if not given and not isinstance(source, str | Path):
         raise ValueError(
             "a MuJoCo model is the path of an MJCF file, its text, an MjSpec or an MjModel; "
             f"got {type(source).__name__}"
         )
     try:
-        if "<" in str(source):
-            return mujoco.MjSpec.from_string(str(source))
-        if not Path(source).exists():
-            raise FileNotFoundError(f"there is no MJCF file {str(source)!r}")
-        open_file(source).close()
-        return mujoco.MjSpec.from_file(str(source))
+        if given:
+            spec = spec.copy()
+        elif "<" in str(source):
+            spec = mujoco.MjSpec.from_string(str(source))
+        else:
+            if not Path(source).exists():
+                raise FileNotFoundError(f"there is no MJCF file {str(source)!r}")
+            open_file(source).close()
+            spec = mujoco.MjSpec.from_file(str(source))
+        return spec, spec.compile()
     except ValueError as error:
-        where = "MJCF text" if "<" in str(source) else str(source)
-        raise ValueError(f"{where} is not a MuJoCo model: {error}") from error
+        where = "the MjSpec" if given else "MJCF text" if "<" in str(source) else str(source)
+        words = " ".join(str(error).split())
+        raise ValueError(f"{where} is not a MuJoCo model: {words}") from error
 
 
 def _add_contact_sensor(
