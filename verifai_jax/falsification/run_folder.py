@@ -67,10 +67,7 @@ DECIDING = (
 
 
 def save_run(run: Run, folder: Path) -> Path:
-    """Write a run to a folder; return the folder.
-
-    **Raises:** as `Run.save`.
-    """
+    """Write a run to a folder; return the folder."""
     with write_lock(folder):
         check_not_continued(run, folder)
         if _is_own(run, folder):

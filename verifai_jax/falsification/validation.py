@@ -255,10 +255,7 @@ def check_rule(search: Search, rule: "StoppingRule | None") -> None:
 
 
 def points_of(problem: Problem, rows: Rows, precision: str) -> Float[np.ndarray, "n row"]:
-    """Return given features as rows that an engine simulates with exactly these numbers.
-
-    **Raises:** the errors of `given_features`.
-    """
+    """Return given features as rows that an engine simulates with exactly these numbers."""
     return given_rows(problem.space, given_features(problem.space, rows, precision))
 
 

@@ -33,10 +33,7 @@ SECONDS: Slot[None, float] = Slot("seconds of tracing")
 
 
 def silent_mistakes(problem: Problem) -> tuple[str, ...]:
-    """Return a sentence for each likely mistake in a problem that raises no error; cached.
-
-    **Raises:** the errors of tracing the system.
-    """
+    """Return a sentence for each likely mistake in a problem that raises no error; cached."""
 
     def found() -> tuple[str, ...]:
         return (*formula_notes(problem), *mistakes_of_the_system(problem))

@@ -7,6 +7,8 @@ from typing import Any
 
 import numpy as np
 
+from verifai_jax.core.messages.text import one_line
+
 GAPS = (
     "", "-", "--", "#N/A", "#N/A N/A", "#NA", "-1.#IND", "-1.#QNAN", "-NaN", "-nan", "1.#IND",
     "1.#QNAN", "N/A", "NA", "NULL", "NaN", "n/a", "nan", "null", "None", "none", "n.a.",
@@ -108,13 +110,8 @@ def _vectors(source: str, name: str, column: Any) -> np.ndarray:
         if not isinstance(entry, bool | int | float | None):
             raise ValueError(
                 f"column {name!r} of {source} holds lists that are not vectors of numbers; in "
-                f"row {row} there is {_brief(entry)}"
+                f"row {row} there is {one_line(repr(entry), 40)}"
             )
     entries = [entry for cell in rows for entry in cell if entry is not None]
     truths = bool(entries) and all(isinstance(entry, bool) for entry in entries)
     return np.array(rows, object if truths else float).reshape(len(rows), width)
-
-
-def _brief(value: object) -> str:
-    text = repr(value)
-    return text if len(text) <= 40 else f"{text[:37]}..."

@@ -18,6 +18,7 @@ from typing import Any
 
 import numpy as np
 
+from verifai_jax.core.messages.text import one_line
 from verifai_jax.core.store.atomic_files import reason
 from verifai_jax.core.store.files import DamagedError
 from verifai_jax.core.store.locks import write_lock
@@ -209,5 +210,4 @@ def _differences(one: object, other: object, path: str = "") -> Iterable[str]:
 
 
 def _abbreviate(value: object) -> str:
-    text = json.dumps(value) if not isinstance(value, str) else value
-    return text if len(text) <= 120 else f"{text[:117]}..."
+    return one_line(value if isinstance(value, str) else json.dumps(value), 120)

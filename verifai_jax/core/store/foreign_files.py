@@ -91,10 +91,7 @@ def open_file(
 
 
 def read_bytes(path: str | Path, max_bytes: int = MAX_BYTES, within: Path | None = None) -> bytes:
-    """Read a regular file.
-
-    **Raises:** as `open_file`.
-    """
+    """Read a regular file."""
     with open_file(path, max_bytes, within) as file:
         return file.read(os.fstat(file.fileno()).st_size)
 

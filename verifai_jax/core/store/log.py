@@ -153,10 +153,7 @@ class Log:
 
 
 def write_log(path: Path, entries: Mapping[str, Arrays]) -> None:
-    """Replace the log at `path` by one with these entries, atomically.
-
-    **Raises:** the errors of `Log.put`.
-    """
+    """Replace the log at `path` by one with these entries, atomically."""
     write_complete(path, _encode(entries) if entries else b"")
 
 

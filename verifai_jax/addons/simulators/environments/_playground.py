@@ -157,10 +157,7 @@ def playground(
 
 
 def loaded(env: Env, options: Mapping[str, object] | None = None) -> tuple[Any, str]:
-    """Return an environment, given by name or as an object, and its name.
-
-    **Raises:** the errors of `playground`.
-    """
+    """Return an environment, given by name or as an object, and its name."""
     package = import_quietly("mujoco_playground", "playground")
     check_version("playground", OLDEST)
     if not isinstance(env, str):

@@ -12,6 +12,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from verifai_jax.core.messages.text import one_line
+
 Space = Any
 """A `gymnasium.Space`; its types cannot be imported here."""
 
@@ -35,8 +37,7 @@ def kind_of(space: Space) -> str:
 
 def describe(space: Space) -> str:
     """Describe a space in one line."""
-    text = " ".join(repr(space).split())
-    return text if len(text) <= 120 else f"{text[:100]}...{text[-17:]}"
+    return one_line(repr(space), 160)
 
 
 def check_space(space: Space, name: str, delayed: bool) -> None:
@@ -212,17 +213,10 @@ def _sequence(space: Space, value: object) -> list[Any]:
 
 
 def _misfit(space: Space, value: object, shape: tuple[int, ...] | None = None) -> Misfit:
-    if shape is not None:
-        return Misfit(
-            f"got {_brief(value)} of shape {list(shape)}, where {describe(space)} needs "
-            f"{list(space.shape)}"
-        )
-    return Misfit(f"got {_brief(value)}, which {describe(space)} does not have")
-
-
-def _brief(value: object) -> str:
-    text = " ".join(repr(value).split())
-    return text if len(text) <= 80 else f"{text[:77]}..."
+    got, known = f"got {one_line(repr(value), 80)}", describe(space)
+    if shape is None:
+        return Misfit(f"{got}, which {known} does not have")
+    return Misfit(f"{got} of shape {list(shape)}, where {known} needs {list(space.shape)}")
 
 
 def named_numbers(name: str, value: object) -> dict[str, np.ndarray]:

@@ -173,10 +173,7 @@ def _locate_input(
 
 
 def reading(model: MjModel, path: str) -> Location:
-    """Return the location in the state of a signal's path.
-
-    **Raises:** the errors of `locate`.
-    """
+    """Return the location in the state of a signal's path."""
     kind, name, field, index = _split(path, (*_READINGS, "sensor", "contact"))
     if kind == "sensor":
         whole = path.removeprefix("sensor/")
