@@ -170,15 +170,10 @@ class Evaluator:
         self.engine.compile()
 
     def __call__(
-        self,
-        u: Float[Any, "n d"],
-        temperature: Float[np.ndarray, " n"] | float = 1.0,
-        first: int | None = None,
-        *,
-        padded_to: int = 1,
-        keep_traces: bool | None = None,
+        self, u: Float[Any, "n d"], temperature: Float[np.ndarray, " n"] | float = 1.0,
+        first: int | None = None, *, padded_to: int = 1, keep_traces: bool | None = None,
         journals: bool = True,
-    ) -> Verdicts:
+    ) -> Verdicts:  # fmt: skip
         """Simulate and evaluate these points.
 
         **Arguments:**

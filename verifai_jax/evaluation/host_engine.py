@@ -60,17 +60,10 @@ class HostEngine:
     """
 
     def __init__(
-        self,
-        problem: Problem,
-        precision: str = "float32",
-        journal: Journal | None = None,
-        *,
-        system: System | None = None,
-        monitor: HostMonitor | None = None,
-        guidance: Guidance = NOTHING,
-        keep_traces: bool = False,
-        given: bool = False,
-    ) -> None:
+        self, problem: Problem, precision: str = "float32", journal: Journal | None = None, *,
+        system: System | None = None, monitor: HostMonitor | None = None,
+        guidance: Guidance = NOTHING, keep_traces: bool = False, given: bool = False,
+    ) -> None:  # fmt: skip
         self.given = given
         self.problem, self.precision, self.journal = problem, precision, journal
         self.keep_traces = keep_traces

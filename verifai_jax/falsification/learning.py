@@ -165,12 +165,10 @@ class Learning:
         self.proposals.warm_start(points, rho, None if outcomes is None else outcomes[proper])
 
     def _tell(
-        self,
-        objective: Float[np.ndarray, " n"],
-        verdicts: Verdicts,
+        self, objective: Float[np.ndarray, " n"], verdicts: Verdicts,
         coverage_ids: Int[np.ndarray, "n ids"] | None,
         outcomes: Float[np.ndarray, "n outcome"] | None,
-    ) -> None:
+    ) -> None:  # fmt: skip
         """Pass the results of its points to the search, always in float32."""
 
         def single(values: np.ndarray | None) -> np.ndarray | None:

@@ -56,15 +56,10 @@ class Proposals:
     """
 
     def __init__(
-        self,
-        search: Search,
-        cube: Cube,
-        batch: int,
-        key: Key[Array, ""],
-        accepts: Callable[[Any], Bool[Array, " n"]] | None = None,
-        coverage_ids: int = 0,
+        self, search: Search, cube: Cube, batch: int, key: Key[Array, ""],
+        accepts: Callable[[Any], Bool[Array, " n"]] | None = None, coverage_ids: int = 0,
         improve: Callable[[Any], Float[Any, "batch d"]] | None = None,
-    ) -> None:
+    ) -> None:  # fmt: skip
         self.search, self.batch, self.cube = search, batch, cube
         self.total = search.total(self.cube)
         self.proposed = self.accepted = 0

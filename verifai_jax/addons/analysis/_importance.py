@@ -182,15 +182,10 @@ def _split(
 
 
 def _losses(
-    matrix: Float[np.ndarray, "n e"],
-    values: np.ndarray,
-    groups: Sequence[Sequence[int]],
-    train: Int[np.ndarray, " train"],
-    test: Int[np.ndarray, " test"],
-    generator: np.random.Generator,
-    repeats: int,
-    seed: int,
-) -> tuple[float, Float[np.ndarray, "features repeats"]]:
+    matrix: Float[np.ndarray, "n e"], values: np.ndarray, groups: Sequence[Sequence[int]],
+    train: Int[np.ndarray, " train"], test: Int[np.ndarray, " test"],
+    generator: np.random.Generator, repeats: int, seed: int,
+) -> tuple[float, Float[np.ndarray, "features repeats"]]:  # fmt: skip
     """Return the score of a model on the test rows, and its losses by shuffling each feature."""
     from sklearn.ensemble import ExtraTreesClassifier, ExtraTreesRegressor
     from sklearn.metrics import r2_score, roc_auc_score

@@ -311,15 +311,10 @@ def _thinned(
 
 
 def _select_regions(
-    values: Float[np.ndarray, "n k"],
-    codes: Int[np.ndarray, "n m"],
-    failing: Bool[np.ndarray, " n"],
-    weights: Float[np.ndarray, " n"],
-    unordered: tuple[Column, ...],
-    depth: int,
-    cover: float,
-    max_rules: int,
-) -> list[Region]:
+    values: Float[np.ndarray, "n k"], codes: Int[np.ndarray, "n m"],
+    failing: Bool[np.ndarray, " n"], weights: Float[np.ndarray, " n"],
+    unordered: tuple[Column, ...], depth: int, cover: float, max_rules: int,
+) -> list[Region]:  # fmt: skip
     """Select regions that together cover the failures, each from what those before left over."""
     bad = failing * weights
     base = bad.sum() / weights.sum()

@@ -251,14 +251,10 @@ CLOSER = ((0.2, 0.02), (0.04, 0.004))
 
 
 def _minima(
-    key: Key[Array, ""],
-    posterior: Posterior,
-    risk: Callable[[Float[Array, "m d"]], Float[Array, " m"]],
-    cube: Cube,
-    shared: Float[Array, "m d"],
-    random: Float[Array, "2 parents children r"],
-    count: int,
-) -> Float[Array, "parents d"]:
+    key: Key[Array, ""], posterior: Posterior,
+    risk: Callable[[Float[Array, "m d"]], Float[Array, " m"]], cube: Cube,
+    shared: Float[Array, "m d"], random: Float[Array, "2 parents children r"], count: int,
+) -> Float[Array, "parents d"]:  # fmt: skip
     """Return minima of `count` functions drawn from the posterior, several of each."""
     process = process_of(cube)
     paths = process.paths(posterior, key, count, WAVES)

@@ -101,15 +101,10 @@ class Coverage(Search[CoverageState]):
         return jnp.where(explores[:, None], fresh, changed), state._replace(round=state.round + 1)
 
     def _mutated(
-        self,
-        cube: Cube,
-        parent: Float[Array, "n d"],
-        other: Float[Array, "n d"],
-        coins: Float[Array, "n coins"],
-        fresh: Float[Array, "n d"],
-        masks: Float[Array, "n d"],
+        self, cube: Cube, parent: Float[Array, "n d"], other: Float[Array, "n d"],
+        coins: Float[Array, "n coins"], fresh: Float[Array, "n d"], masks: Float[Array, "n d"],
         noise: Float[Array, "n d"],
-    ) -> Float[Array, "n d"]:
+    ) -> Float[Array, "n d"]:  # fmt: skip
         d = max(cube.dim, 1)
         index = np.arange(cube.dim)
         begin = jnp.floor(coins[:, 0] * d)[:, None]

@@ -80,16 +80,10 @@ class Blocks:
     """
 
     def __init__(
-        self,
-        problem_of: Callable[[Any], Problem],
-        policies: Sequence[Any],
-        *,
-        seed: int,
-        lanes: int,
-        remember: Remember | None = None,
-        devices: Sequence[Any] | None = None,
+        self, problem_of: Callable[[Any], Problem], policies: Sequence[Any], *, seed: int,
+        lanes: int, remember: Remember | None = None, devices: Sequence[Any] | None = None,
         executor: Executor | None = None,
-    ) -> None:
+    ) -> None:  # fmt: skip
         self.lanes = lanes
         self._notes: list[str] = []
         self.simulated = 0
