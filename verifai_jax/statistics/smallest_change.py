@@ -43,11 +43,11 @@ def _nonnegative(
     """
     x = np.zeros(matrix.shape[1])
     positive, refused = x > 0, x > 0
-    least = 1e-13 * np.linalg.norm(matrix) * np.linalg.norm(right)
+    rounding = 1e-13 * np.linalg.norm(matrix) * np.linalg.norm(right)
     for _ in range(3 * len(x)):
         slope = np.where(positive | refused, 0.0, matrix.T @ (right - matrix @ x))
         entering = int(np.argmax(slope))
-        if slope[entering] <= least:
+        if slope[entering] <= rounding:
             return x
         positive[entering] = True
         while True:
