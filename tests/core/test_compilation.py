@@ -17,7 +17,7 @@ from verifai_jax.core.compute.compilation import (
     tracing,
     while_compiling,
 )
-from verifai_jax.core.compute.keys import run_keys
+from verifai_jax.core.compute.keys import run_keys, simulation_key
 
 
 class Slow:
@@ -158,3 +158,8 @@ def test_the_keys_of_a_seed_are_those_of_jax(seed):
         expected = jax.random.split(jax.random.key(seed, impl="threefry2x32"))
     found = [np.asarray(jax.random.key_data(key)) for key in run_keys(seed)]
     np.testing.assert_array_equal(found, np.asarray(jax.random.key_data(expected)))
+    key = run_keys(seed)[1]
+    for row in (0, 1, 77_777, 2**32 - 1):
+        one, other = simulation_key(key, row), jax.random.fold_in(key, row)
+        assert one.dtype == other.dtype
+        np.testing.assert_array_equal(jax.random.key_data(one), jax.random.key_data(other))

@@ -412,8 +412,9 @@ def _verified(
 
 def _changed(nominal: Nominal, u: Float[np.ndarray, " d"]) -> dict[str, tuple[Any, Any]]:
     """Return the coordinates that depart: the nominal value of each and that at `u`."""
-    pair = nominal.space.features_at(np.stack([nominal.u, u]))
-    columns = nominal.space.rows(pair)
+    # One at a time, for which there is a program already.
+    pair = [nominal.space.rows(nominal.space.features_at(v[None])) for v in (nominal.u, u)]
+    columns = {name: (pair[0][name][0], pair[1][name][0]) for name in pair[0]}
     names = list(columns) if len(columns) == len(u) else []
     changed = {}
     for i in np.flatnonzero(nominal.departs(u[None])[0]):

@@ -163,15 +163,16 @@ def replay(
     key = simulation_key(key, 0 if number is None else number)
     with in_precision(precision):
         features = problem.space.from_row(row)
+        # Kept with the problem: as a static argument it would never be freed.
+        judge = problem.programs.get(JUDGES, "", lambda: jax.jit(partial(_judged, problem)))
         if problem.black_box:
             trace = problem.system(features, key)
             read = lazy_import("verifai_jax.evaluation.host_engine", "on_host_clock")(trace)
+            _, rho, status = judge(read)
         else:
             precise = jax.tree.map(lambda leaf: _cast(leaf, precision), features)
-            trace = read = jax.jit(problem.system)(precise, key)
-        # Kept with the problem: as a static argument it would never be freed.
-        judge = problem.programs.get(JUDGES, "", lambda: jax.jit(partial(trace_verdict, problem)))
-        rho, status = judge(read)
+            trace, rho, status = judge(precise, key)
+            read = trace
         return Replay(
             problem=problem,
             row=number,
@@ -186,6 +187,12 @@ def replay(
 
 
 JUDGES: Slot[str, Any] = Slot("verdicts of replays")
+
+
+def _judged(problem: Problem, given: Any, key: Key[Array, ""] | None = None) -> tuple[Any, ...]:
+    """Return a trace, simulated from features if there is a key, with its verdict."""
+    trace = given if key is None else problem.system(given, key)
+    return trace, *trace_verdict(problem, trace)
 
 
 def _cast(leaf: ArrayLike, precision: str) -> Array:

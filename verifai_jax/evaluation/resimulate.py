@@ -30,6 +30,7 @@ from verifai_jax.core.messages.text import format_error
 from verifai_jax.core.values.trace import Status
 from verifai_jax.evaluation.engine import Engine
 from verifai_jax.evaluation.row import TableRows
+from verifai_jax.evaluation.row_program import RowProgram
 from verifai_jax.evaluation.verdicts import Verdicts
 from verifai_jax.problem.problem import Problem
 from verifai_jax.systems.base import System
@@ -171,7 +172,7 @@ class Replays:
         def make() -> Engine:
             finer = None if traced else self.refiner(factor)
             refine = self.problem.system.refined if finer is None else lambda _: finer
-            return Engine(
+            engine = Engine(
                 self.problem,
                 together,
                 precision=self.precision,
@@ -181,12 +182,17 @@ class Replays:
                 # It compiles in a third of the time and runs half again as long.
                 effort="least" if together == 1 else "little",
             )
+            # Traced once, however many rows are together.
+            engine.program = self.problem.programs.get(ROWS, mode[:2], lambda: engine.program)
+            return engine
 
         return self.problem.programs.get(REPLAYS, mode, make)
 
 
 REPLAYS: Slot[tuple[str, int, int], Engine] = Slot("replays")
 """Engines by (precision, factor or 0 where it is traced, rows together)."""
+ROWS: Slot[tuple[str, int], RowProgram] = Slot("rows of replays")
+"""Programs of one row by the first two of these."""
 
 
 class HostReplays:

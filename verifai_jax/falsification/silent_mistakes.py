@@ -11,10 +11,9 @@ import math
 from collections.abc import Mapping
 from typing import cast
 
-import jax
 import numpy as np
 
-from verifai_jax.core.compute.compilation import Slot, compile_soon
+from verifai_jax.core.compute.compilation import Slot
 from verifai_jax.evaluation.engine import Engine
 from verifai_jax.evaluation.evaluator import Evaluator
 from verifai_jax.falsification.table import ErrorTable
@@ -86,11 +85,8 @@ def _nominal_note(problem: Problem, evaluate: Evaluator) -> tuple[str, ...]:
     space = problem.space
     nominal = space.completed(problem.nominal or {})
     varied = {name: nominal[name] for name, domain in space.root.fields if domain.size}
-    # One program for it, where each step on its own would compile another.
-    flatten = compile_soon(
-        "the nominal point", jax.jit(lambda: space.flatten(varied)).lower(), "least"
-    )
-    u = np.asarray(flatten(), np.float32)
+    # By the program that a shrinking needs, too.
+    u = np.asarray(space.point_of(space.coerce(varied)), np.float32)
     # The engine may be one of rows that carry given features.
     rows = u[None] if problem.black_box else evaluate.rows_of(u[None])
     verdict = engine.evaluate(rows, evaluate.key, 0)

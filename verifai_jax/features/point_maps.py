@@ -203,8 +203,10 @@ class PointMaps:
         return jnp.asarray(True if self.where is None else self.where(features))
 
     @cached_property
-    def accepts_points(self) -> Callable[[Numbers], Bool[Array, " n"]]:
+    def accepts_points(self) -> Callable[[Numbers], Bool[Array | np.ndarray, " n"]]:
         """The constraint as a compiled function of points `[n, dim]` of the unit cube."""
+        if self.where is None:
+            return lambda u: np.ones(np.shape(u)[0], bool)
         return jax.jit(jax.vmap(lambda u: self.accepts(self.unflatten(u))))
 
     @property
@@ -233,7 +235,7 @@ class PointMaps:
         return jax.jit(jax.vmap(lambda u: self.root.coverage_ids(self.unflatten(u))))
 
     @property
-    def constraint(self) -> Callable[[Numbers], Bool[Array, " n"]] | None:
+    def constraint(self) -> Callable[[Numbers], Bool[Array | np.ndarray, " n"]] | None:
         """The compiled constraint `[n, dim] -> [n]`; None for a space without one."""
         return None if self.where is None else self.accepts_points
 

@@ -16,11 +16,12 @@ from verifai_jax.core.messages.text import format_seconds, shorten
 from verifai_jax.core.values.trace import Status, Trace
 from verifai_jax.core.values.waveform import HELD, is_waveform
 from verifai_jax.evaluation.replay import Replay
-from verifai_jax.mtl import Expression, Formula, explain, robustness_signal
+from verifai_jax.mtl import Expression, Formula
 from verifai_jax.mtl.blame import broken_at
 from verifai_jax.mtl.bounds import predicates_of, signal_bounds
 from verifai_jax.mtl.evaluate import End
 from verifai_jax.mtl.expression import constant_value
+from verifai_jax.mtl.host_values import HostValues
 from verifai_jax.pictures.style import (
     BOUND,
     FAILING,
@@ -82,6 +83,7 @@ def plot_replay(
     clock = np.asarray(trace.clock())
     decisive = decisive_instant(formulas[name], trace, replay.problem.end)
     broken, held = _broken(replay), _held(replay)
+    values_of = _values(trace, replay.problem.end)
     figure = new_figure(figsize=(8, 1.2 + 1.45 * len(shown)))
     panels = figure.subplots(len(shown), 1, sharex=True, squeeze=False).ravel()
     for axes, signal in zip(panels, shown, strict=True):
@@ -98,7 +100,7 @@ def plot_replay(
         named = {}
         said = "" if decisive is None or decisive[0] != signal else _mark(axes, trace, *decisive)
         for predicate, limits in _bounds(replay, signal, shown).items():
-            margin = np.asarray(robustness_signal(predicate, trace, end=replay.problem.end))
+            margin = values_of(predicate)
             _draw_limits(axes, trace, values, limits)
             color = BOUND if (margin < 0).any() else SAFE
             if predicate in broken:
@@ -212,12 +214,16 @@ def decisive_instant(formula: Formula, trace: Trace, end: End = "hold") -> tuple
     """
     if not all(np.all(np.isfinite(np.asarray(trace.signals[n]))) for n in formula.signals()):
         return None
-    why = explain(formula, trace, end=end)
-    named = why.predicate.signals()
-    if not named:
+    values = _values(trace, end)
+    decided = values.walk(formula).decision(formula)
+    if decided is None or not (named := decided[0].signals()):
         return None
-    clock = np.asarray(trace.clock())
-    return named[0], int(np.argmin(np.abs(clock - why.time)))
+    return named[0], min(decided[1], values.length - 1) // values.stride
+
+
+def _values(trace: Trace, end: End) -> HostValues:
+    """Return what formulas are on a trace, in NumPy, where nothing compiles."""
+    return HostValues.of(trace, "truncate" if end == "truncate" else "hold")
 
 
 def _bounds(replay: Replay, signal: str, shown: Sequence[str]) -> dict[Formula, list[Expression]]:
@@ -260,12 +266,14 @@ def _draw_limits(
     style: dict[str, Any] = {"color": BOUND, "linewidth": 0.9, "linestyle": "--", "alpha": 0.8}
     for limit in limits:
         constant = constant_value(limit)
-        course = constant if constant is not None else robustness_signal(limit >= 0, trace)
+        course: Any = constant
+        if constant is None:
+            course = _values(trace, "hold")(limit >= 0)[:: trace.stride]
         # A bound far away would squeeze the signal into a flat line, unless it is one.
         if np.min(np.abs(course)) > 4 * reach and np.ptp(finite) > 0:
             continue
         if constant is None:
-            axes.plot(trace.clock(), np.asarray(course), **style)
+            axes.plot(trace.clock(), course, **style)
         else:
             axes.axhline(constant, **style)
 

@@ -24,13 +24,14 @@ import jax
 import jax.extend.core
 import jax.numpy as jnp
 from jax.interpreters import ad
-from jaxtyping import Array, Key, PyTree
+from jaxtyping import Array
 
 from verifai_jax.core.compute import fingerprint
 from verifai_jax.core.compute.compilation import Slot
 from verifai_jax.core.compute.jaxprs import CALLS, called
 from verifai_jax.core.compute.precision import truncate_silently
 from verifai_jax.problem.problem import Problem
+from verifai_jax.problem.tracing import judged_results
 
 
 class Slopes(NamedTuple):
@@ -80,42 +81,25 @@ def depends_on_key(problem: Problem) -> bool:
     return problem.programs.get(KEY, None, lambda: _uses_key(problem))
 
 
-@truncate_silently()
 def _uses_key(problem: Problem) -> bool:
-    features = problem.space.feature_form
     if problem.black_box:
-        return problem.system.may_draw(features)
-
-    def judged(key: Key[Array, ""], features: PyTree) -> PyTree:
-        trace = problem.system(features, key)
-        signals = [trace.signals[name] for name in problem.monitored]
-        return signals, trace.valid, trace.status
-
-    key = jax.eval_shape(lambda: jax.random.key(0))
-    return fingerprint.used_inputs(jax.make_jaxpr(judged)(key, features))[0]
+        return problem.system.may_draw(problem.space.feature_form)
+    program, trace = problem.traced()
+    return fingerprint.used_inputs(program, judged_results(trace, problem.monitored))[-1]
 
 
 @truncate_silently()
 def _depends(problem: Problem) -> Slopes:
-    key = jax.eval_shape(lambda: jax.random.key(0))
-    mapped, features = jax.make_jaxpr(problem.space.unflatten, return_shape=True)(
-        problem.space.point_form
-    )
+    mapped = jax.make_jaxpr(problem.space.unflatten)(problem.space.point_form)
     sweep = _Sweep()
     moved = sweep(mapped.jaxpr, [True])
-    # Traced already, when the problem was checked.
-    program, trace = jax.make_jaxpr(problem.system, return_shape=True)(features, key)
+    program, trace = problem.traced()
     of_key = [False] * (len(program.jaxpr.invars) - len(moved))
     # What nothing monitored is computed from is not differentiated either.
-    count = len(program.jaxpr.outvars)
-    numbers = jax.tree.unflatten(jax.tree.structure(trace), range(count))
-    signals = {name: numbers.signals[name] for name in problem.monitored}
-    judged = set(jax.tree.leaves((signals, numbers.valid, numbers.status)))
-    read = fingerprint.without_unused(program.jaxpr, [number in judged for number in range(count)])
-    reached = sweep(read, [*moved, *of_key])
-    found = dict(zip(sorted(judged), reached, strict=True))
-    depends = any(found[number] for number in jax.tree.leaves(signals))
-    return Slopes(depends, tuple(sweep.lacking))
+    judged = judged_results(trace, problem.monitored)
+    reached = sweep(fingerprint.without_unused(program.jaxpr, judged), [*moved, *of_key])
+    # The length and the status, which are whole numbers, depend differentiably on nothing.
+    return Slopes(any(reached), tuple(sweep.lacking))
 
 
 class _Sweep:

@@ -3,11 +3,9 @@
 import jax
 
 from verifai_jax.core.compute.fingerprint import fingerprint, identity, stable_text
-from verifai_jax.core.compute.precision import truncate_silently
 from verifai_jax.problem.problem import Problem
 
 
-@truncate_silently()
 def digest_of_model(problem: Problem) -> str:
     """Return a hash of the system, the features and the constraint of a problem.
 
@@ -17,10 +15,10 @@ def digest_of_model(problem: Problem) -> str:
     """
     if problem.black_box:
         return ""
-    space, system = problem.space, problem.system
-    features, key = space.feature_form, jax.eval_shape(lambda: jax.random.key(0))
-    programs = [jax.make_jaxpr(lambda f, k: system(f, k))(features, key)]
-    programs += [] if space.where is None else [jax.make_jaxpr(space.accepts)(features)]
+    space = problem.space
+    programs = [problem.traced()[0]]
+    if space.where is not None:
+        programs.append(jax.make_jaxpr(space.accepts)(space.feature_form))
     hashes = [fingerprint(each, derivatives=False) for each in programs]
     if None in hashes:
         return ""

@@ -6,9 +6,9 @@
 `Problem.check()` says everything that is wrong with it before anything compiles.
 """
 
+import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
 from html import escape
 from itertools import pairwise
 from pathlib import Path
@@ -19,7 +19,8 @@ import numpy as np
 from jaxtyping import Array, Float, Key
 
 from verifai_jax.core.compute.compilation import ProgramCache, Slot
-from verifai_jax.core.compute.precision import truncate_silently
+from verifai_jax.core.compute.fingerprint import fingerprint
+from verifai_jax.core.compute.precision import reproducible_settings, truncate_silently
 from verifai_jax.core.compute.purity import TRACED_ONCE, watch
 from verifai_jax.core.display.extensions import verb
 from verifai_jax.core.display.lazy import lazy_import
@@ -45,7 +46,7 @@ from verifai_jax.mtl.semantics import Semantics
 from verifai_jax.problem.behaviour import Behaviour
 from verifai_jax.problem.guide import Guide, Term
 from verifai_jax.problem.rulebook import Rulebook
-from verifai_jax.problem.tracing import fingerprint_of, traced_by_default, why_not_batched
+from verifai_jax.problem.tracing import traced, traced_by_default, why_not_batched
 from verifai_jax.systems.base import System, as_system
 
 ORDER = "; the order is Problem(name, space, system, spec)"
@@ -94,7 +95,7 @@ class Problem(InNotebook):
 
     _internal = frozenset((
         "black_box", "draws", "form", "made_in", "monitored", "on_backend",
-        "programs", "requirement_entries", "sources",
+        "programs", "requirement_entries", "sources", "traced",
     ))  # fmt: skip
     name: str
     space: FeatureSpace
@@ -194,15 +195,33 @@ class Problem(InNotebook):
         **Arguments:**
         - `first`: the first row of the table to which they apply.
         """
-        traced = partial(fingerprint_of, self.system, self.space.feature_form)
-        program = self.programs.get(FINGERPRINT, None, traced)
+        program = self.programs.get(FINGERPRINT, None, self._fingerprint)
         return sources_of(self, made=self.made_in or (), first=first, program=program)
 
     def requirement_entries(self) -> dict[str, dict[str, str]]:
         """Return the content of the formulas' requirements, by identifier, as plain data."""
         return {each.id: each.entry() for each in self.requirements if each.id in self.formulas}
 
-    @truncate_silently()
+    @reproducible_settings()
+    def _fingerprint(self) -> str:
+        """Return a hash of the system's program; empty where there is none to take."""
+        if self.black_box or not traced_by_default(self.system):
+            return ""
+        try:
+            return fingerprint(self.traced()[0], derivatives=False) or ""
+        except Exception:
+            return ""  # What it raises, `check` says.
+
+    def traced(self) -> tuple[Any, Trace]:
+        """Return the system's program, of features and a key, and the form of its traces.
+
+        It is traced once for each precision.
+
+        **Raises:** the errors of the system.
+        """
+        make = lambda: traced(self.system, self.space.feature_form)  # noqa: E731
+        return self.programs.get(TRACED, _settings(), make)
+
     def draws(self) -> bool:
         """Return whether the system uses its random key; abstract evaluation, nothing compiles.
 
@@ -211,11 +230,8 @@ class Problem(InNotebook):
         """
         if self.black_box:
             return False
-        features = self.space.feature_form
-        key = jax.eval_shape(lambda: jax.random.key(0))
-        program = jax.make_jaxpr(lambda key, features: self.system(features, key))(key, features)
-        drawn = program.jaxpr.invars[0]
-        return any(drawn is used for step in program.jaxpr.eqns for used in step.invars)
+        program = self.traced()[0].jaxpr
+        return any(program.invars[-1] is used for step in program.eqns for used in step.invars)
 
     def __getstate__(self) -> dict[str, Any]:
         # What is compiled for it stays here: another process compiles its own.
@@ -359,15 +375,19 @@ class Problem(InNotebook):
 
     @truncate_silently()
     def _form(self) -> Trace | None:
-        features, key = self.space.feature_form, jax.eval_shape(lambda: jax.random.key(0))
-        # A new function each time: JAX remembers what it traced by the function.
-        program = lambda: jax.make_jaxpr(lambda *a: self.system(*a), return_shape=True)  # noqa: E731
-        watched = None
+        features, watched, seconds = self.space.feature_form, None, list[float]()
+
+        def once() -> Any:
+            started = time.perf_counter()
+            result = traced(self.system, features)
+            seconds.append(time.perf_counter() - started)
+            return result
+
         try:
             if self.black_box or not traced_by_default(self.system):
                 trace = self.system.abstract(features)
             else:
-                watched = watch(self.system, lambda: program()(features, key))
+                watched = watch(self.system, once)
                 trace = watched.result[1]
         except Exception as error:
             raise self._wrong_system(error, features) from error
@@ -386,7 +406,9 @@ class Problem(InNotebook):
             )
         if watched is None:
             return trace
+        self.programs.get(TRACED, _settings(), lambda: watched.result)
         self.programs.get(KEPT, None, lambda: watched.kept)
+        self.programs.get(SECONDS, None, lambda: min(seconds))
         if (alone := why_not_batched(watched.result[0].jaxpr)) is not None:
             raise ProblemError(
                 f"the system of problem {self.name!r} cannot be simulated in batches: {alone}"
@@ -418,10 +440,19 @@ KEPT: Slot[None, tuple[str, ...]] = Slot("kept")
 """What each call of a problem's system changes, in words."""
 FORM: Slot[None, Trace | None] = Slot("form")
 """The form of the traces of a problem's system."""
+SECONDS: Slot[None, float] = Slot("seconds of tracing")
+"""Seconds that one tracing of a problem's system takes."""
+TRACED: Slot[tuple[str, ...], tuple[Any, Trace]] = Slot("traced")
+"""The program of the system and the form of its traces, by JAX's precision and generator."""
 FINGERPRINT: Slot[None, str] = Slot("fingerprint")
 """The fingerprint of the system's program."""
 BACKENDS: Slot[str, Problem] = Slot("backends")
 """The same problem on each backend of its system."""
+
+
+def _settings() -> tuple[str, ...]:
+    names = ("jax_enable_x64", "jax_default_prng_impl")
+    return tuple(str(getattr(jax.config, name, None)) for name in names)
 
 
 def _rulebook(

@@ -7,29 +7,23 @@ calls change something. Nothing compiles: the system is traced, which takes a fr
 Only certain mistakes are reported.
 """
 
-import time
 from collections.abc import Iterator
-from typing import Any
 
 import jax
-from jaxtyping import PyTree
 
 from verifai_jax.core.compute.compilation import Slot
 from verifai_jax.core.compute.fingerprint import used_inputs
-from verifai_jax.core.compute.precision import truncate_silently
-from verifai_jax.core.compute.purity import PATIENCE, Program
+from verifai_jax.core.compute.purity import PATIENCE
 from verifai_jax.core.values.trace import Trace
 from verifai_jax.features import Domain
 from verifai_jax.mtl.shortfalls import shortfalls
-from verifai_jax.problem.problem import KEPT, Problem
-from verifai_jax.problem.tracing import traced_by_default
+from verifai_jax.problem.problem import KEPT, SECONDS, Problem
+from verifai_jax.problem.tracing import judged_results, traced_by_default
 
 COMPARED = ". A Categorical of texts has the place of the choice as its value, which no text equals"
 """Advice on a choice that seems to be read: a comparison with a text is false, silently."""
 MISTAKES: Slot[None, tuple[str, ...]] = Slot("silent mistakes")
 """Sentences on a problem."""
-SECONDS: Slot[None, float] = Slot("seconds of tracing")
-"""Seconds that one tracing of a problem's system takes."""
 
 
 def silent_mistakes(problem: Problem) -> tuple[str, ...]:
@@ -63,13 +57,7 @@ def mistakes_of_the_system(problem: Problem) -> Iterator[str]:
     """Yield the mistakes that tracing the system shows."""
     if problem.black_box or not traced_by_default(problem.system):
         return
-    features = problem.space.feature_form
-    key = jax.eval_shape(lambda: jax.random.key(0))
-    started = time.perf_counter()
-    program = _program(problem, features, key)
-    yield from _unread(problem, program, features)
-    seconds = time.perf_counter() - started
-    problem.programs.get(SECONDS, None, lambda: seconds)
+    yield from _unread(problem)
     if kept := problem.programs.peek(KEPT, None):
         yield (
             f"each call of the system changes {' and '.join(kept[:4])}, and JAX calls it while "
@@ -84,20 +72,10 @@ def is_quick(problem: Problem) -> bool:
     return seconds is not None and seconds <= PATIENCE
 
 
-@truncate_silently()
-def _program(problem: Problem, features: PyTree, key: Any) -> Program:
-    """Trace from features to the monitored signals, and the length of what counts of them."""
-
-    def signals(features: PyTree, key: Any) -> Any:
-        trace = problem.system(features, key)
-        return [trace.signals[name] for name in problem.monitored], trace.valid
-
-    return jax.make_jaxpr(signals)(features, key)
-
-
-def _unread(problem: Problem, program: Program, features: PyTree) -> Iterator[str]:
+def _unread(problem: Problem) -> Iterator[str]:
     """Yield the features that neither a monitored signal nor the constraint depends on."""
-    used = used_inputs(program)
+    features, (program, trace) = problem.space.feature_form, problem.traced()
+    used = used_inputs(program, judged_results(trace, problem.monitored, status=False))
     where = problem.space.where
     if where is not None:
         asked = jax.make_jaxpr(where)(features)

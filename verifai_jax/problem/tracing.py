@@ -4,13 +4,13 @@ traced_by_default(system)                           # whether JAX traces the sys
 why_not_batched(program)                            # what jax.vmap refuses, and the remedy
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import jax
 
-from verifai_jax.core.compute.fingerprint import alone_only, describe_step, fingerprint
-from verifai_jax.core.compute.precision import reproducible_settings, truncate_silently
+from verifai_jax.core.compute.fingerprint import alone_only, describe_step
+from verifai_jax.core.compute.precision import truncate_silently
 from verifai_jax.systems.base import System
 
 
@@ -43,21 +43,27 @@ def why_not_batched(program: Any) -> str | None:
     return None
 
 
-@reproducible_settings()
 @truncate_silently()
-def fingerprint_of(system: System, features: Mapping[str, Any]) -> str:
-    """Return the fingerprint of a system's program, with all of its constants.
-
-    Empty for a system that is not traced for its form, and for one that raises, of which
-    `Problem.check` says why.
+def traced(system: System, features: Mapping[str, Any]) -> tuple[Any, Any]:
+    """Return the program of a system, of features and a key, and the form of its traces.
 
     - `features`: the form of the features.
     """
-    if system.black_box or not traced_by_default(system):
-        return ""
-    try:
-        # Traced already, for its form.
-        program = jax.make_jaxpr(system)(features, jax.eval_shape(lambda: jax.random.key(0)))
-    except Exception:
-        return ""
-    return fingerprint(program, derivatives=False) or ""
+    key = jax.eval_shape(lambda: jax.random.key(0))
+    # A new function each time: JAX remembers what it traced by the function.
+    return jax.make_jaxpr(lambda *a: system(*a), return_shape=True)(features, key)
+
+
+def judged_results(trace: Any, names: Iterable[str], status: bool = True) -> list[bool]:
+    """Return which results of a system's program verdicts are made of.
+
+    **Arguments:**
+    - `trace`: the form of its traces.
+    - `names`: the monitored signals.
+    - `status`: whether the status counts, too.
+    """
+    count = len(jax.tree.leaves(trace))
+    numbers = jax.tree.unflatten(jax.tree.structure(trace), range(count))
+    signals = [numbers.signals[name] for name in names]
+    judged = set(jax.tree.leaves((signals, numbers.valid, numbers.status if status else None)))
+    return [number in judged for number in range(count)]

@@ -22,19 +22,51 @@ def shortest(
     """
     if np.all(bound <= 0):
         return np.zeros(matrix.shape[1])
-    from scipy.optimize import nnls
-
     size = np.abs(bound).max()
     dual = np.vstack([matrix.T, bound / size])
     right = np.append(np.zeros(matrix.shape[1]), 1.0)
-    try:
-        weights, _ = nnls(dual, right)
-    except RuntimeError:
+    weights = _nonnegative(dual, right)
+    if weights is None:
         return None  # It has not converged.
     residual = dual @ weights - right
     if residual @ residual < 1e-14:
         return None
     return -residual[:-1] / residual[-1] * size
+
+
+def _nonnegative(
+    matrix: Float[np.ndarray, "r m"], right: Float[np.ndarray, " r"]
+) -> Float[np.ndarray, " m"] | None:
+    """Minimise `|matrix @ x - right|` over `x >= 0`; None if that takes too many steps.
+
+    SciPy has the same, but importing its `optimize` takes longer than a whole shrinking.
+    """
+    x = np.zeros(matrix.shape[1])
+    positive, refused = x > 0, x > 0
+    rounding = 1e-13 * np.linalg.norm(matrix) * np.linalg.norm(right)
+    for _ in range(3 * len(x)):
+        slope = np.where(positive | refused, 0.0, matrix.T @ (right - matrix @ x))
+        entering = int(np.argmax(slope))
+        if slope[entering] <= rounding:
+            return x
+        positive[entering] = True
+        while True:
+            solved = np.zeros(len(x))
+            solved[positive] = np.linalg.lstsq(matrix[:, positive], right, rcond=None)[0]
+            below = np.flatnonzero(positive & (solved <= 0))
+            if not len(below):
+                refused[:] = False
+                x = solved
+                break
+            if entering in below and not x[entering]:
+                # Rounding alone made its slope positive.
+                positive[entering], refused[entering] = False, True
+                break
+            share = x[below] / (x[below] - solved[below])
+            x = np.where(positive, x + share.min() * (solved - x), 0.0)
+            x[below[share == share.min()]] = 0.0
+            positive &= x > 0
+    return None
 
 
 def shortest_in_box(

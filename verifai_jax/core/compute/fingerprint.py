@@ -241,9 +241,14 @@ def as_traced(traced: jax.stages.Traced) -> Callable[..., Any]:
     return lambda *arguments: jax.tree.unflatten(form, known(*jax.tree.leaves(arguments)))
 
 
-def used_inputs(program: Any) -> list[bool]:
-    """Return, for each input of a program, whether a result depends on it."""
-    results = [True] * len(program.jaxpr.outvars)
+def used_inputs(program: Any, wanted: Sequence[bool] | None = None) -> list[bool]:
+    """Return, for each input of a program, whether a result depends on it.
+
+    **Arguments:**
+    - `program`: a `Jaxpr` with its constants.
+    - `wanted`: which results count; all when left out.
+    """
+    results = [True] * len(program.jaxpr.outvars) if wanted is None else list(wanted)
     return partial_eval.dce_jaxpr(program.jaxpr, results)[1]
 
 

@@ -1,6 +1,7 @@
 """Random keys of a run and of its simulations: functions of the seed and the row alone."""
 
 import jax
+import jax.core
 import numpy as np
 from jaxtyping import Array, Int, Key, UInt32
 
@@ -29,7 +30,13 @@ def as_key(data: UInt32[np.ndarray, "*shape 2"]) -> Key[Array, "*shape"]:
 
 def simulation_key(key: Key[Array, ""], row: Int[Array, ""] | int) -> Key[Array, ""]:
     """Derive the random key of one simulation from the run's key and the row number."""
-    return jax.random.fold_in(key, row)
+    known = isinstance(row, int | np.integer) and not isinstance(key, jax.core.Tracer)
+    if not known or key.ndim or jax.random.key_impl(key) != IMPLEMENTATION:
+        return jax.random.fold_in(key, row)
+    # The same in NumPy, for which nothing compiles.
+    counter = np.array([0, int(row) & 0xFFFFFFFF], np.uint32)
+    words = np.asarray(jax.random.key_data(key))
+    return as_key(np.concatenate(_threefry(words, counter[:1], counter[1:])))
 
 
 def mixed_bits(value: UInt32[Array | np.ndarray, "*shape"]) -> UInt32[Array | np.ndarray, "*shape"]:
