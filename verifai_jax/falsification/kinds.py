@@ -6,7 +6,7 @@ from jaxtyping import Float, Int
 from verifai_jax.falsification.run import Run
 from verifai_jax.search.kinds import ENOUGH, REACH
 
-MOST = 4096
+MAX_FAILURES = 4096
 """Failures that regions are made of, at most: the first ones, which take a tenth of a second."""
 
 
@@ -38,7 +38,7 @@ def regions_of(u: Float[np.ndarray, "n d"]) -> Int[np.ndarray, " n"]:
 
 def describe_kinds(run: Run) -> tuple[str, ...]:
     """Write how many regions of failures a run has found, and how it divided its budget."""
-    rows = run.table.violating.iloc[:MOST]
+    rows = run.table.violating.iloc[:MAX_FAILURES]
     if run.prior or run.problem is None or not len(rows):
         return ()
     regions = regions_of(run.problem.space.points(rows))
@@ -50,7 +50,7 @@ def describe_kinds(run: Run) -> tuple[str, ...]:
     tenth = [int(rows.index[np.flatnonzero(regions == k)[ENOUGH - 1]]) for k in known]
     until = min(tenth)
     inside = int(np.isin(regions, known).sum())
-    of = "" if run.table.counts.violating <= MOST else f" of the first {MOST:,}"
+    of = "" if run.table.counts.violating <= MAX_FAILURES else f" of the first {MAX_FAILURES:,}"
     these = "a region" if len(known) == 1 else f"{len(known)} regions"
     return (
         f"{these} with {ENOUGH} failures or more: {inside:,}{of}; {len(rows) - inside:,} elsewhere",

@@ -53,7 +53,7 @@ class Kinds(NamedTuple):
 
     @property
     def described(self) -> Bool[Array, " kinds"]:
-        """Which boxes have enough failures."""
+        """True for boxes with enough failures."""
         return self.count >= ENOUGH
 
     def distances(self, u: Float[Array, "n d"]) -> Float[Array, "n kinds"]:
