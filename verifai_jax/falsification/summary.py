@@ -11,6 +11,7 @@ import numpy as np
 from verifai_jax.core.display.lazy import lazy_import
 from verifai_jax.core.messages.text import format_features, format_percent, one_line, printable
 from verifai_jax.evaluation.confirmations import UNDECIDED
+from verifai_jax.falsification.kinds import describe_kinds
 from verifai_jax.falsification.no_rate import remedy, why_no_rate
 from verifai_jax.falsification.run import Run
 
@@ -39,6 +40,7 @@ def summarize(run: Run) -> str:
             lines[-1] += f" (fails in {counts.failing_alone[name]:,})"
     if violating and (verdicts := _closer_look(run)):
         lines.append(f"  of these     {verdicts}")
+    lines += [f"  {'' if i else 'kinds':<13}{line}" for i, line in enumerate(describe_kinds(run))]
     lines += _rates(run)
     if failed < run.simulations:
         best = run.best.to_dict()

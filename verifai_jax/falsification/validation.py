@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -164,6 +165,9 @@ def adapt_search(
             f"none: {lacking} has no derivative. Use a search that needs none, such as 'portfolio' "
             "or 'cross_entropy', or give the operation a derivative by jax.custom_jvp"
         )
+    if problem.rulebook is not None and isinstance(search, searches.Portfolio):
+        # Where a lesser rule is broken a graver one may be, too.
+        search = replace(search, kinds=False)
     fallback = search.fallback
     if fallback is None or not (search.wants.derivatives or search.wants.traces):
         return search, ()
