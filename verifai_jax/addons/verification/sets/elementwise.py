@@ -112,6 +112,14 @@ def _compare(t: Interpreter, step: Equation, inputs: list[Value]) -> list[Value]
     return [whole.compared(name, *functions.difference(a, as_form(b)).bounds())]
 
 
+@rule("lt_to", "le_to")
+def _in_total_order(t: Interpreter, step: Equation, inputs: list[Value]) -> list[Value]:
+    """Compare floats in an order in which zeros have signs: only different numbers are decided."""
+    a, b = _levelled(inputs)
+    low, high = functions.difference(as_form(a), as_form(b)).bounds()
+    return [Whole.truth(high < 0, low > 0)]
+
+
 @rule("not")
 def _not(t: Interpreter, step: Equation, inputs: list[Value]) -> list[Value]:
     return [whole.FUNCTIONS["not"](as_whole(inputs[0]))]
