@@ -139,7 +139,7 @@ def _tora(name: str, control: Callable, start: list, seconds: float, period: flo
         return s[1], -s[0] + 0.1 * jnp.sin(s[2]), s[3], u[0]
 
     ends = dict(zip(("x1", "x2", "x3", "x4"), start, strict=True))
-    return held(name, rates, control, ends, seconds, period, spec, parts=int(period / 0.1 + 0.5))
+    return held(name, rates, control, ends, seconds, period, spec, parts=int(4 * period))
 
 
 def tora(folder: Path) -> vj.Problem:

@@ -1,4 +1,4 @@
-"""Sorting, on sets: each place of the order has the hull of the elements that may stand there."""
+"""Sorting, on sets: each position of the order has the hull of the elements that may stand there."""
 
 import itertools
 from collections.abc import Sequence
@@ -70,8 +70,8 @@ def _sorted(values: list[Value], axis: int, stable: bool) -> list[Value]:
     final = count - 1 - before.sum(-1)
     first, final = (np.where(nothing[..., None], end, each)
                     for end, each in ((0, first), (count - 1, final)))  # fmt: skip
-    place = np.arange(count)
-    possible = (first[..., None] <= place) & (place <= final[..., None])
+    position = np.arange(count)
+    possible = (first[..., None] <= position) & (position <= final[..., None])
     found = [_placed(value, possible) for value in last]
     found[0] = _by_pairs(key, found[0], nothing)
     return [v.moved(lambda a, lead: np.moveaxis(a, -1, lead + axis)) for v in found]
@@ -82,10 +82,10 @@ def _ends(value: Value) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _placed(value: Value, possible: np.ndarray) -> Value:
-    """Return for each place the hull of the elements that may stand there.
+    """Return for each position the hull of the elements that may stand there.
 
     **Arguments:**
-    - `possible`: `[boxes, ..., element, place]`.
+    - `possible`: `[boxes, ..., element, position]`.
     """
     low, high = _ends(value)
     lowest, highest = _extent(low, high)

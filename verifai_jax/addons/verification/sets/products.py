@@ -98,22 +98,22 @@ def _convolution(t: Interpreter, step: Equation, inputs: list[Value]) -> list[Va
     size = int(np.prod(image.shape, dtype=np.int64))
     numbers = np.arange(size).reshape(image.shape).transpose(forms.lhs_spec)
     depth, inner, *taps = (kernel.shape[axis] for axis in forms.rhs_spec)
-    places = [step.outvars[0].aval.shape[axis] for axis in forms.out_spec[2:]]
+    points = [step.outvars[0].aval.shape[axis] for axis in forms.out_spec[2:]]
     grids = list[np.ndarray]()
-    for i, (n, place, tap) in enumerate(zip(numbers.shape[2:], places, taps, strict=True)):
-        along = np.arange(place)[:, None] * params["window_strides"][i] - params["padding"][i][0]
+    for i, (n, position, tap) in enumerate(zip(numbers.shape[2:], points, taps, strict=True)):
+        along = np.arange(position)[:, None] * params["window_strides"][i] - params["padding"][i][0]
         along = along + np.arange(tap) * params["rhs_dilation"][i]
         gap = params["lhs_dilation"][i]
         inside = (along >= 0) & (along <= (n - 1) * gap) & (along % gap == 0)
         grids.append(np.where(inside, along // gap, n))
     # The number after the last one, along any axis, is the zero that stands for padding.
-    numbers = np.pad(numbers, [(0, 0), (0, 0)] + [(0, 1)] * len(places), constant_values=size)
+    numbers = np.pad(numbers, [(0, 0), (0, 0)] + [(0, 1)] * len(points), constant_values=size)
     for i, grid in enumerate(grids):
         numbers = numbers.take(grid, 2 + 2 * i)
-    rank, each = len(places), image.shape[forms.lhs_spec[0]] // batches
+    rank, each = len(points), image.shape[forms.lhs_spec[0]] // batches
     evens, odds = (range(start, 2 + 2 * rank, 2) for start in (2, 3))
     numbers = numbers.transpose(0, 1, *evens, *odds)
-    numbers = numbers.reshape(batches, each, groups, inner, *places, -1)
+    numbers = numbers.reshape(batches, each, groups, inner, *points, -1)
     numbers = numbers.transpose(0, 2, 1, *range(4, 4 + rank), 3, 4 + rank)
     # One part is a product of matrices, which is faster than one with an axis for parts.
     several = () if parts == 1 else (parts,)
@@ -134,10 +134,10 @@ def _convolution(t: Interpreter, step: Equation, inputs: list[Value]) -> list[Va
 
     def placed(array: np.ndarray, lead: int) -> np.ndarray:
         front = array.shape[:lead]
-        array = array.reshape(*front, parts, each, *places, depth // parts)
+        array = array.reshape(*front, parts, each, *points, depth // parts)
         order = (1, 0, 2 + rank, *range(2, 2 + rank))
         array = array.transpose(*range(lead), *(lead + axis for axis in order))
-        array = array.reshape(*front, each, depth, *places)
+        array = array.reshape(*front, each, depth, *points)
         back = np.argsort(forms.out_spec)
         return array.transpose(*range(lead), *(lead + int(axis) for axis in back))
 

@@ -50,23 +50,23 @@ def _interpolation(t: Interpreter, program: Program, inputs: list[Value]) -> lis
     if len(inputs) != 3 or getattr(program, "consts", ()):
         return None
     x, points, values = inputs
-    places, heights = _table(points), _table(values)
-    if not isinstance(x, Form) or places is None or heights is None:
+    edges, heights = _table(points), _table(values)
+    if not isinstance(x, Form) or edges is None or heights is None:
         return None
     kind = rounding(x.dtype)
-    gaps = np.diff(places)
+    gaps = np.diff(edges)
     # Closer points than these JAX takes for equal, with a jump between them.
-    if len(places) < 2 or len(places) != len(heights) or not (gaps > 1e-6 * (1 + np.abs(
-        places[1:]
+    if len(edges) < 2 or len(edges) != len(heights) or not (gaps > 1e-6 * (1 + np.abs(
+        edges[1:]
     ))).all() or not _is(program, jnp.interp, 0):  # fmt: skip
         return None
     scale = np.abs(heights).max()
 
     def knots(slope: Reals, low: Reals, high: Reals) -> Sequence[Reals]:
-        return [np.full(low.shape, place) for place in places]
+        return [np.full(low.shape, knot) for knot in edges]
 
     function = Function(
-        lambda at: np.interp(at, places, heights), knots, units=0.0,
+        lambda at: np.interp(at, edges, heights), knots, units=0.0,
         range=(heights.min() - UNITS * kind.unit * scale - kind.smallest,
                heights.max() + UNITS * kind.unit * scale + kind.smallest),
     )  # fmt: skip
@@ -90,8 +90,8 @@ def _search(t: Interpreter, program: Program, inputs: list[Value]) -> list[Value
     if len(inputs) != 2 or getattr(program, "consts", ()):
         return None
     table, x = inputs
-    places = _table(table)
-    if not isinstance(x, Form) or places is None or not (np.diff(places) >= 0).all():
+    edges = _table(table)
+    if not isinstance(x, Form) or edges is None or not (np.diff(edges) >= 0).all():
         return None
     side = next((i for i in (0, 1) if _is(program, _SEARCHES[i], i)), None)
     if side is None:
@@ -99,11 +99,11 @@ def _search(t: Interpreter, program: Program, inputs: list[Value]) -> list[Value
     low, high = x.bounds()
     tiny = 2 * rounding(x.dtype).smallest
     word = "left" if side == 0 else "right"
-    first = np.searchsorted(places, low - tiny, side=word)
-    last = np.searchsorted(places, high + tiny, side=word)
+    first = np.searchsorted(edges, low - tiny, side=word)
+    last = np.searchsorted(edges, high + tiny, side=word)
     lost = unknown(low, high)
     dtype = np.dtype(program.out_avals[0].dtype)
-    return [Whole(np.where(lost, 0, first), np.where(lost, len(places), last), dtype)]
+    return [Whole(np.where(lost, 0, first), np.where(lost, len(edges), last), dtype)]
 
 
 _SEARCHES = (partial(jnp.searchsorted, side="left"), partial(jnp.searchsorted, side="right"))
