@@ -25,8 +25,11 @@ DEPTH = 16
 
 
 def affine(matrix, vector, shift):
-    return [sum((iv.mpf(float(a)) * x for a, x in zip(row, vector, strict=True) if a), iv.mpf(float(s)))
-            for row, s in zip(matrix, shift, strict=True)]  # fmt: skip
+    found = []
+    for row, number in zip(matrix, shift, strict=True):
+        terms = (iv.mpf(float(a)) * x for a, x in zip(row, vector, strict=True) if a)
+        found.append(sum(terms, iv.mpf(float(number))))
+    return found
 
 
 def evaluate(layers, x, slopes):

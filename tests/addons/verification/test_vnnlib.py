@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from verifai_jax.addons.verification import verify_network
+from verifai_jax.addons.verification.network import verify_network
 from verifai_jax.addons.verification.vnnlib import read_property
 from verifai_jax.cli.main import main
 

@@ -74,7 +74,7 @@ def _of_network(
     target: str, rule: Path, into: Path | None, fail_on: Gate | None, options: dict[str, Any]
 ) -> None:
     """Answer a property of a network alone."""
-    from verifai_jax.addons.verification import verify_network
+    from verifai_jax.addons.verification.network import verify_network
 
     known = ("budget", "boxes", "seed", "precision", "progress")
     given = {name: options[name] for name in known if options[name] is not None}
@@ -83,8 +83,8 @@ def _of_network(
     for name in ("inputs", "outputs"):
         numbers = getattr(found, name)
         if numbers is not None:
-            click.echo(f"  {name:12} {' '.join(f'{number:.9g}' for number in numbers)}")
-    click.echo(f"  proved       {100 * found.proved:.4g} % of the inputs")
+            click.echo(f"  {name:12} {' '.join(f'{number:z.9g}' for number in numbers)}")
+    click.echo(f"  proved       {100 * found.proved:z.4g} % of the inputs")
     counterexample = None if found.inputs is None else found.inputs.tolist()
     give_result(verdict=found.verdict, counterexample=counterexample, proved=found.proved)
     if into is not None:

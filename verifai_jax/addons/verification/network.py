@@ -23,7 +23,7 @@ HOLDS, COUNTEREXAMPLE, UNKNOWN = "holds", "counterexample", "unknown"
 
 @dataclass
 class NetworkAnswer:
-    """What is known of a property of a network: `holds`, `counterexample` or `unknown`.
+    """The answer about a property of a network: `holds`, `counterexample` or `unknown`.
 
     - `inputs`, `outputs`: a counterexample, whose outputs the network computes; None without one.
     - `proved`: the proved share of the inputs of the boxes, from 0 to 1.

@@ -4,8 +4,8 @@ A step of a loop rotates and shears the set of states, and nonlinear terms add a
 each number. If each step enclosed the set in a box, the boxes would grow. Here the uncertainties of
 a loop's carried numbers are symbols, which the next step treats like those of the features. Once
 there are many, the shortest are replaced by the symbols of one parallelepiped, with orthogonal
-sides after scaling. The uncertainties of a layer's units stay separate symbols through the following layers, up
-to a result of few numbers.
+sides after scaling. The uncertainties of a layer's units stay separate symbols through the
+following layers, up to a result of few numbers.
 
 Source: R. Lohner, Enclosing the solutions of ordinary initial and boundary value problems (1987);
 N. Nedialkov, K. Jackson, G. Corliss, Validated solutions of initial value problems for ordinary

@@ -1,4 +1,4 @@
-"""Sorting, on sets: each position of the order has the hull of the elements that may stand there."""
+"""Sorting, on sets: each position has the hull of the elements that may stand there."""
 
 import itertools
 from collections.abc import Sequence
