@@ -48,6 +48,11 @@ PROGRAMS = {
         jnp.pad(x, (1, 2), constant_values=4.0), jnp.concatenate([x, 2 * x]), jnp.stack([x, -x], 1),
         jnp.tile(x, 2), x[:, None].T, jnp.split(2 * x, [1]), jnp.repeat(x, 2),
     ),
+    "numbers for arrays": lambda x: (
+        jnp.sum(x[0] + jnp.arange(3.0)), jnp.prod(x[1] * jnp.arange(1.0, 4.0) - x[0]),
+        (x[0] - jnp.arange(3.0))[2], jnp.cumsum(jnp.maximum(x[0], jnp.arange(3.0) - 1)),
+        jnp.sum(jnp.where(x[0] > 0, x[1], jnp.arange(3.0))), jnp.sum(jnp.clip(x[0], -x / 2, 0.9)),
+    ),
     "sums": lambda x: (jnp.sum(x), jnp.mean(x * x), jnp.cumsum(x), jnp.prod(x), jnp.linalg.norm(x)),
     "extremes": lambda x: (
         jnp.max(x), jnp.min(x), jnp.argmax(x), jnp.argmin(x), jax.lax.cummax(x),

@@ -20,14 +20,18 @@ from verifai_jax.addons.verification.sets.whole import Whole
 
 
 def _levelled(values: list[Value]) -> list[Value]:
-    """Return operands of one rank: numbers that stand for arrays get their axes."""
-    rank = max(len(value.shape) for value in values)
+    """Return operands of one shape: numbers that stand for arrays are repeated.
+
+    All parts of a set need it, since a later sum counts the slopes as often as they stand there.
+    """
+    shape = np.broadcast_shapes(*(value.shape for value in values))
 
     def widen(array: np.ndarray, leading: int) -> np.ndarray:
-        missing = rank + leading - array.ndim
-        return array.reshape(*array.shape[:leading], *(1,) * missing, *array.shape[leading:])
+        front, missing = array.shape[:leading], len(shape) + leading - array.ndim
+        array = array.reshape(*front, *(1,) * missing, *array.shape[leading:])
+        return np.broadcast_to(array, (*front, *shape))
 
-    return [value if len(value.shape) == rank else value.moved(widen) for value in values]
+    return [value if value.shape == shape else value.moved(widen) for value in values]
 
 
 _OF_TWO: dict[str, Callable[[Form, Form], Form]] = {

@@ -29,11 +29,11 @@ FEW = 8
 """Numbers of a result that do not carry the symbols of layers on: what follows would cost more."""
 WORTH = 0.002
 """Share of the spread from which on what is not linear gets symbols of its own."""
-ORDER = 20
-"""Symbols for each number that a loop carries, beyond which they are made fewer."""
-KEPT = 15
-"""Symbols for each number that are left then: the longest, and those of one parallelepiped around
-the others. If all become a parallelepiped, the TORA of benchmarks/ainncs.py has no bounds."""
+FINE, COARSE, FINE_BOXES = (20, 15), (6, 4), 64
+"""Symbols for each number that a loop carries, beyond which they are made fewer, and how many are
+left then: the longest, and those of one parallelepiped around the others. If all become a
+parallelepiped, the TORA of benchmarks/ainncs.py has no bounds. Many boxes are small ones, for which
+fewer symbols do, and which take twice the time with more."""
 _NUMBERS = itertools.count(1)
 
 
@@ -72,8 +72,9 @@ def framed(carry: Sequence[Form | Whole], boxes: int, features: int) -> list[For
     noise[:, :, : old - features] = slopes[features:].transpose(1, 2, 0)
     noise[:, np.arange(count), old - features + np.arange(count)] = radius
     sides, rest = noise, np.zeros((boxes, count))
-    if noise.shape[2] > ORDER * count:
-        sides, rest = _reduced(noise)
+    most, left = FINE if boxes <= FINE_BOXES else COARSE
+    if noise.shape[2] > most * count:
+        sides, rest = _reduced(noise, left)
     new = np.concatenate([slopes[:features], sides.transpose(2, 0, 1)])
     radius = np.where(bounded, rest + 4 * SLACK * np.abs(noise).sum(2), np.inf)
     size = np.minimum(size, np.maximum(np.abs(low), np.abs(high)))
@@ -107,7 +108,7 @@ def of_layer(units: Form, features: int) -> Form:
     )  # fmt: skip
 
 
-def _reduced(noise: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _reduced(noise: np.ndarray, of_each: int) -> tuple[np.ndarray, np.ndarray]:
     """Return fewer symbols that contain those of `noise`: the longest ones, and a parallelepiped.
 
     A parallelepiped around all of them would forget how the longest ones move together.
@@ -118,7 +119,7 @@ def _reduced(noise: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     gain = size.sum(1) - size.max(1)
     order = np.argsort(-gain, axis=1, kind="stable")
     arranged = np.take_along_axis(noise, order[:, None, :], axis=2)
-    kept = (KEPT - 1) * count
+    kept = (of_each - 1) * count
     sides, rest = _sides(arranged[:, :, kept:])
     return np.concatenate([arranged[:, :, :kept], sides], axis=2), rest
 
