@@ -72,8 +72,8 @@ def framed(carry: Sequence[Form | Whole], boxes: int, features: int) -> list[For
     noise[:, :, : old - features] = slopes[features:].transpose(1, 2, 0)
     noise[:, np.arange(count), old - features + np.arange(count)] = radius
     sides, rest = noise, np.zeros((boxes, count))
-    most, left = FINE if boxes <= FINE_BOXES else COARSE
-    if noise.shape[2] > most * count:
+    limit, left = FINE if boxes <= FINE_BOXES else COARSE
+    if noise.shape[2] > limit * count:
         sides, rest = _reduced(noise, left)
     new = np.concatenate([slopes[:features], sides.transpose(2, 0, 1)])
     radius = np.where(bounded, rest + 4 * SLACK * np.abs(noise).sum(2), np.inf)
