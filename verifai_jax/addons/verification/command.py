@@ -11,6 +11,7 @@ from verifai_jax.cli.json_output import command, give_result, say, show_result
 
 @command()
 @arguments.TARGET
+@click.argument("rule", required=False, type=PATH)
 @option("--budget", type=float, help="Approximate time in seconds  [default: 60]")
 @option("--boxes", type=int, help="Maximum boxes to examine.")
 @option("--samples", default=4096, help="Simulations of the undecided part.")
@@ -29,6 +30,7 @@ from verifai_jax.cli.json_output import command, give_result, say, show_result
 )
 def verify(
     target: str,
+    rule: Path | None,
     only: str | None,
     into: Path | None,
     plot: Path | None,
@@ -36,10 +38,22 @@ def verify(
     fail_on: Gate | None,
     **options: Any,
 ) -> None:
-    """Divide the features of TARGET (FILE.py:NAME) into proved, broken and undecided boxes."""
+    """Divide the features of TARGET (FILE.py:NAME) into proved, broken and undecided boxes.
+
+    With RULE, a property in VNN-LIB, TARGET is a network in ONNX. The answer is `holds`,
+    `counterexample` with its inputs and outputs, or `unknown`.
+    """
     from verifai_jax import Stop
     from verifai_jax import verify as run
 
+    if (rule is None) == target.endswith(".onnx"):
+        raise click.UsageError(
+            "a network and a property go together: NETWORK.onnx PROPERTY.vnnlib, or FILE.py:NAME "
+            "without a property"
+        )
+    if rule is not None:
+        _of_network(target, rule, into, fail_on, options)
+        return
     problem = arguments.load_problem(target, only)
     before = into if into is not None and into.exists() else None
     stop = Stop(seconds=options.pop("budget"))
@@ -53,4 +67,28 @@ def verify(
     if report is not None:
         say(f"  report       {found.report(report, problem=problem)}")
     failed = {"counterexample": found.broken.mass > 0, "undecided": found.proved.mass < 1}
+    check_gate(fail_on, failed)
+
+
+def _of_network(
+    target: str, rule: Path, into: Path | None, fail_on: Gate | None, options: dict[str, Any]
+) -> None:
+    """Answer a property of a network alone."""
+    from verifai_jax.addons.verification.network import verify_network
+
+    known = ("budget", "boxes", "seed", "precision", "progress")
+    given = {name: options[name] for name in known if options[name] is not None}
+    found = verify_network(target, rule, **given)
+    say(found.verdict)
+    for name in ("inputs", "outputs"):
+        numbers = getattr(found, name)
+        if numbers is not None:
+            say(f"  {name:12} {' '.join(f'{number:z.9g}' for number in numbers)}")
+    say(f"  proved       {100 * found.proved:z.4g} % of the inputs")
+    counterexample = None if found.inputs is None else found.inputs.tolist()
+    give_result(verdict=found.verdict, counterexample=counterexample, proved=found.proved)
+    if into is not None:
+        say(f"  boxes        {found.save(into)}")
+    failed = {"counterexample": found.verdict == "counterexample",
+              "undecided": found.verdict != "holds"}  # fmt: skip
     check_gate(fail_on, failed)

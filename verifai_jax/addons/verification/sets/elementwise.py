@@ -20,14 +20,18 @@ from verifai_jax.addons.verification.sets.whole import Whole
 
 
 def _levelled(values: list[Value]) -> list[Value]:
-    """Return operands of one rank: numbers that stand for arrays get their axes."""
-    rank = max(len(value.shape) for value in values)
+    """Return operands of one shape: numbers that stand for arrays are repeated.
+
+    All parts of a set need it, since a later sum counts the slopes as often as they stand there.
+    """
+    shape = np.broadcast_shapes(*(value.shape for value in values))
 
     def widen(array: np.ndarray, leading: int) -> np.ndarray:
-        missing = rank + leading - array.ndim
-        return array.reshape(*array.shape[:leading], *(1,) * missing, *array.shape[leading:])
+        front, missing = array.shape[:leading], len(shape) + leading - array.ndim
+        array = array.reshape(*front, *(1,) * missing, *array.shape[leading:])
+        return np.broadcast_to(array, (*front, *shape))
 
-    return [value if len(value.shape) == rank else value.moved(widen) for value in values]
+    return [value if value.shape == shape else value.moved(widen) for value in values]
 
 
 _OF_TWO: dict[str, Callable[[Form, Form], Form]] = {
@@ -110,6 +114,14 @@ def _compare(t: Interpreter, step: Equation, inputs: list[Value]) -> list[Value]
         low = np.where(unknown(*a.bounds()), -1, 0)
         return [whole.compared(name, low, -low)]
     return [whole.compared(name, *functions.difference(a, as_form(b)).bounds())]
+
+
+@rule("lt_to", "le_to")
+def _in_total_order(t: Interpreter, step: Equation, inputs: list[Value]) -> list[Value]:
+    """Compare floats in an order in which zeros have signs: only different numbers are decided."""
+    a, b = _levelled(inputs)
+    low, high = functions.difference(as_form(a), as_form(b)).bounds()
+    return [Whole.truth(high < 0, low > 0)]
 
 
 @rule("not")

@@ -15,7 +15,7 @@ ordinary differential equations, Applied Mathematics and Computation 105 (1999),
 import contextlib
 import math
 from collections.abc import Callable, Sequence
-from functools import partial
+from functools import lru_cache, partial
 from typing import Any
 
 import jax
@@ -165,6 +165,14 @@ def _flow(t: Interpreter, step: Equation, inputs: list[Value]) -> list[Value]:
     return list(t.latest[2])
 
 
+@lru_cache(maxsize=64)
+def _part(program: Program, count: int, orders: tuple[int, ...]) -> Program:
+    """Return what computes the derivatives of some orders, of `count` arrays of a state."""
+    wanted = [i // count + 1 in orders for i in range(len(program.outvars))]
+    whole = program.replace(constvars=[], invars=[*program.constvars, *program.invars])
+    return without_unused(whole, wanted)
+
+
 class _Step:
     """One step of a differential equation on sets, by a program of all derivatives of a state.
 
@@ -172,12 +180,8 @@ class _Step:
     """
 
     def __init__(self, t: Interpreter, program: Program, shared: Sequence[Value], count: int):
-        size = len(program.outvars)
-        program = program.replace(constvars=[], invars=[*program.constvars, *program.invars])
-
         def some(*orders: int) -> Callable[..., list[Form]]:
-            wanted = [i // count + 1 in orders for i in range(size)]
-            part = without_unused(program, wanted)
+            part = _part(program, count, orders)
             return lambda shared, time, state: [
                 *map(as_form, t.closed(part, [*shared, time, *state]))
             ]

@@ -271,8 +271,25 @@ def joint_slopes(a: Form, b: Form, first: Reals | float, second: Reals | float) 
     return padded(a, count) * first + padded(b, count) * second
 
 
+def exactly(centre: Reals, rest: Reals, dtype: np.dtype) -> Form | None:
+    """Return what an operation on numbers gives, if the type has all results; otherwise None.
+
+    **Arguments:**
+    - `rest`: how far the results are from `centre`.
+    """
+    exact = (rest == 0) & ((centre == 0) | (np.abs(centre) >= rounding(dtype).smallest))
+    exact &= centre.astype(dtype).astype(np.float64) == centre
+    return Form.constant(centre[0], dtype) if len(centre) == 1 and exact.all() else None
+
+
 def add(a: Form, b: Form, sign: float = 1.0) -> Form:
     """Return `a + b`, or `a - b` for sign -1."""
+    if is_point(a) and is_point(b):
+        end, other = a.centre + sign * b.centre, sign * b.centre
+        back = end - a.centre
+        rest = (a.centre - (end - back)) + (other - back)
+        if (form := exactly(end, rest, a.dtype)) is not None:
+            return form
     (a, b), frame, _ = alike([a, b])
     slopes = joint_slopes(a, b, 1.0, sign)
     centre = a.centre + b.centre if sign > 0 else a.centre - b.centre
@@ -346,6 +363,13 @@ def interval_product(a: Form, b: Form) -> tuple[Reals, Reals]:
 
 def product(a: Form, b: Form) -> Form:
     """Return `a * b` for two different forms."""
+    if is_point(a) and is_point(b):
+        result = a.centre * b.centre
+        # Products of numbers of single precision fit double precision; of others, of small ones.
+        fits = a.dtype.itemsize <= 4 or bool(_whole(a.centre).all() and _whole(b.centre).all())
+        rest = np.full(result.shape, 0.0 if fits else 1.0)
+        if (form := exactly(result, rest, a.dtype)) is not None:
+            return form
     for one, other in ((a, b), (b, a)):
         if is_point(one) and np.isfinite(one.centre).all():
             return scaled(other, one.centre)
@@ -363,6 +387,11 @@ def product(a: Form, b: Form) -> Form:
         radius = radius - np.abs(squares).sum(0) / 2
     slack = (np.abs(a.centre) + a.spread) * (np.abs(b.centre) + b.spread) * SLACK
     return rounded(centre, slopes, radius + slack, size, a.dtype, ends, frame)
+
+
+def _whole(numbers: Reals) -> Reals:
+    """Return which numbers are whole, halves or quarters, and small."""
+    return (np.round(4 * numbers) == 4 * numbers) & (np.abs(numbers) < 2**24)
 
 
 def total(a: Form, axes: Sequence[int]) -> Form:

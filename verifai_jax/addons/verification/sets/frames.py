@@ -3,13 +3,14 @@
 A step of a loop rotates and shears the set of states, and nonlinear terms add an uncertainty to
 each number. If each step enclosed the set in a box, the boxes would grow. Here the uncertainties of
 a loop's carried numbers are symbols, which the next step treats like those of the features. Once
-there are many, they are replaced by the symbols of one parallelepiped, with orthogonal sides after
-scaling. The uncertainties of a layer's units stay separate symbols through the following layers, up
-to a result of few numbers.
+there are many, the shortest are replaced by the symbols of one parallelepiped, with orthogonal
+sides after scaling. The uncertainties of a layer's units stay separate symbols through the
+following layers, up to a result of few numbers.
 
 Source: R. Lohner, Enclosing the solutions of ordinary initial and boundary value problems (1987);
 N. Nedialkov, K. Jackson, G. Corliss, Validated solutions of initial value problems for ordinary
-differential equations, Applied Mathematics and Computation 105 (1999), section 6.
+differential equations, Applied Mathematics and Computation 105 (1999), section 6. A. Girard,
+Reachability of uncertain linear systems using zonotopes, HSCC (2005).
 """
 
 import itertools
@@ -28,10 +29,11 @@ FEW = 8
 """Numbers of a result that do not carry the symbols of layers on: what follows would cost more."""
 WORTH = 0.002
 """Share of the spread from which on what is not linear gets symbols of its own."""
-ORDER = 6
-"""Symbols for each number that a loop carries, beyond which they become those of a parallelepiped.
-With as many as there are numbers the quadrotor of benchmarks/verify.py has no bounds after 78
-steps, with six times as many they stay narrow, and the other problems take less time as well."""
+FINE, COARSE, FINE_BOXES = (20, 15), (6, 4), 64
+"""Symbols for each number that a loop carries, beyond which they are made fewer, and how many are
+left then: the longest, and those of one parallelepiped around the others. If all become a
+parallelepiped, the TORA of benchmarks/ainncs.py has no bounds. Many boxes are small ones, for which
+fewer symbols do, and which take twice the time with more."""
 _NUMBERS = itertools.count(1)
 
 
@@ -70,8 +72,9 @@ def framed(carry: Sequence[Form | Whole], boxes: int, features: int) -> list[For
     noise[:, :, : old - features] = slopes[features:].transpose(1, 2, 0)
     noise[:, np.arange(count), old - features + np.arange(count)] = radius
     sides, rest = noise, np.zeros((boxes, count))
-    if noise.shape[2] > ORDER * count:
-        sides, rest = _sides(noise)
+    limit, left = FINE if boxes <= FINE_BOXES else COARSE
+    if noise.shape[2] > limit * count:
+        sides, rest = _reduced(noise, left)
     new = np.concatenate([slopes[:features], sides.transpose(2, 0, 1)])
     radius = np.where(bounded, rest + 4 * SLACK * np.abs(noise).sum(2), np.inf)
     size = np.minimum(size, np.maximum(np.abs(low), np.abs(high)))
@@ -103,6 +106,22 @@ def of_layer(units: Form, features: int) -> Form:
         np.where(bounded, 0.0, np.inf), units.size, units.dtype, units.low, units.high,
         Frame(next(_NUMBERS), first, first + count, outer, of_layer=True),
     )  # fmt: skip
+
+
+def _reduced(noise: np.ndarray, of_each: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return fewer symbols that contain those of `noise`: the longest ones, and a parallelepiped.
+
+    A parallelepiped around all of them would forget how the longest ones move together.
+    """
+    count = noise.shape[1]
+    size = np.abs(noise / np.maximum(np.abs(noise).sum(2, keepdims=True), 1e-300))
+    # Girard: what a box around a symbol has more than the symbol itself.
+    gain = size.sum(1) - size.max(1)
+    order = np.argsort(-gain, axis=1, kind="stable")
+    arranged = np.take_along_axis(noise, order[:, None, :], axis=2)
+    kept = (of_each - 1) * count
+    sides, rest = _sides(arranged[:, :, kept:])
+    return np.concatenate([arranged[:, :, :kept], sides], axis=2), rest
 
 
 def _sides(noise: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -1,0 +1,144 @@
+"""Products of matrices and convolutions, on sets."""
+
+import functools
+from collections.abc import Sequence
+
+import numpy as np
+
+from verifai_jax.addons.verification.sets.arrays import add_up, times_each, together
+from verifai_jax.addons.verification.sets.form import Form, is_point, rounded
+from verifai_jax.addons.verification.sets.frames import FEW, of_layer
+from verifai_jax.addons.verification.sets.interpreter import (
+    Equation,
+    Interpreter,
+    Value,
+    constant,
+    rule,
+)
+from verifai_jax.addons.verification.sets.whole import Whole
+
+Axes = tuple[Sequence[int], Sequence[int]]
+
+
+@rule("dot_general")
+def _dot(t: Interpreter, step: Equation, inputs: list[Value]) -> list[Value]:
+    contracted, batched = step.params["dimension_numbers"]
+    form = step.outvars[0].aval
+    return [_contracted(t, inputs[0], inputs[1], contracted, batched, np.dtype(form.dtype))]
+
+
+def _contracted(
+    t: Interpreter, a: Value, b: Value, contracted: Axes, batched: Axes, dtype: np.dtype
+) -> Value:
+    """Return sums of products over the contracted axes, those of each batch apart."""
+    letters = iter("abcdefghijklmnopqrstuvw")
+    joint = [next(letters) for _ in batched[0]], [next(letters) for _ in contracted[0]]
+    names: list[str] = []
+    for value, outer, inner in zip((a, b), batched, contracted, strict=True):
+        known = dict(zip((*outer, *inner), (*joint[0], *joint[1]), strict=True))
+        names.append("".join(known.get(i) or next(letters) for i in range(len(value.shape))))
+    free = ["".join(c for c in name if c not in joint[0] + joint[1]) for name in names]
+    result = "".join(joint[0]) + free[0] + free[1]
+    count = _count(a, b, contracted, batched)
+    for form, other, (own, its) in ((a, b, names), (b, a, names[::-1])):
+        if isinstance(form, Whole) or isinstance(other, Whole):
+            continue
+        if is_point(other) and np.isfinite(other.centre).all():
+            text = f"...{own},{its}->...{result}"
+            terms = int(np.prod([form.shape[own.index(c)] for c in joint[1]], dtype=np.int64))
+            few = count < FEW
+            if not few and len(form.shape) == 1:
+                form = of_layer(form, t.features)
+            sums = _times(form, other.centre[0], text, dtype, terms)
+            return sums.unframed(lambda frame: not frame.of_layer) if few else sums
+    axes = result + "".join(joint[1])
+
+    def spread(name: str, array: np.ndarray, lead: int) -> np.ndarray:
+        order = sorted(range(len(name)), key=lambda i: axes.index(name[i]))
+        sizes = {name[i]: array.shape[lead + i] for i in range(len(name))}
+        array = array.transpose(*range(lead), *(lead + i for i in order))
+        return array.reshape(*array.shape[:lead], *(sizes.get(c, 1) for c in axes))
+
+    a, b = (
+        value.moved(functools.partial(spread, name))
+        for value, name in zip((a, b), names, strict=True)
+    )
+    if isinstance(a, Whole) and isinstance(b, Whole):
+        a, b = (Whole(each.low, each.high, dtype) for each in (a, b))
+    return add_up(times_each(a, b), range(len(result), len(axes)))
+
+
+def _count(a: Value, b: Value, contracted: Axes, batched: Axes) -> int:
+    """Return how many numbers a result has."""
+    free = [
+        size for value, ours, theirs in zip((a, b), contracted, batched, strict=True)
+        for axis, size in enumerate(value.shape) if axis not in (*ours, *theirs)
+    ]  # fmt: skip
+    return int(np.prod([*free, *(a.shape[axis] for axis in batched[0])], dtype=np.int64))
+
+
+def _times(a: Form, numbers: np.ndarray, names: str, dtype: np.dtype, terms: int) -> Form:
+    """Return sums of so many products of a form and exact numbers, as einsum names them."""
+    times = functools.partial(np.einsum, names, optimize=["einsum_path", (0, 1)])
+    slopes = None if a.slopes is None else times(a.slopes, numbers)
+    size = np.abs(numbers)
+    return rounded(
+        times(a.centre, numbers), slopes, times(a.radius, size), times(a.size, size), dtype,
+        None, a.frame, units=terms + 1.0,
+    )  # fmt: skip
+
+
+@rule("conv_general_dilated")
+def _convolution(t: Interpreter, step: Equation, inputs: list[Value]) -> list[Value]:
+    """Collect the numbers that each result is a sum of, zeros for padding, and multiply those."""
+    params, (image, kernel) = step.params, inputs
+    forms = params["dimension_numbers"]
+    groups, batches = params["feature_group_count"], params["batch_group_count"]
+    dtype, parts = np.dtype(step.outvars[0].aval.dtype), groups * batches
+    size = int(np.prod(image.shape, dtype=np.int64))
+    numbers = np.arange(size).reshape(image.shape).transpose(forms.lhs_spec)
+    depth, inner, *taps = (kernel.shape[axis] for axis in forms.rhs_spec)
+    points = [step.outvars[0].aval.shape[axis] for axis in forms.out_spec[2:]]
+    grids = list[np.ndarray]()
+    for i, (n, position, tap) in enumerate(zip(numbers.shape[2:], points, taps, strict=True)):
+        along = np.arange(position)[:, None] * params["window_strides"][i] - params["padding"][i][0]
+        along = along + np.arange(tap) * params["rhs_dilation"][i]
+        gap = params["lhs_dilation"][i]
+        inside = (along >= 0) & (along <= (n - 1) * gap) & (along % gap == 0)
+        grids.append(np.where(inside, along // gap, n))
+    # The number after the last one, along any axis, is the zero that stands for padding.
+    numbers = np.pad(numbers, [(0, 0), (0, 0)] + [(0, 1)] * len(points), constant_values=size)
+    for i, grid in enumerate(grids):
+        numbers = numbers.take(grid, 2 + 2 * i)
+    rank, each = len(points), image.shape[forms.lhs_spec[0]] // batches
+    evens, odds = (range(start, 2 + 2 * rank, 2) for start in (2, 3))
+    numbers = numbers.transpose(0, 1, *evens, *odds)
+    numbers = numbers.reshape(batches, each, groups, inner, *points, -1)
+    numbers = numbers.transpose(0, 2, 1, *range(4, 4 + rank), 3, 4 + rank)
+    # One part is a product of matrices, which is faster than one with an axis for parts.
+    several = () if parts == 1 else (parts,)
+    numbers = numbers.reshape(*several, -1, int(np.prod([inner, *taps], dtype=np.int64)))
+    flat = image.moved(lambda array, lead: array.reshape(*array.shape[:lead], -1))
+    if isinstance(flat, Form) and isinstance(kernel, Form) and is_point(kernel):
+        flat = of_layer(flat, t.features)
+    zero = constant(np.zeros(1), flat.dtype)
+    flat = together([flat, zero], lambda arrays, lead: np.concatenate(arrays, lead))
+    picked = flat.moved(lambda array, lead: array[..., numbers])
+
+    def arranged(array: np.ndarray, lead: int) -> np.ndarray:
+        array = array.transpose(*range(lead), *(lead + axis for axis in forms.rhs_spec))
+        return array.reshape(*array.shape[:lead], *several, depth // parts, numbers.shape[-1])
+
+    last, joint = (len(several) + 1,), tuple(range(len(several)))
+    found = _contracted(t, picked, kernel.moved(arranged), (last, last), (joint, joint), dtype)
+
+    def placed(array: np.ndarray, lead: int) -> np.ndarray:
+        front = array.shape[:lead]
+        array = array.reshape(*front, parts, each, *points, depth // parts)
+        order = (1, 0, 2 + rank, *range(2, 2 + rank))
+        array = array.transpose(*range(lead), *(lead + axis for axis in order))
+        array = array.reshape(*front, each, depth, *points)
+        back = np.argsort(forms.out_spec)
+        return array.transpose(*range(lead), *(lead + int(axis) for axis in back))
+
+    return [found.moved(placed)]
