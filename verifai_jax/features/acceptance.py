@@ -27,7 +27,7 @@ the measurement."""
 
 def acceptance_rate(
     where: Callable[[Float[Array, " d"]], Array],
-    accepts: Callable[[Float[np.ndarray, "n d"]], Bool[Array, " n"]],
+    accepts: Callable[[Float[np.ndarray, "n d"]], Bool[Array | np.ndarray, " n"]],
     names: Sequence[str],
     dim: int,
     seed: int | Key[Array, ""] = 0,

@@ -115,7 +115,7 @@ def distinguishing_features(run: Run) -> list[str]:
     """
     table = run.table.all
     # Items that do not exist have no value, which differs from all other values.
-    varying = [name for name in run.table.features if len(pd.unique(table[name])) > 1]
+    varying = [name for name in run.table.features if len(table[[name]].drop_duplicates()) > 1]
     numeric = [n for n in varying if np.issubdtype(table[n].to_numpy().dtype, np.number)]
     failing, safe = run.table.counterexamples, run.table.safe
     if len(failing) and len(safe):

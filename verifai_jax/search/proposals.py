@@ -57,7 +57,8 @@ class Proposals:
 
     def __init__(
         self, search: Search, cube: Cube, batch: int, key: Key[Array, ""],
-        accepts: Callable[[Any], Bool[Array, " n"]] | None = None, coverage_ids: int = 0,
+        accepts: Callable[[Any], Bool[Array | np.ndarray, " n"]] | None = None,
+        coverage_ids: int = 0,
         improve: Callable[[Any], Float[Any, "batch d"]] | None = None,
     ) -> None:  # fmt: skip
         self.search, self.batch, self.cube = search, batch, cube
