@@ -86,6 +86,8 @@ def replaced_in_turn(function: ast.AST) -> bool:
 def test_files_that_belong_together_are_complete_together():
     found = set()
     for file in sorted(ROOT.rglob("*.py")):
+        if "replacing(" not in file.read_text():
+            continue
         for node in ast.walk(ast.parse(file.read_bytes())):
             if isinstance(node, ast.FunctionDef) and replaced_in_turn(node):
                 found.add(file.relative_to(ROOT).as_posix())
