@@ -64,6 +64,36 @@ def reading(tree: ast.AST) -> Iterator[int]:
             yield node.lineno
 
 
+LOOPS = {
+    "cli/new.py": "files of a new project, each of which is asked for by itself",
+}
+"""Files that replace files one after the other, and why they may."""
+
+
+def replaced_in_turn(function: ast.AST) -> bool:
+    """Return whether a function replaces several files, not all complete before the first."""
+    found = 0
+    for node in ast.walk(function):
+        if isinstance(node, ast.With) and any("replacing(" in ast.unparse(i) for i in node.items):
+            inner = any(each is not node and isinstance(each, ast.With) and node in ast.walk(each)
+                        for each in ast.walk(function))  # fmt: skip
+            looped = any(isinstance(each, ast.For | ast.While) and node in ast.walk(each)
+                         for each in ast.walk(function))  # fmt: skip
+            found += 2 if looped else not inner
+    return found > 1
+
+
+def test_files_that_belong_together_are_complete_together():
+    found = set()
+    for file in sorted(ROOT.rglob("*.py")):
+        if "replacing(" not in file.read_text():
+            continue
+        for node in ast.walk(ast.parse(file.read_bytes())):
+            if isinstance(node, ast.FunctionDef) and replaced_in_turn(node):
+                found.add(file.relative_to(ROOT).as_posix())
+    assert found == set(LOOPS), "write them as core/store/atomic_files.py says"
+
+
 def test_what_a_stranger_may_have_made_is_opened_in_one_way():
     found = {}
     for file in sorted(ROOT.rglob("*.py")):

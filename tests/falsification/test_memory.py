@@ -78,7 +78,7 @@ def resident():
     with open("/proc/self/statm") as file:
         return int(file.read().split()[1]) * 4096 / 2**20
 
-for number in range(60):
+for number in range(123):
     vj.falsify(problem(number), "uniform", 100, progress=False)
     if number == 9:
         few = resident()
@@ -88,14 +88,14 @@ print(few, resident())
 
 @pytest.mark.slow
 @pytest.mark.skipif(not os.path.exists("/proc/self/statm"), reason="there is no /proc")
-def test_sixty_problems_need_little_more_memory_than_ten(tmp_path):
+def test_many_problems_need_little_more_memory_than_ten(tmp_path):
     environment = {**os.environ, "VERIFAI_JAX_CACHE": str(tmp_path)}
     done = subprocess.run(
         [sys.executable, "-c", SOAK, os.path.dirname(__file__)], env=environment,
         capture_output=True, text=True, check=True,
     )  # fmt: skip
     few, many = map(float, done.stdout.split())
-    assert many - few < 40
+    assert many - few < 20
 
 
 def test_no_function_of_a_module_keeps_all_its_static_arguments():

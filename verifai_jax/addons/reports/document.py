@@ -11,7 +11,7 @@ from typing import Any, Protocol, runtime_checkable
 
 from verifai_jax.addons.reports.assessment import with_assessment
 from verifai_jax.addons.reports.claims import PAGE, sealed
-from verifai_jax.addons.reports.page import Page, write_page
+from verifai_jax.addons.reports.page import Page, render
 from verifai_jax.addons.reports.run_question import About
 from verifai_jax.addons.reports.run_report import run_page
 from verifai_jax.addons.reports.sections import with_files
@@ -143,10 +143,11 @@ def write_report(
         page = section.on_page(page)
     if assessment:
         page = with_assessment(page)
-    write_page(page, path)
-    claims = json.dumps(sealed({**page.claims, PAGE: file_hash(path)}), indent=2, allow_nan=False)
-    with replacing(claims_path(path)) as partial:
-        partial.write_text(claims + "\n", encoding="utf-8", newline="\n")
+    with replacing(path) as made, replacing(claims_path(path)) as claimed:
+        made.write_text(render(page), encoding="utf-8", newline="\n")
+        claims = sealed({**page.claims, PAGE: file_hash(made)})
+        text = json.dumps(claims, indent=2, allow_nan=False)
+        claimed.write_text(text + "\n", encoding="utf-8", newline="\n")
     return path
 
 

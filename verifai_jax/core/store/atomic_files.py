@@ -3,9 +3,11 @@
     with replacing("report.html") as partial:
         partial.write_text(page)                # takes the place of report.html at the end
 
-All files of results are written by it: tables, records, pictures, films, policies, reports. Its
-temporary file is locked while it is written, so the next writer in the folder knows those that a
-killed process left, and removes them.
+All files of results are written by it: tables, records, pictures, films, policies, reports. Files
+that belong together are complete before the first is renamed: `with replacing(a) as x, replacing(b)
+as y`; `replacements.py` replaces the files of a folder of their own by one rename. The temporary
+file is locked while it is written, so the next writer in the folder knows those that a killed
+process left, and removes them.
 """
 
 import contextlib

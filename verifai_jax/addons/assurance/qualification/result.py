@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from verifai_jax.addons.reports.markup import bullets, element, paragraph, table
-from verifai_jax.addons.reports.page import Page, Section, write_page
+from verifai_jax.addons.reports.page import Page, Section, render
 from verifai_jax.addons.reports.signing import signing_section
 from verifai_jax.core.display.notebook import InNotebook
 from verifai_jax.core.messages.text import counted, format_seconds, shorten
@@ -87,8 +87,6 @@ class Qualification(InNotebook):
             caught.append((number, hazard.error, hazard.oracle, here))
         plain = {**asdict(self), "passed": self.passed, "errors": errors}
         path = Path(folder) / "qualification.html"
-        with replacing(path.with_suffix(".json")) as partial:
-            partial.write_text(json.dumps(plain, indent=2) + "\n", encoding="utf-8")
         outcomes = [
             (e.name, e.what, "passed" if e.passed else f"fell: {e.message}", f"{e.seconds:z.1f}")
             for e in self.outcomes
@@ -120,7 +118,9 @@ class Qualification(InNotebook):
             ),
             claims={"package_sha256": self.package_sha256, "passed": self.passed},
         )  # fmt: skip
-        write_page(page, path)
+        with replacing(path) as made, replacing(path.with_suffix(".json")) as partial:
+            made.write_text(render(page), encoding="utf-8", newline="\n")
+            partial.write_text(json.dumps(plain, indent=2) + "\n", encoding="utf-8")
         return path
 
 

@@ -81,13 +81,12 @@ def trial_protocol(
         table.insert(0, "pair", pairs + 1)
     table.insert(0, "trial", np.arange(1, len(table) + 1))
     table["failed"] = ""
-    with replacing(path) as partial:
-        partial.write_text(_page(problem, table, seed), encoding="utf-8")
-    with replacing(path.with_suffix(".csv")) as partial:
-        table.to_csv(partial, index=False)
-    if policies:
-        with replacing(path.with_name(f"{path.stem}_key.csv")) as partial:
-            key.to_csv(partial, index=False)
+    with replacing(path) as sheet, replacing(path.with_suffix(".csv")) as filled:
+        sheet.write_text(_page(problem, table, seed), encoding="utf-8")
+        table.to_csv(filled, index=False)
+        if policies:
+            with replacing(path.with_name(f"{path.stem}_key.csv")) as partial:
+                key.to_csv(partial, index=False)
     return table
 
 
