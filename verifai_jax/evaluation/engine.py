@@ -33,7 +33,7 @@ from verifai_jax.core.compute.keys import as_key
 from verifai_jax.core.compute.precision import in_precision
 from verifai_jax.core.compute.remembered import is_kept, lower_or_recall, remembered_as
 from verifai_jax.evaluation.guidance import NOTHING, Guidance
-from verifai_jax.evaluation.layout import Layout, steps_of
+from verifai_jax.evaluation.layout import Layout
 from verifai_jax.evaluation.row import CubePoints, Inputs
 from verifai_jax.evaluation.row_program import Mode, RowProgram
 from verifai_jax.evaluation.verdicts import Verdicts, violations
@@ -42,9 +42,6 @@ from verifai_jax.problem.problem import Problem
 Wanted = Literal["auto", "xla", "native"]
 """What compiles the simulations of a run, as a person asks for it; see `NativeEngine`."""
 WANTED: tuple[Wanted, ...] = ("auto", "xla", "native")
-SHORT = 4000
-"""Steps of a simulation up to which its batches are traced sooner than a file of them is written:
-an automatic transmission has 1500."""
 FIRST = 512
 """Rows of a run that XLA simulates in any case, so that the first result waits for no second
 compiler; and rows that it simulates at a time where it only decides what is near to zero."""
@@ -252,10 +249,9 @@ class Engine:
         traced = self.program.trace(mode)
         if self.alone:
             return traced.lower()
-        long = sum(1 for _ in steps_of(traced.jaxpr.jaxpr)) > SHORT
-        computes = fingerprint(traced.jaxpr, derivatives=False) if long else None
+        name = self._kept_as("simulations", fingerprint(traced.jaxpr, derivatives=False))
         program = layout.spread(as_traced(traced), self.own_keys)
-        return lower_or_recall(self._kept_as("simulations", computes), program, self._arguments)
+        return lower_or_recall(name, program, self._arguments)
 
     def _kept_as(self, kind: str, computes: str | None, *values: object) -> str | None:
         """Return the name under which a program of batches is kept on disk, if it can be."""

@@ -84,7 +84,7 @@ class Layout(NamedTuple):
         """
         if jax.default_backend() != "cpu":
             return self
-        steps = list(steps_of(program))
+        steps = list(_steps(program))
         layout = self._replace(wide=all(step.primitive.name in PLAIN for step in steps))
         together = any(
             step.primitive.name.startswith(TOGETHER) and any(v.aval.size > 1 for v in step.invars)
@@ -151,11 +151,11 @@ def chunks_and_lanes(problem: Problem, batch: int, devices: int) -> tuple[int, i
     return chunks, -(-per_device // chunks)
 
 
-def steps_of(program: Any) -> Iterator[Any]:
+def _steps(program: Any) -> Iterator[Any]:
     """Yield the steps of a `Jaxpr`, in place of loops and calls those within them."""
     for step in program.eqns:
         inside = programs_in(step)
         for each in inside:
-            yield from steps_of(each)
+            yield from _steps(each)
         if not inside:
             yield step
