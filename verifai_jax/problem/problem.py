@@ -6,7 +6,6 @@
 `Problem.check()` says everything that is wrong with it before anything compiles.
 """
 
-import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from html import escape
@@ -375,19 +374,12 @@ class Problem(InNotebook):
 
     @truncate_silently()
     def _form(self) -> Trace | None:
-        features, watched, seconds = self.space.feature_form, None, list[float]()
-
-        def once() -> Any:
-            started = time.perf_counter()
-            result = traced(self.system, features)
-            seconds.append(time.perf_counter() - started)
-            return result
-
+        features, watched = self.space.feature_form, None
         try:
             if self.black_box or not traced_by_default(self.system):
                 trace = self.system.abstract(features)
             else:
-                watched = watch(self.system, once)
+                watched = watch(self.system, lambda: traced(self.system, features))
                 trace = watched.result[1]
         except Exception as error:
             raise self._wrong_system(error, features) from error
@@ -408,7 +400,7 @@ class Problem(InNotebook):
             return trace
         self.programs.get(TRACED, _settings(), lambda: watched.result)
         self.programs.get(KEPT, None, lambda: watched.kept)
-        self.programs.get(SECONDS, None, lambda: min(seconds))
+        self.programs.get(QUICK, None, lambda: watched.quick)
         if (alone := why_not_batched(watched.result[0].jaxpr)) is not None:
             raise ProblemError(
                 f"the system of problem {self.name!r} cannot be simulated in batches: {alone}"
@@ -440,8 +432,8 @@ KEPT: Slot[None, tuple[str, ...]] = Slot("kept")
 """What each call of a problem's system changes, in words."""
 FORM: Slot[None, Trace | None] = Slot("form")
 """The form of the traces of a problem's system."""
-SECONDS: Slot[None, float] = Slot("seconds of tracing")
-"""Seconds that one tracing of a problem's system takes."""
+QUICK: Slot[None, bool] = Slot("quick")
+"""Whether a problem's system is quick to trace."""
 TRACED: Slot[tuple[str, ...], tuple[Any, Trace]] = Slot("traced")
 """The program of the system and the form of its traces, by JAX's precision and generator."""
 FINGERPRINT: Slot[None, str] = Slot("fingerprint")

@@ -13,11 +13,10 @@ import jax
 
 from verifai_jax.core.compute.compilation import Slot
 from verifai_jax.core.compute.fingerprint import used_inputs
-from verifai_jax.core.compute.purity import PATIENCE
 from verifai_jax.core.values.trace import Trace
 from verifai_jax.features import Domain
 from verifai_jax.mtl.shortfalls import shortfalls
-from verifai_jax.problem.problem import KEPT, SECONDS, Problem
+from verifai_jax.problem.problem import KEPT, QUICK, Problem
 from verifai_jax.problem.tracing import judged_results, traced_by_default
 
 COMPARED = ". A Categorical of texts has the place of the choice as its value, which no text equals"
@@ -68,8 +67,7 @@ def mistakes_of_the_system(problem: Problem) -> Iterator[str]:
 
 def is_quick(problem: Problem) -> bool:
     """Return whether a system was quick to trace, and so is likely quick to simulate."""
-    seconds = problem.programs.peek(SECONDS, None)
-    return seconds is not None and seconds <= PATIENCE
+    return bool(problem.programs.peek(QUICK, None))
 
 
 def _unread(problem: Problem) -> Iterator[str]:

@@ -38,11 +38,13 @@ Program: TypeAlias = Any
 class Watched:
     """The result of the first tracing of a function, with what was seen of its memory.
 
+    - `quick`: whether it took at most `PATIENCE` seconds.
     - `kept`: what each call changes, in words.
     - `why_impure`: why the program is not that of each call; None for a function that is pure.
     """
 
     result: Any
+    quick: bool
     kept: tuple[str, ...] = ()
     why_impure: str | None = None
 
@@ -67,7 +69,7 @@ def watch(root: object, trace: Callable[[], Any], twice: bool = True) -> Watched
     first = state_of(root)
     kept = changed(before, first)
     if not kept and not (twice and quick):
-        return Watched(result)
+        return Watched(result, quick)
     leaked = [name for name in kept if holds_tracer(first, name)]
     programs, line = [_program(result)], None
     try:
@@ -84,9 +86,9 @@ def watch(root: object, trace: Callable[[], Any], twice: bool = True) -> Watched
     later = [*leaked, *changed(first, after)]
     kept = [name for name in kept if name in later and name != CHANCE]
     if not varies and not (leaked and any(map(_has_tracers, programs))):
-        return Watched(result, tuple(kept))
+        return Watched(result, quick, tuple(kept))
     where = "" if line is None else f" (see {line})"
-    return Watched(result, tuple(kept), f"{why_differs(kept)}{where}")
+    return Watched(result, quick, tuple(kept), f"{why_differs(kept)}{where}")
 
 
 def why_differs(kept: list[str]) -> str:
