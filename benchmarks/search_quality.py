@@ -2,11 +2,15 @@
 
     python benchmarks/search_quality.py landscapes [--seeds 24] [--searches bayes,bandit]
     python benchmarks/search_quality.py cartpole [--seeds 20] [--problem rare]
+    python benchmarks/search_quality.py kinds [--seeds 10]
 
 What counts is the number of the simulation that found the first failure. On the landscapes the
 share of failures is known, and with it what uniform sampling needs in the median, log(2) / share;
 a search's entry is how many times fewer it needs. On the controller the failure rate is measured
 first. A simulation with a derivative counts as one; the row `gradient (as 2)` counts it as two.
+
+`kinds` counts how many of eight wells the default search has failures in after 3000 simulations,
+with each number that decides about that changed in turn.
 """
 
 import argparse
@@ -23,6 +27,8 @@ from landscapes import LANDSCAPES, tell_of
 import verifai_jax as vj
 from benchmarks.seeds import first_failures
 from verifai_jax.core.user_code.targets import load_target
+from verifai_jax.core.values.cube import Cube
+from verifai_jax.search import kinds, portfolio
 
 BATCH = {"uniform": 512, "halton": 512, "sobol": 512, "gradient": 8, "bayes": 8}
 ACTIVE_BATCH = 16
@@ -54,8 +60,8 @@ def searches(chosen):
 def advance(search, rho, cube, batch, rounds, state):
     """Some rounds of every seed's search.
 
-    **Returns:** the states; the robustness `[seeds, rounds * batch]`, and what each simulation
-    counts with a derivative as two: 0 where a search that plans its rounds left a row out.
+    **Returns:** the states; the robustness `[seeds, rounds * batch]`, what each simulation counts
+    with a derivative as two, 0 where a search that plans its rounds left a row out; and the points.
     """
 
     def step(state, _):
@@ -67,11 +73,11 @@ def advance(search, rho, cube, batch, rounds, state):
             differentiates = search.plan(state, cube, batch).differentiate
         cost = jnp.where(observations.valid, jnp.where(differentiates, 2, 1), 0)
         value = jnp.where(cost > 0, value, jnp.inf)
-        return search.tell(state, cube, observations), (value, cost)
+        return search.tell(state, cube, observations), (value, cost, u)
 
     def one(state):
-        state, (values, costs) = jax.lax.scan(step, state, None, length=rounds)
-        return state, values.ravel(), costs.ravel()
+        state, (values, costs, u) = jax.lax.scan(step, state, None, length=rounds)
+        return state, values.ravel(), costs.ravel(), u.reshape(-1, cube.dim)
 
     return jax.vmap(one)(state)
 
@@ -88,7 +94,7 @@ def first_on_landscape(search, landscape, batch, seeds):
     first, doubled = np.full(seeds, np.inf), np.full(seeds, np.inf)
     done, spent = np.zeros(seeds), np.zeros(seeds)
     while done.min() < MAX_SIMULATIONS and np.isinf(first).sum() > (seeds - 1) // 2:
-        state, values, costs = advance(search, rho, cube, batch, rounds, state)
+        state, values, costs, _ = advance(search, rho, cube, batch, rounds, state)
         failing, costs = np.asarray(values) < 0, np.asarray(costs)
         number = done[:, None] + np.cumsum(costs > 0, axis=1)
         price = spent[:, None] + np.cumsum(costs, axis=1)
@@ -167,17 +173,98 @@ def on_cartpole(options):
         )
 
 
+WELLS = {4: 0.1, 6: 0.22}
+"""Radius of each of eight wells by dimension; together they are 0.4 % and 0.5 % of the cube."""
+PATIENCE = ((portfolio, "LESS_PATIENT", (1, 2, 4)),)
+NUMBERS = (
+    (kinds, "ENOUGH", (10, 5, 20)),
+    (kinds, "REACH", (0.05, 0.025, 0.1)),
+    (kinds, "TAPER", (0.15, 0.075, 0.3)),
+)
+"""Numbers of the default search, the chosen one first."""
+
+
+def wells(d):
+    """Eight wells far from each other, whose walls are up to twice as steep as the first's."""
+    rng, centres = np.random.default_rng(d), []
+    while len(centres) < 8:
+        point = rng.uniform(0.08, 0.92, d)
+        if all(np.linalg.norm(point - other) > 2.5 * WELLS[d] for other in centres):
+            centres.append(point)
+    centres, slopes = np.array(centres, np.float32), np.linspace(1, 2, 8, dtype=np.float32)
+
+    def rho(u):
+        far = jnp.sqrt(jnp.sum((u - centres) ** 2, axis=1) + 1e-9)
+        return jnp.min(slopes * (far - WELLS[d]))
+
+    def found(u):
+        far = np.linalg.norm(u[:, None] - centres, axis=2)
+        return len(set(far.argmin(axis=1)[far.min(axis=1) < WELLS[d]]))
+
+    return rho, found
+
+
+def kinds_of_runs(d, seeds, **options):
+    """Return how many wells each seed has failures in, and its number of failures."""
+    rho, found = wells(d)
+    space = {"u": vj.Box([0.0] * d, [1.0] * d)}
+    problem = vj.Problem(
+        "wells", space, lambda f, key: vj.Trace({"out": rho(f["u"])[None]}, dt=0.1),
+        "always out > 0",
+    )  # fmt: skip
+    cells = []
+    for seed in range(seeds):
+        search = vj.search.Portfolio(**options)
+        run = vj.falsify(problem, search, 3000, seed=seed, confirm=False, progress=False)
+        rows = run.table.violating
+        cells.append((found(problem.space.points(rows)), len(rows)))
+    return np.array(cells)
+
+
+def on_kinds(options):
+    """One line a number: wells found in whole runs, and without gradients in rounds of 128."""
+    for name, value in (("kinds", False), ("kinds", True)):
+        for d in WELLS:
+            cells = kinds_of_runs(d, options.seeds, kinds=value)
+            print(
+                f"{name}={value}, {d} dimensions: {cells[:, 0]}, failures {np.median(cells[:, 1])}"
+            )
+    for module, name, values in PATIENCE:
+        for value in values:
+            setattr(module, name, value)
+            found = [np.sort(kinds_of_runs(d, options.seeds)[:, 0]) for d in WELLS]
+            print(f"{name} {value}: median {[float(np.median(f)) for f in found]}, "
+                  f"mean {[float(np.mean(f)) for f in found]}", flush=True)  # fmt: skip
+        setattr(module, name, values[0])
+    search = vj.search.Portfolio(gradients=False)
+    for module, name, values in NUMBERS:
+        for value in values:
+            setattr(module, name, value)
+            jax.clear_caches()
+            medians = []
+            for d in WELLS:
+                (rho, found), cube = wells(d), Cube((0,) * d)
+                keys = jax.random.split(jax.random.key(7), options.seeds)
+                state = jax.vmap(lambda key, cube=cube: search.init(key, cube, 128))(keys)
+                _, rows, _, u = advance(search, rho, cube, 128, 3000 // 128, state)
+                counts = [found(np.asarray(u[i][rows[i] < 0])) for i in range(options.seeds)]
+                medians.append((float(np.median(counts)), float(np.mean(counts))))
+            print(f"{name} {value}: median and mean {medians}", flush=True)
+        setattr(module, name, values[0])
+
+
 def main():
     """Measure and print one line a search."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("where", choices=["landscapes", "cartpole"])
+    parser.add_argument("where", choices=["landscapes", "cartpole", "kinds"])
     parser.add_argument("--seeds", type=int, default=24)
     parser.add_argument("--searches", default="", help="names, comma-separated")
     parser.add_argument("--landscapes", default="", help="names, comma-separated")
     parser.add_argument("--budget", type=int, default=10_000)
     parser.add_argument("--problem", default="rare", help="name of a problem in specs/cartpole.py")
     options = parser.parse_args()
-    {"landscapes": on_landscapes, "cartpole": on_cartpole}[options.where](options)
+    cases = {"landscapes": on_landscapes, "cartpole": on_cartpole, "kinds": on_kinds}
+    cases[options.where](options)
 
 
 if __name__ == "__main__":
