@@ -126,13 +126,9 @@ class Replay(InNotebook):
         return lazy_import("verifai_jax.pictures.replay", "plot_replay")(self, path, signals)
 
     def animate(
-        self,
-        path: str | Path | None = None,
-        *,
-        camera: str | None = None,
-        size: Sequence[int] | None = None,
-        fps: float | None = None,
-    ) -> Any:
+        self, path: str | Path | None = None, *, camera: str | None = None,
+        size: Sequence[int] | None = None, fps: float | None = None,
+    ) -> Any:  # fmt: skip
         """Draw the simulation as an animated GIF, which notebooks display.
 
         **Arguments:**
@@ -150,12 +146,9 @@ class Replay(InNotebook):
 
 @shows_progress("replaying a simulation of", "simulations")
 def replay(
-    problem: Problem,
-    row: "Mapping[str, Any] | pd.Series",
-    key: Key[Array, ""],
-    number: int | None = None,
-    precision: str = "float32",
-) -> Replay:
+    problem: Problem, row: "Mapping[str, Any] | pd.Series", key: Key[Array, ""],
+    number: int | None = None, precision: str = "float32",
+) -> Replay:  # fmt: skip
     """Simulate the features of `row` again with the random key of simulation `number`.
 
     **Raises:** `ValueError` for a precision other than float32 and float64.

@@ -182,13 +182,9 @@ class RowFunction(NamedTuple):
     guidance: Guidance
 
     def __call__(
-        self,
-        row: PyTree,
-        key: Key[Array, ""],
-        temperature: Float[Array, ""],
-        shared: PyTree,
+        self, row: PyTree, key: Key[Array, ""], temperature: Float[Array, ""], shared: PyTree,
         derivative: Derivative,
-    ) -> Row:
+    ) -> Row:  # fmt: skip
         """Evaluate one row; `derivative` is how it is differentiated, where it is."""
         if self.goals is None and not self.gradient:
             return self._plain(row, key, shared)
@@ -209,13 +205,9 @@ class RowFunction(NamedTuple):
         return self.inputs.coordinates(row, shared, self.precision)
 
     def objective(
-        self,
-        coordinates: Float[Array, " dim"],
-        row: PyTree,
-        key: Key[Array, ""],
-        temperature: Float[Array, ""],
-        shared: PyTree,
-    ) -> tuple[Float[Array, "*clauses"], PyTree]:
+        self, coordinates: Float[Array, " dim"], row: PyTree, key: Key[Array, ""],
+        temperature: Float[Array, ""], shared: PyTree,
+    ) -> tuple[Float[Array, "*clauses"], PyTree]:  # fmt: skip
         """Return the differentiated objective, and the results computed with it.
 
         The objective is the least smooth robustness, or the clauses of the goal nearest to failing.

@@ -189,14 +189,9 @@ class PointMaps:
     def cube(self) -> Cube:
         """The unit cube of this space, as searches see it."""
         return Cube(
-            levels=self.levels,
-            weights=self.weights,
-            ordered=self.ordered,
-            names=self.coordinates,
-            lengths=self.lengths,
-            signals=self.signals,
-            sequences=self.root.sequences,
-        )
+            levels=self.levels, weights=self.weights, ordered=self.ordered, names=self.coordinates,
+            lengths=self.lengths, signals=self.signals, sequences=self.root.sequences,
+        )  # fmt: skip
 
     def accepts(self, features: Mapping[str, Any]) -> Bool[Array, ""]:
         """Return whether the constraint holds; True without one. Pure JAX."""

@@ -173,10 +173,9 @@ def is_held(values: Shaped[np.ndarray, "t *vector"]) -> bool:
 
 
 def telling_signals(
-    names: Sequence[str],
-    curves: Mapping[str, Shaped[np.ndarray, "t *vector"]],
+    names: Sequence[str], curves: Mapping[str, Shaped[np.ndarray, "t *vector"]],
     shown: Sequence[str],
-) -> list[str]:
+) -> list[str]:  # fmt: skip
     """Return signals in order of their interest for a panel.
 
     Changing signals come before constant ones, and one signal of each body (`car_x` and `car_y`
@@ -283,15 +282,9 @@ def _shade(axes: Axes, clock: Float[np.ndarray, " t"], fails: Bool[np.ndarray, "
     edges = np.concatenate([clock[:1], (clock[1:] + clock[:-1]) / 2, clock[-1:]])
     # From edge to edge, so that a single instant is seen, too.
     axes.fill_between(
-        np.repeat(edges, 2)[1:-1],
-        0,
-        1,
-        where=np.repeat(fails, 2).tolist(),
-        transform=axes.get_xaxis_transform(),
-        color=FAILING,
-        alpha=0.13,
-        linewidth=0,
-    )
+        np.repeat(edges, 2)[1:-1], 0, 1, where=np.repeat(fails, 2).tolist(),
+        transform=axes.get_xaxis_transform(), color=FAILING, alpha=0.13, linewidth=0,
+    )  # fmt: skip
 
 
 def _name_signal(axes: Axes, name: str) -> None:

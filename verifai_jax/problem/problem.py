@@ -278,12 +278,9 @@ class Problem(InNotebook):
         return function(self, faults, by_simulator)
 
     def objective(
-        self,
-        semantics: Semantics = hard,
-        of: str = "unit",
-        key: Key[Array, ""] | None = None,
+        self, semantics: Semantics = hard, of: str = "unit", key: Key[Array, ""] | None = None,
         formula: str | None = None,
-    ) -> Callable[..., Float[Array, ""]]:
+    ) -> Callable[..., Float[Array, ""]]:  # fmt: skip
         """Return the robustness of one simulation as a pure function, for JAX to transform.
 
         `jax.grad(problem.objective(mtl.smooth(0.1)))(u)` is its gradient at a point of the unit

@@ -230,11 +230,9 @@ class Portfolio(Search[PortfolioState]):
         points, descents = propose(before.interior, cube, batch)
         # At their turn the others have not been asked.
         none = before._replace(
-            rows=jnp.zeros(3, jnp.int32),
-            differentiates=jnp.array(True),
-            opening=jnp.array(False),
+            rows=jnp.zeros(3, jnp.int32), differentiates=jnp.array(True), opening=jnp.array(False),
             interior=descents,
-        )
+        )  # fmt: skip
         state = choose(descents.turn, none, state._replace(interior=descents))
         return jnp.where(descents.turn, points, u), state
 
@@ -264,13 +262,9 @@ class Portfolio(Search[PortfolioState]):
         score, turn = without_clauses(observations).score, state.interior.turn
         costs = jnp.where(turn | state.differentiates, 2.0, 1.0)
         interior = learn(
-            state.interior,
-            cube,
-            observations,
-            score,
-            rows * costs,
+            state.interior, cube, observations, score, rows * costs,
             (state.mutation.points, state.mutation.score),
-        )
+        )  # fmt: skip
         # The steps of a descent are many, and of use to the others where they are good.
         limit = state.mutation.score[AMONG - 1]
         good = jnp.isfinite(limit) & ((score < limit) | (score == 0))

@@ -70,11 +70,9 @@ def _nonnegative(
 
 
 def shortest_in_box(
-    rows: Float[np.ndarray, "m k"],
-    maximum: Float[np.ndarray, " m"],
-    low: Float[np.ndarray, " k"],
+    rows: Float[np.ndarray, "m k"], maximum: Float[np.ndarray, " m"], low: Float[np.ndarray, " k"],
     high: Float[np.ndarray, " k"],
-) -> Float[np.ndarray, " k"] | None:
+) -> Float[np.ndarray, " k"] | None:  # fmt: skip
     """Compute the shortest `z` with `rows @ z <= maximum` and `low <= z <= high`.
 
     **Arguments:**

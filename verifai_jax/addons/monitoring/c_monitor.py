@@ -277,14 +277,9 @@ static inline void @name_finish(const @name *m, @name *scratch, double out[@outp
 
 
 def export_c(
-    formulas: Formula | str | Mapping[str, Formula | str],
-    dt: float,
-    name: str = "monitor",
-    *,
-    semantics: Semantics = hard,
-    every: bool = False,
-    sizes: Mapping[str, int] | None = None,
-) -> str:
+    formulas: Formula | str | Mapping[str, Formula | str], dt: float, name: str = "monitor", *,
+    semantics: Semantics = hard, every: bool = False, sizes: Mapping[str, int] | None = None,
+) -> str:  # fmt: skip
     """Return a C99 header with a monitor of one formula, or of several by name.
 
     Its `NAME_start`, `NAME_step`, `NAME_interval` and `NAME_finish` correspond to the methods of

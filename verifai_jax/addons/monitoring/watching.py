@@ -237,13 +237,9 @@ def watch(
     every: bool = ..., sizes: Mapping[str, int] | None = ...,
 ) -> Watch[dict[str, float]]: ...  # fmt: skip
 def watch(
-    formulas: Formula | str | Mapping[str, Formula | str],
-    dt: float,
-    *,
-    semantics: Semantics = hard,
-    every: bool = False,
-    sizes: Mapping[str, int] | None = None,
-) -> "Watch[float] | Watch[dict[str, float]]":
+    formulas: Formula | str | Mapping[str, Formula | str], dt: float, *,
+    semantics: Semantics = hard, every: bool = False, sizes: Mapping[str, int] | None = None,
+) -> "Watch[float] | Watch[dict[str, float]]":  # fmt: skip
     """Monitor one formula, or several by name, on samples `dt` seconds apart.
 
     Values are those of `robustness` in double precision, bit for bit, except for the last digit of

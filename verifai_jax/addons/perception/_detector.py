@@ -122,14 +122,9 @@ _batch = jax.jit(lambda network, images: network.batch(images))
 
 
 def detector(
-    key: Key[Array, ""],
-    shape: tuple[int, int],
-    *,
-    kinds: int = 0,
-    values: int = 1,
-    channels: Sequence[int] = (12, 16, 24),
-    hidden: Sequence[int] = (48,),
-) -> Detector:
+    key: Key[Array, ""], shape: tuple[int, int], *, kinds: int = 0, values: int = 1,
+    channels: Sequence[int] = (12, 16, 24), hidden: Sequence[int] = (48,),
+) -> Detector:  # fmt: skip
     """Return a detector with random weights (He et al., "Delving deep into rectifiers", 2015).
 
     **Arguments:**

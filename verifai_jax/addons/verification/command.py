@@ -31,15 +31,9 @@ from verifai_jax.cli.json_output import command, give_result, say, show_result
     undecided="unless the whole space is proved",
 )
 def verify(
-    target: str,
-    rule: Path | None,
-    only: str | None,
-    into: Path | None,
-    plot: Path | None,
-    report: Path | None,
-    fail_on: Gate | None,
-    **options: Any,
-) -> None:
+    target: str, rule: Path | None, only: str | None, into: Path | None, plot: Path | None,
+    report: Path | None, fail_on: Gate | None, **options: Any,
+) -> None:  # fmt: skip
     """Divide the features of TARGET (FILE.py:NAME) into proved, broken and undecided boxes.
 
     With RULE, a property in VNN-LIB, TARGET is a network in ONNX. The answer is `holds`,

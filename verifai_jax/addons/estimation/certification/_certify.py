@@ -114,14 +114,9 @@ def certify(
     lanes = LANES if samples >= LANES else max(8, power_of_two(samples))
     enable_compile_cache()  # Before the search compiles, too.
     blocks = Blocks(
-        problem_of,
-        policies,
-        seed=seed,
-        lanes=lanes,
-        remember=remember,
-        devices=devices,
+        problem_of, policies, seed=seed, lanes=lanes, remember=remember, devices=devices,
         executor=options_of("certify", RunOn, run_on, "executor").executor,
-    )
+    )  # fmt: skip
     attacker = check_attack(blocks.problem, certified.attack)
     rounds = -(-certified.attack_simulations // lanes)
     if tie is None:
@@ -189,12 +184,9 @@ def _chance(problem: Problem, rows: Sequence[Certificate]) -> list[str]:
 
 
 def _sample(
-    blocks: Blocks,
-    sampled: list[PolicyRecord],
-    allocation: Allocation,
-    margins: np.ndarray,
+    blocks: Blocks, sampled: list[PolicyRecord], allocation: Allocation, margins: np.ndarray,
     report: "_Report",
-) -> str:
+) -> str:  # fmt: skip
     """Simulate the blocks of the allocation until it is done; return the reason for ending."""
     while True:
         failures, simulations = _counts(sampled)
@@ -222,13 +214,9 @@ def _counts(records: list[PolicyRecord]) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _certificate(
-    number: int,
-    sampled: PolicyRecord,
-    attacked: PolicyRecord,
-    allocation: Allocation,
-    among: int,
+    number: int, sampled: PolicyRecord, attacked: PolicyRecord, allocation: Allocation, among: int,
     blocks: Blocks,
-) -> Certificate:
+) -> Certificate:  # fmt: skip
     rate = None
     if sampled.simulations:
         failing = sampled.failures + sampled.not_finite
@@ -363,12 +351,9 @@ def repeat_failures(
 
 
 def _again(
-    blocks: Blocks,
-    policy: int,
-    attacked: PolicyRecord,
-    rows: Sequence[tuple[float, PolicyRecord, int, int]],
-    attempt: int,
-) -> tuple[Float[np.ndarray, " n"], Bool[np.ndarray, " n"]]:
+    blocks: Blocks, policy: int, attacked: PolicyRecord,
+    rows: Sequence[tuple[float, PolicyRecord, int, int]], attempt: int,
+) -> tuple[Float[np.ndarray, " n"], Bool[np.ndarray, " n"]]:  # fmt: skip
     """Return the robustness of these rows when they are simulated again, and which fail."""
     again, failing = np.full(len(rows), np.nan), np.zeros(len(rows), bool)
     for of_attack in (False, True):

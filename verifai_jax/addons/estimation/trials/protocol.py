@@ -34,14 +34,9 @@ RULES = (
 
 @suggests_options
 def trial_protocol(
-    problem: Problem,
-    path: str | Path,
-    count: int = 20,
-    *,
-    policies: Sequence[str] = (),
-    trials: "pd.DataFrame | None" = None,
-    seed: int = 0,
-) -> "pd.DataFrame":
+    problem: Problem, path: str | Path, count: int = 20, *, policies: Sequence[str] = (),
+    trials: "pd.DataFrame | None" = None, seed: int = 0,
+) -> "pd.DataFrame":  # fmt: skip
     """Write a protocol sheet for real trials, and a table to fill in.
 
     A table with the name of the sheet `path` and the ending `.csv` is written next to it; fill in

@@ -61,11 +61,9 @@ class Model:
 
 
 def load(
-    source: ModelSource,
-    contacts: tuple[str, ...] = (),
-    keyframe: str | int | None = None,
+    source: ModelSource, contacts: tuple[str, ...] = (), keyframe: str | int | None = None,
     **options: int | None,
-) -> Model:
+) -> Model:  # fmt: skip
     """Read and compile a model.
 
     **Arguments:**
