@@ -17,8 +17,9 @@ WRITERS = {
     "addons/monitoring/requirement_files.py", "addons/native/native_code/library.py",
     "addons/perception/_detector.py", "addons/reports/document.py", "addons/reports/page.py",
     "addons/rl/policies/base.py", "addons/simulators/pictures/mujoco_scene.py",
-    "addons/synthesis/commands/synthesize.py", "cli/new.py", "core/compute/remembered.py",
-    "core/display/notebook.py", "core/store/files.py", "core/store/loggers.py",
+    "addons/synthesis/commands/synthesize.py", "addons/verification/network.py",
+    "cli/new.py", "core/compute/remembered.py",
+    "core/display/notebook.py", "core/store/files.py", "addons/training/loggers.py",
     "pictures/animation.py", "pictures/style.py", "systems/policy.py",
 }  # fmt: skip
 """Writers by `replacing`, which tests/core/store/test_replacements.py kills at each operation.

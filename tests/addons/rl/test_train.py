@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from checked_types import unchecked
 
 from envs.cartpole_task import CartPoleTask
 from verifai_jax.addons.rl import PPO, Continuous, Discrete, Task, evaluate, train
@@ -147,7 +148,7 @@ def test_statistics_of_observations_merge():
     ],
 )
 def test_hyper_parameters_that_cannot_train_are_refused(options, message):
-    with pytest.raises(ValueError, match=message):
+    with unchecked(), pytest.raises(ValueError, match=message):
         train(Recall(), PPO(**options), steps=10)
 
 

@@ -152,6 +152,7 @@ def test_alternatives_comparisons_and_sums_are_read(tmp_path):
         ("(assert (<= (* Y_0 Y_1) 1))", r"\(\* Y_0 Y_1\) is not a linear term"),
         ("(assert (=> Y_0 1))", "is no comparison"),
         ("(assert (<= Y_0 1)", "a bracket is not closed"),
+        ("(" * 100_000, "its brackets are nested deeper than 100"),
         ("(assert (<= Y_0 1)))", "a bracket closes that was not opened"),
         ("(declare-const W Real)", "a variable 'W'"),
         ("(declare-const X_1 Real)(assert (<= X_1 1))", "the input X_1 has no bound on a side"),

@@ -22,8 +22,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from verifai_jax.core.store.foreign_files import read_text
+
 CASES = 4096
 """Alternatives of a property, multiplied out, at most."""
+MAX_DEPTH = 100
+"""Brackets within brackets, at most."""
 
 
 class Linear(NamedTuple):
@@ -84,7 +88,7 @@ def read_property(path: Path) -> list[Case]:
     **Raises:** `ValueError` for a text that is no VNN-LIB, an input without a bound, and what is
     not linear, with the name of the file and the part.
     """
-    text = re.sub(r";[^\n]*", "", path.read_text())
+    text = re.sub(r";[^\n]*", "", read_text(path))
     tokens = re.findall(r"[()]|[^\s()]+", text)
     try:
         statements, rest = _parsed(tokens, 0)
@@ -95,12 +99,14 @@ def read_property(path: Path) -> list[Case]:
         raise ValueError(f"{path.name} is not a property in VNN-LIB: {error}") from error
 
 
-def _parsed(tokens: Sequence[str], at: int) -> tuple[list[Any], int]:
+def _parsed(tokens: Sequence[str], at: int, depth: int = 0) -> tuple[list[Any], int]:
     """Return the list that begins at a token, and where it ends."""
+    if depth > MAX_DEPTH:
+        raise ValueError(f"its brackets are nested deeper than {MAX_DEPTH}")
     found = list[Any]()
     while at < len(tokens) and tokens[at] != ")":
         if tokens[at] == "(":
-            inner, at = _parsed(tokens, at + 1)
+            inner, at = _parsed(tokens, at + 1, depth + 1)
             if at >= len(tokens):
                 raise ValueError("a bracket is not closed")
             found.append(inner)
