@@ -13,6 +13,7 @@ alarm of one in 16 000 samples, and the simulations to the first failure are cou
 
 import argparse
 from collections.abc import Callable, Hashable
+from typing import Any
 
 import jax
 import jax.numpy as jnp

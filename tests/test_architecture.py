@@ -242,7 +242,7 @@ def test_entry_points_name_what_exists():
 KINDS = {"mtl": ("Formula", "Expression"), "features": ("Domain",), "search": ("Search",)}
 """Rooms of whose kinds of things nobody outside asks the class, with the classes that they stand
 below. What others ask of them is a method, which has a default."""
-AT_HOME = {"mtl": ("addons.monitoring", "addons.verification")}
+AT_HOME = {"mtl": ("addons.monitoring", "addons.reports", "addons.verification")}
 """Add-ons that evaluate formulas in a way of their own, by the kind of node."""
 
 

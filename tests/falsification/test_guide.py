@@ -138,10 +138,11 @@ def test_a_black_box_is_guided_too_and_goes_on_as_it_was(tmp_path):
 @pytest.mark.addons
 @pytest.mark.thorough
 def test_workers_of_an_executor_tell_the_same():
-    options = {"budget": 96, "batch": 16, "seed": 0, "diverse": "behaviour"}
-    here = vj.falsify(GUIDED, "cross_entropy", **options)
+    search = vj.search.Diverse(vj.search.named("cross_entropy"), by="behaviour")
+    options = {"budget": 96, "batch": 16, "seed": 0}
+    here = vj.falsify(GUIDED, search, **options)
     with ThreadPoolExecutor(2) as pool:
-        there = vj.falsify(GUIDED, "cross_entropy", run_on=vj.RunOn(executor=pool), **options)
+        there = vj.falsify(GUIDED, search, run_on=vj.RunOn(executor=pool), **options)
     assert there.table.all.equals(here.table.all)
 
 

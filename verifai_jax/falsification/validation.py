@@ -165,7 +165,7 @@ def adapt_search(
             f"none: {lacking} has no derivative. Use a search that needs none, such as 'portfolio' "
             "or 'cross_entropy', or give the operation a derivative by jax.custom_jvp"
         )
-    if problem.rulebook is not None and isinstance(search, searches.Portfolio):
+    if problem.rulebook is not None and getattr(search, "kinds", False):
         # Where a lesser rule is broken a graver one may be, too.
         search = replace(search, kinds=False)
     fallback = search.fallback

@@ -10,6 +10,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
+import verifai_jax as vj
 from verifai_jax.core.messages.errors import UnknownNameError
 from verifai_jax.core.values.trace import Trace
 from verifai_jax.mtl import explain, judge, parse, read, read_requirements, robustness
@@ -60,9 +61,10 @@ def test_a_fleet_has_the_verdicts_of_its_recordings_alone(logs, tmp_path):
     found = judge(requirements, logs)
     assert len(found.rows) == 12
     assert len(found.without_verdict) == 3
-    assert {row.error for row in found.without_verdict} == {
-        "sample times must increase; row 1 has 0 s and row 2 0 s"
-    }
+    for row in found.without_verdict:
+        assert row.error.endswith(
+            "torn.csv: sample times must increase; row 1 has 0 s and row 2 0 s"
+        )
     formulas = {each.id: each.formula for each in requirements}
     with jax.enable_x64(True):
         for row in found.rows:

@@ -129,7 +129,7 @@ def test_what_is_near_to_zero_is_decided_by_xla():
 
 
 def test_the_same_table_resumed_or_not(ending):
-    options = {"engine": "native", "batch": 700, "progress": False}
+    options = {"run_on": vj.RunOn(engine="native"), "batch": 700, "progress": False}
     whole = vj.falsify(ending, "uniform", 2100, **options)
     part = vj.falsify(ending, "uniform", 900, **options)
     assert part.engine == whole.engine == "native"
@@ -138,7 +138,7 @@ def test_the_same_table_resumed_or_not(ending):
     # Which rows are examined depends on the earlier budget, whatever the engine.
     rows, others = (run.table.all.drop(columns="verdict") for run in (whole, again))
     assert rows.equals(others)
-    other = vj.falsify(ending, "uniform", 2100, **{**options, "engine": "xla"})
+    other = vj.falsify(ending, "uniform", 2100, **{**options, "run_on": vj.RunOn(engine="xla")})
     assert other.engine == "xla"
     assert (other.table.all["violated"] == whole.table.all["violated"]).all()
     assert whole.notes == other.notes
@@ -333,7 +333,9 @@ def test_a_constant_that_is_off_by_a_ten_thousandth_is_found(monkeypatch, tmp_pa
     monkeypatch.setattr(native_program, "translate", honest)
     monkeypatch.setenv("VERIFAI_JAX_CACHE", str(tmp_path / "other"))
     problem.programs.clear()
-    assert vj.falsify(problem, "uniform", 700, engine="native", progress=False).engine == "native"
+    native = vj.RunOn(engine="native")
+    run = vj.falsify(problem, "uniform", 700, run_on=native, progress=False)
+    assert run.engine == "native"
 
 
 def test_a_system_that_draws_is_compared_at_rounding_too(monkeypatch, tmp_path):

@@ -152,14 +152,15 @@ def test_it_finds_more_that_happens_where_inputs_say_little():
 
 @pytest.mark.slow
 def test_it_goes_on_as_it_was_also_with_gradients():
-    options = {"diverse": "behaviour", "seed": 1, "confirm": False, "batch": 16}
-    whole = vj.falsify(BANDED, "portfolio", 120, **options)
+    search = vj.search.Diverse(vj.search.named("portfolio"), by="behaviour")
+    options = {"seed": 1, "confirm": False, "batch": 16}
+    whole = vj.falsify(BANDED, search, 120, **options)
     table = whole.table.all
     begins = np.flatnonzero(np.diff(table["differentiated"].to_numpy(int)) == 1) + 1
-    part = vj.falsify(BANDED, "portfolio", int(begins[begins >= 40][0]), **options)
+    part = vj.falsify(BANDED, search, int(begins[begins >= 40][0]), **options)
     assert vj.resume(part, budget=120).table.all.equals(table)
     guided = replace(BANDED, guide="always y < 0.9")
-    assert len(vj.falsify(guided, "portfolio", 48, **options).table) == 48
+    assert len(vj.falsify(guided, search, 48, **options).table) == 48
 
 
 def staged(f, key):

@@ -127,10 +127,9 @@ def test_a_search_begins_where_bounds_are_loosest():
     found = vj.verify(problem, boxes=20, samples=0, progress=False)
     assert 0.5 < found.proved.mass < 1
     counts = []
-    for options in ({"proved": found}, {}):
-        one = problem if options else found.rest(problem)
-        run = vj.falsify(one, "cross_entropy", 8192, batch=64, stop=vj.Stop(after=1), seed=0,
-                         progress=False, **options)  # fmt: skip
+    begun = vj.Start("cross_entropy", proved=found)
+    for one, search in ((problem, begun), (found.rest(problem), "cross_entropy")):
+        run = vj.falsify(one, search, 8192, batch=64, stop=vj.Stop(after=1), seed=0, progress=False)
         counts.append(len(run.table) if run.table.all["violated"].any() else 10**9)
     assert counts[0] <= 64 < 1024 < counts[1]
 

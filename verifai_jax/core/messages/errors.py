@@ -74,7 +74,7 @@ def _check_order(
     """Refuse an object of our own in the place of another argument, while its own has none."""
     wanted = [str(getattr(p.annotation, "__name__", p.annotation)) for p in parameters]
     given = [
-        {c.__name__ for c in type(value).__mro__ if c.__module__.startswith("verifai_jax.")}
+        {c.__name__ for c in type(value).__mro__ if str(c.__module__).startswith("verifai_jax.")}
         for value in arguments
     ]
     for kind, kinds in zip(wanted, given, strict=False):

@@ -215,7 +215,8 @@ def test_a_digest_is_of_numbers_and_structure():
 @pytest.mark.thorough
 def test_at_exactly_zero_the_comparator_decides():
     zero = [jax.tree.map(np.zeros_like, threshold(0.0))]
-    only = {"samples": 64, "budget": 64, "attack_simulations": 0}
+    once = vj.Certification(samples=64, budget=64, attack_simulations=0)
+    only = {"certification": once}
     assert certify(problem_of, zero, **only)[0].failures == 0
 
     def strictly(policy):
@@ -287,7 +288,8 @@ def outside(policy):
 @pytest.mark.thorough
 def test_what_jax_cannot_trace_is_simulated_policy_by_policy():
     some = [POLICIES[2]]
-    options = {"p": 0.05, "samples": 64, "budget": 64, "attack_simulations": 64}
+    once = vj.Certification(samples=64, budget=64, attack_simulations=64)
+    options = {"p": 0.05, "certification": once}
     expected = certify(problem_of, some, **options).table
     for make, told in [(untraceable, "compiled one by one: policy 0; JAX"), (outside, None)]:
         found = certify(make, some, **options)

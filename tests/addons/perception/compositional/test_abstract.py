@@ -146,7 +146,7 @@ def test_a_finite_search_ends_with_all_of_its_candidates_simulated():
     points = [[0.9, v / 7, hue] for v in range(8) for hue in (0.39, 0.4, 0.9)]
     result = vj.perception.abstract(
         problem(), lambda s: braking(late(s)), frame, ERROR,
-        search=vj.search.PointList(points), samples=50, batch=64, stop_after=99,
+        search=vj.search.PointList(points), samples=50, batch=64, stop=vj.Stop(after=99),
     )  # fmt: skip
     assert result.ended == "exhausted"
     assert len(result.images.table) == len(points)

@@ -5,6 +5,7 @@ from dataclasses import replace
 import pytest
 from drifting import drifting, quick_certificates
 
+import verifai_jax as vj
 from verifai_jax.addons.rl import policy_sources
 from verifai_jax.addons.training.sweeps import running as driver
 from verifai_jax.addons.training.sweeps._sweep import sweep
