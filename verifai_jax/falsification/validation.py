@@ -4,7 +4,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 from jaxtyping import Float
@@ -167,7 +167,7 @@ def adapt_search(
         )
     if problem.rulebook is not None and getattr(search, "kinds", False):
         # Where a lesser rule is broken a graver one may be, too.
-        search = replace(search, kinds=False)
+        search = replace(cast(Any, search), kinds=False)
     fallback = search.fallback
     if fallback is None or not (search.wants.derivatives or search.wants.traces):
         return search, ()
