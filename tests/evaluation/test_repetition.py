@@ -51,6 +51,7 @@ def same_verdicts(run):
     return list(failing["verdict"]), [vj.confirm(run, int(row)).verdict for row in failing.index]
 
 
+@pytest.mark.thorough
 def test_what_fails_at_every_seventh_call_is_not_claimed():
     run = falsified(failing_at(7))
     assert len(run.table.counterexamples) == 0
@@ -75,6 +76,7 @@ def test_what_fails_at_every_seventh_call_is_not_claimed():
     assert of_run == of_confirm == ["fragile"] * n
 
 
+@pytest.mark.thorough
 def test_a_counter_in_a_file_is_memory_too(tmp_path):
     file = tmp_path / "count"
 
@@ -202,6 +204,7 @@ def test_workers_repeat_in_another_process():
     assert "memory or chance of its own" in str(run).splitlines()[1]
 
 
+@pytest.mark.thorough
 @pytest.mark.addons
 def test_an_environment_with_a_running_mean_is_found_out():
     gym = pytest.importorskip("gymnasium")

@@ -98,6 +98,7 @@ def test_many_problems_need_little_more_memory_than_ten(tmp_path):
     assert many - few < 20
 
 
+@pytest.mark.thorough
 def test_no_function_of_a_module_keeps_all_its_static_arguments():
     for file in Path(vj.__file__).parent.rglob("*.py"):
         for node in ast.parse(file.read_text()).body:

@@ -71,6 +71,7 @@ def test_a_resumed_run_has_the_same_stages(last, safe, tmp_path):
     assert len(run.table) == len(safe.table)
 
 
+@pytest.mark.thorough
 def test_clauses_that_have_to_fail_together_are_evaluated_in_every_stage():
     def system(features, key):
         return vj.Trace({"x": features["x"][None], "y": 1e4 * features["y"][None]}, dt=1.0)

@@ -142,6 +142,7 @@ def test_tests_that_were_edited(tmp_path):
     assert "tests always (x < 3), and the problem has always (x < 0.9)" in str(found)
 
 
+@pytest.mark.thorough
 def test_evidence_that_was_edited(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     Path("odd.yaml").write_text(

@@ -129,6 +129,7 @@ def doubled(count):
     ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("nodes", "shape"),
     [
@@ -215,6 +216,7 @@ def huge(nodes, tmp_path, initializers=(), opset=17):
     return str(error.value)
 
 
+@pytest.mark.slow
 def test_results_are_bounded_before_they_are_computed(tmp_path):
     many = numpy_helper.from_array(np.array([2**24 - 10], np.int64), "many")
     zeros = helper.make_node("ConstantOfShape", ["many"], ["zeros"])

@@ -144,6 +144,7 @@ def test_returns_do_not_depend_on_company(whole):
         )
 
 
+@pytest.mark.thorough
 def test_what_cannot_train_or_explodes_is_a_row():
     space = {"limit": vj.Categorical(0.3, 100.0), "rate": vj.Categorical(0.1, 0.5)}
     found = sweep(
