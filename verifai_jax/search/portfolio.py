@@ -101,7 +101,7 @@ class PortfolioState(NamedTuple):
     taken: Float[Array, "taken d"]  # the latest points where descents began or ended
     interior: InteriorState | None
     barren: Int[Array, ""]  # simulations since the last failure that is in no known kind
-    kinds: Kinds | None  # regions of failures; None where they are not left
+    kinds: Kinds | None  # regions of failures; None if none is left
 
 
 @dataclass(frozen=True)

@@ -126,7 +126,7 @@ class Cancelled(Exception):
 
 
 class Call(NamedTuple):
-    """A call of a tool: whether it was cancelled, and what is told the seconds that it has run."""
+    """A call of a tool: whether it was cancelled, and who gets the seconds that it has run."""
 
     cancelled: threading.Event
     report: Callable[[float], object] = lambda seconds: None

@@ -37,10 +37,10 @@ def propose_regions(
         return []
     leaf = int(np.clip(failing.sum() // 10, 1, 5))
     regions: list[Region] = []
-    for even in (False, True):
-        each = np.where(failing, weights[~failing].sum() / weights[failing].sum(), 1.0)
+    even = weights * np.where(failing, weights[~failing].sum() / weights[failing].sum(), 1.0)
+    for each in (weights, even):
         tree = DecisionTreeClassifier(max_depth=depth, min_samples_leaf=leaf, random_state=0)
-        nodes = tree.fit(matrix, failing, weights * each if even else weights).tree_
+        nodes = tree.fit(matrix, failing, each).tree_
         stack = [(0, start)]
         while stack:
             node, region = stack.pop()

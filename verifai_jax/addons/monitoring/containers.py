@@ -286,11 +286,11 @@ def read_hdf5(path: Path, time: str, notes: dict[str, int]) -> list[Table]:
 
     def visit(name: str, item: Any) -> None:
         if getattr(item, "ndim", 0):
-            # What is no signal is left out by its form, unread.
-            form = np.broadcast_to(np.empty((), item.dtype), item.shape)
             if item.ndim < 3 and item.dtype.kind in "biufS":
                 check_values(item.size, f"{name} of {path}")
-            found[name] = item[()] if item.ndim < 3 and item.dtype.kind in "biufS" else form
+                found[name] = item[()]
+            else:  # What is no signal is left out by its form, unread.
+                found[name] = np.broadcast_to(np.empty((), item.dtype), item.shape)
             said = item.attrs.get("units", item.attrs.get("unit", ""))
             units[name] = said.decode() if isinstance(said, bytes) else str(said)
 

@@ -76,7 +76,7 @@ def replacing(path: str | Path, *, locked: bool = False) -> Iterator[Path]:
 def held(path: Path) -> io.FileIO | None:
     """Open a file for writing, made if it is missing, and lock it until it is closed.
 
-    None where there are no such locks; on a file system without them the file is not locked.
+    It is None on a platform without such locks; a file system without them leaves it unlocked.
 
     **Raises:** `BlockingIOError` if another process has the lock; `OSError` of the file system.
     """

@@ -102,7 +102,7 @@ def _acquire(folder: Path) -> FileIO | None:
         raise FolderInUse(_in_use(folder, owner)) from None
     if file is not None:
         _held.add(file)
-        with contextlib.suppress(OSError):  # On a full disk nobody is told who has it.
+        with contextlib.suppress(OSError):  # On a full disk the file does not name its holder.
             file.truncate(0)
             file.write(f"{os.getpid()} {socket.gethostname()}".encode())
     return file
