@@ -19,6 +19,7 @@ def double(features, key):
     return vj.Trace({"x": (a + 0 * clock).astype(np.float64) + jnp.zeros(5, int)}, dt=0.1)
 
 
+@pytest.mark.thorough
 @pytest.mark.addons
 def test_jax_does_not_warn_of_the_precision_that_a_run_asks_for():
     problem = vj.Problem("toy", {"a": vj.Box(0.0, 1.0)}, double, "always x < 0.9")

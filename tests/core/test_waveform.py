@@ -49,6 +49,7 @@ def test_refined_is_the_same_function(wave, factor):
     assert len(fine.knots) == {"linear": 4 * factor + 1, "constant": 5 * factor}[wave.hold]
 
 
+@pytest.mark.thorough
 def test_vectors_and_batches():
     knots = jax.random.normal(jax.random.key(0), (7, 5, 2))
     batch = Waveform(knots, "linear", 2.0)
@@ -121,6 +122,7 @@ def test_on_the_host_it_is_the_same_function_in_numpy(hold, knots):
 UNEVEN = (0.0, 0.3, 1.0, 1.1, 2.0)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(("times", "count"), [(None, 5), (UNEVEN, 3), (None, 2), (UNEVEN, 5)])
 def test_pchip_is_that_of_scipy(times, count):
     """On the host, and traced."""

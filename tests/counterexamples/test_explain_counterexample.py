@@ -223,6 +223,7 @@ def test_a_batch_of_a_host_system_is_simulated_with_the_key_of_the_row():
     assert vj.shrink(run, seed=0).changed.keys() == {"x"}
 
 
+@pytest.mark.thorough
 def test_it_is_said_that_changed_features_have_no_verdict():
     @vj.blackbox
     def fragile(features):

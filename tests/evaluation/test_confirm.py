@@ -164,6 +164,7 @@ def test_features_one_rounding_away_are_replayed_beside_the_row_itself(circles):
     assert np.all(found.rho["nudged"] != found.rho["quarter_step"])
 
 
+@pytest.mark.thorough
 def test_one_row_in_words(circles, confirmed_circles):
     one = confirm(circles, int(circles.best.name))
     assert one.confirmed
@@ -215,6 +216,7 @@ def test_single_precision_is_not_believed():
     assert doubtful.why.tolist() == ["its robustness -0.1 moves by 0.1 between replays"]
 
 
+@pytest.mark.thorough
 def test_chaos_is_fragile():
     def doubled(features, key):
         x = features["x"]
@@ -382,6 +384,7 @@ def boxed(function, spec="always x <= 0.5"):
     return vj.Problem("boxed", {"x": vj.Box(0.0, 1.0)}, vj.blackbox(function), spec)
 
 
+@pytest.mark.thorough
 def test_a_black_box_is_simulated_again():
     steady = boxed(lambda f: Trace({"x": np.full(4, f["x"])}, dt=0.1))
     found = checked(steady, [0.7, 0.9])
@@ -511,6 +514,7 @@ def test_what_is_finished_survives_ctrl_c(circles, monkeypatch):
     assert found.notes == ("interrupted after 16 rows",)
 
 
+@pytest.mark.thorough
 def test_another_simulator_has_to_agree(circles):
     exact = vj.ode(
         lambda t, s, control, f: {"x": s["v"], "v": -s["x"]},

@@ -86,6 +86,7 @@ def test_lock_step_gives_the_table_of_the_traced_system(traced):
     assert (table["violated"] == traced["violated"]).all()
 
 
+@pytest.mark.thorough
 def test_rows_come_in_any_order_and_are_told_apart(traced):
     table = vj.falsify(problem_of(OneByOne()), "uniform", 200, batch=64).table.all
     late, dead = table["b"] > 0.9, table["b"] < -0.9
@@ -248,6 +249,7 @@ def test_wide_integers_do_not_wrap(vectorised):
     assert (rows.rho == np.float32(2.0**31 - 6)).all()
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("wrong", "said"),
     [

@@ -42,6 +42,7 @@ def _problem(domain):
     return vj.Problem("p", {"x": vj.Box(-1, 1), "more": domain}, system, "x > 0")
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("precision", ["float32", "float64"])
 @pytest.mark.parametrize(
     "name", [*DOMAINS, *(pytest.param(name, marks=pytest.mark.addons) for name in EVENTS)]

@@ -167,6 +167,7 @@ def test_what_raises_when_it_is_simulated_again_is_not_claimed():
     assert "every replay to confirm them raised" in str(down)
 
 
+@pytest.mark.thorough
 def test_a_search_learns_what_came_again():
     # Fails by chance everywhere, but surely nowhere.
     system = failing_at(5)
@@ -231,6 +232,7 @@ def test_an_environment_with_a_running_mean_is_found_out():
     assert fresh.simulation.function.environment is not system.simulation.function.environment
 
 
+@pytest.mark.thorough
 @pytest.mark.addons
 def test_fuzz_claims_what_came_again():
     run = vj.fuzz(problem(failing_at(17)), 60, batch=20, progress=False)
@@ -263,6 +265,7 @@ def test_certificates_show_what_came_again():
     assert note.startswith("policy 0: the system has memory or chance of its own")
 
 
+@pytest.mark.thorough
 @pytest.mark.addons
 def test_a_corpus_holds_what_comes_again(tmp_path):
     wavering = Counter(lambda a, count: 1.0 if count % 2 else -1.0)

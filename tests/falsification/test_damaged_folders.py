@@ -168,6 +168,7 @@ def test_anything_changed_in_a_folder_is_right_or_told(
         check(folder, problem, whole)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("kind", ["short", "long", "cut off"])
 def test_a_folder_that_is_whole_is_resumed(problem, whole, folders, tmp_path, monkeypatch, kind):
     monkeypatch.setattr(segments, "SEGMENT_ROWS", 1 << 20 if kind == "short" else 40)

@@ -155,6 +155,7 @@ def test_infinite_signals_are_not_counterexamples():
         _ = run.best
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("signal", ["p", "inverse"])
 def test_a_loop_that_diverges_has_no_verdict(signal):
     # p doubles its growth each step until float32 overflows; 1 / p is infinite at the start.

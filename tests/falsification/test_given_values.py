@@ -191,6 +191,7 @@ def test_numbers_of_other_types_are_simulated_or_refused_by_name():
         vj.simulate(BLACK_BOX, [ROW | {"wind": 10**400}])
 
 
+@pytest.mark.thorough
 def test_a_column_that_is_there_twice_is_refused():
     frame = pd.DataFrame([[*ROW.values(), 3.0]], columns=[*ROW, "wind"])
     for rows in (frame, frame.iloc[0]):

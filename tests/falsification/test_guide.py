@@ -44,6 +44,7 @@ def test_it_finds_what_the_robustness_says_nothing_of():
     assert run.guide == {"term": "always (heat < 0.9)", "weight": 0.8, "scale": 0.1}
 
 
+@pytest.mark.thorough
 def test_verdicts_and_robustness_are_those_without_it():
     points = np.random.default_rng(0).uniform(size=(64, 4)).astype(np.float32)
     points[:3] = [0.9, 0.2, 0.7, 0.4]
@@ -72,6 +73,7 @@ def test_what_is_told_is_the_weighted_sum_by_hand():
     assert guide.steer(np.zeros(1, np.float32), np.float32([-1e30]))[0] >= 0
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("clauses", [False, True])
 def test_its_gradient_passes(clauses):
     def ramp(f, key):

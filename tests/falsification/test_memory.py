@@ -52,6 +52,7 @@ def test_problems_and_their_programs_are_freed():
     assert ours() - before == collections.Counter()
 
 
+@pytest.mark.thorough
 def test_formulas_that_were_judged_are_bounded():
     trace = Trace({"x": jnp.zeros(3)}, dt=0.1)
     calls = []

@@ -103,6 +103,7 @@ def test_another_model_is_not_gone_on_with(folder):
     assert change.now[:12] in str(error.value)
 
 
+@pytest.mark.thorough
 def test_it_is_gone_on_with_where_that_is_meant(folder):
     steeper = slope(STEEPER)
     run = vj.resume(folder, steeper, budget=12, progress=False, even_if_changed=True)
@@ -153,6 +154,7 @@ def test_a_damaged_record_of_it_is_refused(folder):
         vj.load(folder)
 
 
+@pytest.mark.thorough
 def test_a_replay_that_gives_the_row_its_number_says_nothing(folder):
     run = vj.load(folder, slope())
     for row in (0, 5, run.table.all.iloc[3]):
@@ -164,6 +166,7 @@ def test_a_replay_that_gives_the_row_its_number_says_nothing(folder):
     assert run.replay(other).finding == ""
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("precision", [None, "float64"])
 def test_a_replay_of_another_model_says_so_at_once(folder, precision):
     run = vj.load(folder, slope(STEEPER))
@@ -188,6 +191,7 @@ def test_a_simulation_that_ends_otherwise_is_a_finding(folder):
     assert failing != STEEPER
 
 
+@pytest.mark.thorough
 def test_state_in_a_file_is_no_part_of_the_model_and_declared_data_are(project):
     (project / "counter.txt").write_text("0")
     (project / "gain.txt").write_text("1.0")
@@ -240,6 +244,7 @@ def test_studies_of_a_row_begin_with_it(folder):
         assert "its number again" not in str(found)
 
 
+@pytest.mark.thorough
 @pytest.mark.addons
 def test_a_saved_counterexample_knows_its_model(folder, tmp_path):
     run = vj.load(folder, slope())

@@ -111,6 +111,7 @@ class Around(vj.search.Wrapper):
     search: vj.search.Search
 
 
+@pytest.mark.thorough
 @pytest.mark.addons
 def test_names_of_searches_around_others():
     assert vj.search.named("diverse") == vj.search.Diverse(vj.search.Portfolio())

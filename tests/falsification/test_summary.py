@@ -109,6 +109,7 @@ def line(run, name):
     return found[0][len(name) + 2 :].strip() if found else None
 
 
+@pytest.mark.thorough
 def test_the_first_line_counts_the_table(run):
     table = run.table.all
     ok, violated = table["status"] == "ok", table["violated"]

@@ -88,6 +88,7 @@ def test_rows_of_a_table():
     assert float(space.distance(table.loc[0], {"x": 7, "alg": "b"})) == expected
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("changes", "message"),
     [

@@ -187,6 +187,7 @@ def test_a_line_between_two_knots_stays_between_them():
     np.testing.assert_allclose(slope, [0.75, 0.25])
 
 
+@pytest.mark.thorough
 def test_a_feature_fixed_at_its_end_stays_inside():
     with in_precision("float64"):
         space = vj.FeatureSpace({"x": vj.Box(0, 61.2), "y": vj.Box(0, 1)}).fixed(x=61.2)

@@ -26,6 +26,7 @@ FORMULAS = [
 ]
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("end", ["hold", "truncate"])
 @pytest.mark.parametrize("text", FORMULAS)
 def test_against_what_changes_when_instants_do(text, end):

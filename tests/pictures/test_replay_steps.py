@@ -16,6 +16,7 @@ def plant(**options):
     )  # fmt: skip
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(("hold", "drawn"), [("constant", "steps-post"), ("linear", "default")])
 @pytest.mark.parametrize("period", [0.1, 0.2])
 def test_controls_and_held_inputs_are_steps(hold, drawn, period):

@@ -178,6 +178,7 @@ def test_what_is_wrong_is_refused_where_it_is_made(monkeypatch):
         frequent_patterns(frame, minimum=0.01)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("which", ["counterexamples", "safe", "all"])
 def test_tells_and_draws(which, tmp_path):
     found = frequent_patterns(driving(), which=which, space=SPACE)

@@ -122,6 +122,7 @@ def test_what_is_wrong_is_refused_where_it_is_made():
         nearest(frame, 120)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("kind", KINDS)
 def test_tables_and_pictures(kind, tmp_path):
     found = k_closest(table(kind), 3)

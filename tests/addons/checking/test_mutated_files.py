@@ -76,6 +76,7 @@ def check_run(run, problem, tmp_path, count):
     assert not wrong, "\n".join(wrong)
 
 
+@pytest.mark.thorough
 def test_mutated_runs(run, problem, tmp_path):
     check_run(run, problem, tmp_path, FEW)
 

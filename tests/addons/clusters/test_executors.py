@@ -104,6 +104,7 @@ def test_the_table_is_the_one_of_one_machine_whatever_the_order(problem, options
     )
 
 
+@pytest.mark.thorough
 def test_a_run_that_was_stopped_goes_on_with_workers_and_without(tmp_path):
     whole = vj.falsify(LINE, "uniform", 4000, batch=512)
     begun = vj.falsify(
@@ -136,6 +137,7 @@ def test_a_constraint_is_kept_and_its_acceptance_is_that_of_the_rows_taken():
     assert one.acceptance == other.acceptance
 
 
+@pytest.mark.thorough
 def test_a_pool_that_loses_a_process_leaves_what_is_finished(tmp_path, monkeypatch):
     monkeypatch.setattr("verifai_jax.addons.clusters.executors.SECONDS", 0.0)
     options = {"search": "uniform", "budget": 70, "batch": 20, "confirm": False}
@@ -152,6 +154,7 @@ def test_a_pool_that_loses_a_process_leaves_what_is_finished(tmp_path, monkeypat
     pd.testing.assert_frame_equal(again.table.all, whole.table.all, check_exact=True)
 
 
+@pytest.mark.thorough
 def test_finished_rows_of_a_slow_black_box_are_not_simulated_again(tmp_path, monkeypatch):
     monkeypatch.setattr("verifai_jax.addons.clusters.executors.SECONDS", 0.0)
     monkeypatch.setattr("verifai_jax.addons.clusters.executor_engine.WORTH_KEEPING", 0.0)

@@ -243,6 +243,7 @@ def test_tasks_refuse_numbers_out_of_range(field, value, wanted):
         mc.ContinuousMountainCarTask(**{field: value})
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("action", [Discrete(3), Continuous(-1.0, 1.0)])
 def test_a_network_drives_the_system_as_it_drives_the_task(action):
     continuous = isinstance(action, Continuous)

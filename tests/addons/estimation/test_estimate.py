@@ -49,6 +49,7 @@ def test_says_what_is_guaranteed_and_what_is_not(rare):
     assert rare.simulations_until(1e-4) == pytest.approx(29956 - rare.prior_simulations, abs=1)
 
 
+@pytest.mark.thorough
 def test_pictures_are_drawn_and_written(rare, tmp_path):
     rare.plot(tmp_path / "estimate.png")
     assert (tmp_path / "estimate.png").stat().st_size > 5000

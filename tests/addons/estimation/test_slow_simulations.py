@@ -99,6 +99,7 @@ class Known(Surrogate):
         return self.border - np.abs(z[:, 0]), np.ones(len(z))
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("shift", [0.0, 0.1, 3.0])
 def test_a_control_variate_is_right_whatever_the_surrogate_is_worth(shift):
     rng, covered = np.random.default_rng(0), []

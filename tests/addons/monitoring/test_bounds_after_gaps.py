@@ -76,6 +76,7 @@ def uncompiled(monkeypatch):
     monkeypatch.setenv("VERIFAI_JAX_CACHE", "off")
 
 
+@pytest.mark.thorough
 @given(formulas(3), broken(), st.booleans())
 @QUICK
 def test_the_interval_is_what_the_gaps_and_the_future_allow(uncompiled, formula, both, boolean):

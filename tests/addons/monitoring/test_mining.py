@@ -106,6 +106,7 @@ FRONTS = {
 }
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("text", FRONTS)
 @pytest.mark.parametrize("seed", range(10))
 def test_fronts_are_those_of_all_pairs(text, seed):

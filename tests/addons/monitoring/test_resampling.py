@@ -27,6 +27,7 @@ def union(trace, dt, method):
     return np.concatenate([clock, times]), np.concatenate([at, x])
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("method", ["hold", "linear"])
 @pytest.mark.parametrize("origin", [0.0, 1.7e9])
 def test_verdicts_are_those_of_the_union(method, origin):

@@ -34,6 +34,7 @@ def test_each_one_keeps_the_protocol_and_its_defaults_can_train(name):
     assert algorithm.steps_per_update == algorithm.environments * algorithm.horizon
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("name", ALGORITHMS)
 def test_an_update_keeps_the_form_of_the_state_and_its_policy_acts(name):
     # A leaf that is weakly typed at first only would have everything compiled twice.

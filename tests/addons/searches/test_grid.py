@@ -90,6 +90,7 @@ def test_every_combination_once_in_order():
     assert not np.array_equal(u, asked(search, cube, seed=1))
 
 
+@pytest.mark.thorough
 def test_large_indices_are_exact():
     cube, search = Cube((0, 0, 0, 97)), Grid((21, 1009, 1000))
     total = search.total(cube)

@@ -227,6 +227,7 @@ def test_traces_in_the_form_of_the_model():
     np.testing.assert_allclose(again.signals["x"], smooth, atol=1e-3)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("formula", "stride"),
     [

@@ -151,6 +151,7 @@ def test_a_push_is_an_arrow(motion, gl):
     assert columns.max() < SIZE[0] / 2
 
 
+@pytest.mark.thorough
 def test_a_wind_is_a_push(seen):
     row = {"size": 0.2, "wind": -4.0, "vx": 0.0}
     pushes = mujoco_motion.record(replay(seen.problem, row, jax.random.key(0), 0)).pushes
@@ -158,6 +159,7 @@ def test_a_wind_is_a_push(seen):
     assert np.count_nonzero(pushes) == len(pushes)
 
 
+@pytest.mark.thorough
 def test_a_run_ends_where_it_was_terminated():
     ending = problem(terminate=lambda state, features: state.qpos[1] < -0.1)
     short = replay(ending, {"size": 0.2, "wind": 0.0, "vx": 0.0}, jax.random.key(0), 0)

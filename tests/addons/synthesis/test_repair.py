@@ -105,6 +105,7 @@ def test_counterexamples_of_a_run_come_first():
     assert result.rounds[0].change > 0
 
 
+@pytest.mark.thorough
 def test_nominal_parameters_that_hold_are_kept():
     result = repair(first_order, ["k"], 6000, nominal={"k": 1.2}, gradient=False)
     assert result.parameters == {"k": 1.2}
@@ -119,6 +120,7 @@ def test_the_margin_is_kept():
     assert result.robustness >= 0.2
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("gradient", [True, False])
 def test_no_parameters_are_enough(gradient):
     result = repair(first_order, ["k"], 6000, aim=vj.Aim(margin=0.6), gradient=gradient)

@@ -73,6 +73,7 @@ def test_the_chosen_problem_is_ready(found):
     assert len(vj.falsify(found.chosen, "uniform", 64, batch=64).table.counterexamples) == 0
 
 
+@pytest.mark.thorough
 def test_what_it_says(found):
     assert "holds with robustness" in str(found)
     assert "0 of 2000 held-out environments fail: failure probability < 0.0015 at 95 %" in str(
@@ -175,6 +176,7 @@ def test_a_black_box_with_a_choice_and_simulations_that_raise():
     assert result.chosen.space.domains["direction"].size == 0
 
 
+@pytest.mark.thorough
 def test_a_constraint_between_parameter_and_environment():
     # Weak disturbances alone: |w| / k <= 0.5, so that |x| never grows beyond 0.5.
     space = vj.FeatureSpace(first_order.space.domains, where=lambda f: abs(f["w"]) <= f["k"] / 2)

@@ -31,6 +31,7 @@ def proved():
     return vj.verify(squares(), boxes=150, samples=0, progress=False)
 
 
+@pytest.mark.thorough
 def test_a_point_is_in_the_rest_unless_its_box_is_decided(proved):
     """Points find their boxes by cuts as by comparing them with each box."""
     boxes, random = proved.boxes, np.random.default_rng(0)

@@ -63,6 +63,7 @@ def test_links_and_sizes(tmp_path):
         read_bytes(tmp_path / "sparse")
 
 
+@pytest.mark.thorough
 def test_nested_and_shared_texts(tmp_path):
     deep = 100_000
     aliases = "\n".join(f"a{i}: &a{i} [{', '.join([f'*a{i - 1}'] * 9)}]" for i in range(1, 11))

@@ -39,6 +39,7 @@ def leftovers(folder):
     return [p.name for p in folder.rglob("*") if p.name.startswith(".") or ".part" in p.name]
 
 
+@pytest.mark.thorough
 def test_files_that_belong_together_are_replaced_together(tmp_path):
     folder, user = tmp_path / "link", tmp_path / "real"
     user.mkdir()

@@ -47,6 +47,7 @@ def held_exactly(knots, x, delay=0.0, until=1.0):
     return x
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("substeps", [1, 2])
 @pytest.mark.parametrize("delay", [0.0, 0.25])
 def test_a_held_input_keeps_the_order_of_the_method(substeps, delay):
@@ -92,6 +93,7 @@ def test_pulses_stay_within_a_step(substeps):
     np.testing.assert_allclose(x, expected, atol=1e-6)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("steps", [(8, 16), (6, 12)])
 def test_a_linear_input_converges(steps):
     # The kinks at 0.25, 0.5 and 0.75 are at steps, or within them.

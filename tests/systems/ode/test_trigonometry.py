@@ -42,6 +42,7 @@ def test_derivatives():
     assert float(second) == pytest.approx(-np.sin(1.2), rel=1e-6)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("largest", [1.0, 1e3, 1e6])
 def test_float64_is_exact(largest):
     with jax.enable_x64():

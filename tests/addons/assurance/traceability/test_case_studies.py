@@ -50,6 +50,7 @@ def trace(arguments: list[str]):
     return CliRunner().invoke(main, arguments)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("name", CHANGES)
 def test_each_requirement_has_a_formula_and_a_test(name, monkeypatch):
     monkeypatch.chdir(CASES.parents[1])

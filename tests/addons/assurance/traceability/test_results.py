@@ -45,6 +45,7 @@ def falsified(problem, folder=None, budget=64, **options):
     return vj.falsify(problem, "uniform", budget, progress=False, folder=folder, **options)
 
 
+@pytest.mark.thorough
 def test_outcomes_of_runs():
     run = falsified(PROBLEM)
     broken = np.count_nonzero(run.table.all["a"] > 0.9)

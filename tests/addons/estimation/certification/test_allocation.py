@@ -41,6 +41,7 @@ def raced(rates, run):
     return mixed[found.arm] == mixed.min(), int(found.simulations.sum())
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(("rates", "uniform"), [(FACTS, 30_000), (ONE_CLEAR, 11_000)])
 def test_names_the_safest_with_a_fifth_of_uniform_samples(rates, uniform):
     runs = [raced(rates, run) for run in range(60)]

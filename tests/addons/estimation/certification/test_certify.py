@@ -166,6 +166,7 @@ def test_order_company_and_devices_change_nothing(certificates):
     assert order[other.safest] == certificates.safest
 
 
+@pytest.mark.thorough
 def test_an_accelerator_works_on_all_blocks_at_once(certificates, monkeypatch):
     monkeypatch.setattr(programs, "_one_by_one", lambda devices: False)
     monkeypatch.setattr(programs, "MAX_BLOCKS", 4)

@@ -40,6 +40,7 @@ def test_both_results_of_trials_say_it(problem):
     assert not vj.compare_trials(pairs.drop(columns="a"), "old", "new").notes
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(("truth", "word"), [(1.3, "highest"), (-0.3, "lowest"), (0.5, "")])
 def test_a_calibration_says_when_it_ends_at_an_edge(problem, truth, word):
     a = np.linspace(0.02, 0.98, 12)

@@ -35,6 +35,7 @@ def test_a_model_of_stable_baselines3(name):
     check_agrees(policy(FILES / f"{name}.zip", **OPTIONS.get(name, {})), *expected(name))
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("name", ["mlp", "mlp_dynamo", "mixed", "cnn"])
 def test_a_graph_of_onnx(name):
     loaded = policy(FILES / f"{name}.onnx")

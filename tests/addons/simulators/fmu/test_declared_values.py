@@ -115,6 +115,7 @@ def last(trace, *names):
     return [float(trace.signals[name][-1]) for name in names]
 
 
+@pytest.mark.thorough
 def test_an_item_is_sent_by_its_value(system):
     space = {"quality": vj.Categorical("bad", "good"), "lamp": vj.Categorical(False, True)}
     space |= {"gear": vj.DiscreteBox(1, 5)}
@@ -166,6 +167,7 @@ def test_an_array_is_refused(system):
             problem(system, table=vj.Box(0, 1)).check()
 
 
+@pytest.mark.thorough
 def test_values_beyond_the_declared_range_are_a_note(system):
     beyond = problem(system, level=vj.Box(-1.0, 0.5), gear=vj.Categorical(2, 7))
     beyond.check()

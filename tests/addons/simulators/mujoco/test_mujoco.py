@@ -169,6 +169,7 @@ def test_a_batch_of_any_size_is_the_same_rows():
         )
 
 
+@pytest.mark.thorough
 def test_mujoco_is_the_analytic_cart_pole():
     def push(time, state, features):
         return jnp.asarray(2 * jnp.sin(3 * time), jnp.float32)

@@ -58,6 +58,7 @@ class TestPaths:
         with pytest.raises(ValueError, match=message):
             cart(keyframe=keyframe)
 
+    @pytest.mark.thorough
     def test_the_mass_of_a_geom_is_that_of_a_model_compiled_so(self):
         system = cart(
             backend="native", bind={"tip": "geom/tip/mass", "more": Scaled("geom/p/mass")},
@@ -136,6 +137,7 @@ class TestControllersInPython:
             np.testing.assert_allclose(system(k).signals["x"], traced(k).signals["x"], atol=1e-6)
         assert traced.notes == ()
 
+    @pytest.mark.thorough
     def test_their_memory_goes_along(self):
         def counting(time, state, memory, features):
             if memory > 2:

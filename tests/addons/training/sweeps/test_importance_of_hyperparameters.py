@@ -102,6 +102,7 @@ def test_checkpoints_count_as_training_set_size():
     assert found.table.loc["steps", "failure_rate_total"] > 0.9
 
 
+@pytest.mark.thorough
 def test_lengths_of_trainings_may_be_swept_with_checkpoints_before_their_ends():
     space = vj.FeatureSpace({**SPACE.domains, "steps": vj.Categorical(2000, 4000)})
     table = made(
@@ -111,6 +112,7 @@ def test_lengths_of_trainings_may_be_swept_with_checkpoints_before_their_ends():
     assert found.table["nominal_return"].idxmax() == "steps"
 
 
+@pytest.mark.thorough
 def test_noise_is_not_explained():
     noise = np.random.default_rng(5)
     table = made(40, lambda u, steps: noise.random(), lambda u, steps: 500.0)
@@ -121,6 +123,7 @@ def test_noise_is_not_explained():
     assert "return: it is 500 for every policy" in str(found)
 
 
+@pytest.mark.thorough
 def test_a_trend_shows_where_no_model_can_be_learned():
     noise = np.random.default_rng(1)
     table = made(30, lambda u, steps: 0.6 * u[1] + noise.random(), lambda u, steps: -u[0])
@@ -162,6 +165,7 @@ def test_too_few_configurations_are_admitted():
         found.plot()
 
 
+@pytest.mark.thorough
 def test_columns_without_a_space_and_with_gaps():
     table = made(60, lambda u, steps: float(u[2] > 0.6), lambda u, steps: 1.0)
     table["clip"] = np.where(table["algorithm"] == "ppo", 0.2 + 0.001 * table.index, np.nan)

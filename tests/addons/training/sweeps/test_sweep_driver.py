@@ -278,6 +278,7 @@ def test_interrupted_and_resumed_it_is_the_same_sweep(case, monkeypatch, tmp_pat
     same_tables(sweep(study, folder=tmp_path / "through", **how), through, but=())
 
 
+@pytest.mark.thorough
 def test_a_store_of_another_sweep_says_what_differs(tmp_path):
     sweep(drifting(), configurations=2, certification=vj.Certification(samples=8), folder=tmp_path)
     for other, how, told in (
@@ -333,6 +334,7 @@ def test_halving_keeps_the_best_by_return():
     np.testing.assert_array_equal(merged["nominal_return_x"], merged["nominal_return_y"])
 
 
+@pytest.mark.thorough
 def test_a_search_is_told_how_bad_the_policies_are(monkeypatch):
     told = []
 

@@ -364,6 +364,7 @@ def test_folders_that_hold_no_such_sweep(small, tmp_path):
         load_sweep(folder)
 
 
+@pytest.mark.thorough
 def test_the_picture_is_written(small, tmp_path):
     figure = small.plot(tmp_path / "sweep.png")
     assert (tmp_path / "sweep.png").stat().st_size > 10_000
