@@ -278,17 +278,18 @@ class FormulaBuilder(ExpressionBuilder):
     def _interval(self, tree: Tree | None) -> Interval:
         if tree is None:
             return ast.EVERYTHING
-        low, high = (self._bound(child) for child in tree.children)
+        opening, *bounds, closing = tree.children
+        low, high = map(self._bound, bounds)
         span = self._span(tree)
         if low < 0:
             raise self._fail("an interval starts at 0 or later", *span)
         if high < low:
-            ends = (_text(self.text, child) for child in reversed(tree.children))
+            ends = (_text(self.text, child) for child in reversed(bounds))
             offer = self._offered(": write ", f"[{', '.join(ends)}]", within='F{} "s"')
             raise self._fail(f"an interval ends no earlier than it starts{offer}", *span)
         if low == float("inf"):
             raise self._fail("an interval starts at a finite time", *span)
-        return Interval(low, high)
+        return Interval(low, high, opening == "(", closing == ")")
 
     def _bound(self, tree: Tree) -> float:
         if len(tree.children) == 1:
@@ -306,6 +307,8 @@ class FormulaBuilder(ExpressionBuilder):
                 str(unknown_name("constant", name, ["inf", *self.constants])), *self._span(tree)
             )
         minus, number, unit = tree.children
+        if str(unit or "s") not in UNITS:
+            raise self._fail(str(unknown_name("unit of time", str(unit), UNITS)), *self._span(tree))
         try:
             value = float(Decimal(str(number)) * UNITS[str(unit or "s")])
         except (DecimalException, ValueError):

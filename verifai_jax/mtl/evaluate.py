@@ -8,17 +8,20 @@ therefore cost nothing, and unbounded windows end there.
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any, Literal
 
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 from jaxtyping import Array, Float
 
 from verifai_jax.core.messages.text import format_seconds
 from verifai_jax.mtl import formula as ast
 from verifai_jax.mtl import windows
-from verifai_jax.mtl.expression import Arithmetic, Component, Duration, Number, Signal
+from verifai_jax.mtl.expression import Arithmetic, Component, Number, Signal
 from verifai_jax.mtl.formula import Formula, Interval, Term
+from verifai_jax.mtl.sampled import ArrayOperations, Sampled, held
 from verifai_jax.mtl.semantics import alone, compared
 from verifai_jax.mtl.tree import missing_case
 
@@ -48,21 +51,16 @@ def samples(time: float, dt: float, interval: Interval) -> float:
     return round(n)
 
 
-def seconds_held(truth: Any, n: int, dt: float, xp: Any) -> Any:
-    """Return the seconds, among the last `n` samples, in which truth values were above zero.
+def span_of(interval: Interval, dt: float, stride: int = 1) -> tuple[int, float]:
+    """Return the first and the last sample of an interval, relative to now.
 
-    **Arguments:**
-    - `truth`: `[time, *lanes]`; the result is NaN while one of the values is.
-    - `xp`: the array module, NumPy or `jax.numpy`.
+    **Raises:** `IntervalError` for an end that is not a multiple of `dt`, and for no sample.
     """
-
-    def within(marks: Any) -> Any:
-        total = xp.cumsum(marks, axis=0)
-        return total - xp.concatenate([xp.zeros_like(total[:n]), total[:-n]])
-
-    if n > len(truth):
-        n = len(truth)
-    return xp.where(within(xp.isnan(truth)) > 0, xp.nan, within(truth > 0) * dt)
+    first = int(samples(interval.start, dt, interval)) * stride + interval.open_start
+    last = samples(interval.end, dt, interval) * stride - interval.open_end
+    if last < first:
+        raise IntervalError(f"the interval {interval} has no sample every {format_seconds(dt)}")
+    return first, last
 
 
 def check_scalar(e: Term, shape: Sequence[int], lanes: int) -> None:
@@ -119,11 +117,8 @@ class Evaluator:
 
     def span(self, interval: Interval) -> tuple[int, float]:
         """Return the first and last sample of an interval, relative to now."""
-        a = samples(interval.start, self.dt, interval) * self.stride
-        b = samples(interval.end, self.dt, interval) * self.stride
-        if self.open_right and b > a:
-            b -= 1
-        return int(a), b
+        a, b = span_of(interval, self.dt, self.stride)
+        return a, b - (self.open_right and b > a)
 
     def settles(self, f: Formula) -> int:
         """Return the instant from which `f` is constant under `hold`; the last sample otherwise."""
@@ -212,8 +207,8 @@ class Evaluator:
         match e:
             case Number(value):
                 return value
-            case Duration():
-                return self._duration(e)[start : stop + 1]
+            case Sampled():
+                return self._sampled(e)[start : stop + 1]
             case Signal(name):
                 signal = self.signals[name]
                 check_scalar(e, signal.shape, self.lanes)
@@ -232,20 +227,28 @@ class Evaluator:
                 return self._arithmetic(e, start, stop)
         raise missing_case("the value", e)
 
-    def _duration(self, e: Duration) -> Float[Array, "time *lanes"]:
+    def _sampled(self, e: Sampled) -> Float[Array, "time *lanes"]:
         if e not in self._memo:
             boolean = replace(self, kind="boolean", nudges={}, _memo={}, _settled={})
-            truth = boolean.value(e.operand, 0, self._last)
-            dtype = next(iter(self.signals.values())).dtype
-            n = int(samples(e.window, self.dt, Interval(0.0, e.window))) * self.stride
-            seconds = seconds_held(truth, n, self.dt / self.stride, jnp).astype(dtype)
-            if self.valid is not None:  # After the end nothing is counted.
-                rows = jnp.minimum(self._index(0, seconds), self.valid - 1)
-                shape = jnp.broadcast_shapes(rows.shape, seconds.shape)
-                seconds = jnp.take_along_axis(
-                    jnp.broadcast_to(seconds, shape), jnp.broadcast_to(rows, shape), axis=0
+            like = next(iter(self.signals.values()))
+            like = jnp.ones((self.length,) + (1,) * self.lanes, like.dtype)
+            period = self.dt / self.stride
+            of = ArrayOperations(period, jnp, _apply, partial(lax.cummax, axis=0), like)
+            operands = [
+                held(boolean.value(part, 0, self._last), jnp)
+                if isinstance(part, Formula)
+                else like * self.expression(part, 0, self._last)
+                for part in e.operands
+            ]
+            span = (0, 0) if e.window is None else span_of(e.window, self.dt, self.stride)
+            value = e.value(of, operands, span[0], int(span[1]))
+            if self.valid is not None:  # After the end it stays as it is.
+                rows = jnp.minimum(self._index(0, value), self.valid - 1)
+                shape = jnp.broadcast_shapes(rows.shape, value.shape)
+                value = jnp.take_along_axis(
+                    jnp.broadcast_to(value, shape), jnp.broadcast_to(rows, shape), axis=0
                 )
-            self._memo[e] = seconds
+            self._memo[e] = value
         return self._memo[e]
 
     def _arithmetic(self, e: Arithmetic, start: int, stop: int) -> Array | float:

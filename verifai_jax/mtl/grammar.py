@@ -5,7 +5,7 @@ import functools
 import re
 from typing import Any, Protocol, runtime_checkable
 
-from verifai_jax.mtl.words import ANGLES, NAME, OPERATORS, RESERVED, WORDS
+from verifai_jax.mtl.words import NAME, OPERATORS, RESERVED, WORDS
 
 UNARY = tuple(word for word, o in OPERATORS.items() if o.side and o.operands == 1)
 """Temporal operators in front of one operand."""
@@ -102,14 +102,15 @@ def parser() -> Any:
                  | postfix
         ?postfix: atom
                 | atom "[" NUMBER "]" -> component
-        ?atom: NUMBER [ANGLE] -> number
+        ?atom: NUMBER [UNIT] -> number
              | NAME -> name
              | QUOTED -> quoted
              | TRUE -> true
              | FALSE -> false
-             | NAME "(" iff ("," iff)* ")" -> call
+             | NAME "(" _argument ("," _argument)* ")" -> call
              | "(" iff ")" -> parens
-        interval: "[" bound ("," | ":") bound "]"
+        _argument: iff | interval
+        interval: (LSQB | LPAR) bound ("," | ":") bound (RSQB | RPAR)
         bound: [MINUS] NUMBER [UNIT] | NAME
 
         {unary}
@@ -124,8 +125,11 @@ def parser() -> Any:
         POWER: "**"
         STAR: "*"
         SLASH: "/"
-        UNIT.5: /(?:min|ms|us|ns|s|h|d)(?!\w)/
-        ANGLE.5: /(?:{"|".join(ANGLES)})(?!\w)/
+        UNIT: /(?:%|[A-Za-z°µ]\w*(?:\/[A-Za-z]\w*(?:(?:\^|\*\*)\d)?)?)(?!\w)/
+        LSQB: "["
+        RSQB: "]"
+        LPAR: "("
+        RPAR: ")"
         NUMBER: /(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][+-]?\d+)?/
         NAME: /{NAME.pattern}/
         QUOTED: /"[^"\n]+"/
@@ -146,8 +150,7 @@ _GROUPS = (
     ({"UNTIL"}, "until"),
     ({"COMPARISON"}, "a comparison (<=, >, ...)"),
     ({"PLUS"}, "arithmetic"),
-    ({"UNIT"}, "a unit (s, ms, us, ns, min, h, d)"),
-    ({"ANGLE"}, "a unit of angle (deg, rad)"),
+    ({"UNIT"}, "a unit"),
     ({"COMMA"}, "','"),
     ({"COLON"}, "':'"),
     ({"RPAR"}, "')'"),
@@ -190,18 +193,9 @@ def explain_error(error: Exception, text: str) -> FormulaSyntaxError:
 
 
 def _habit(text: str, position: int, operand: bool) -> str:
-    """Return advice on what is written otherwise elsewhere: `|x|`, and units of numbers."""
+    """Return advice on what is written otherwise elsewhere: `|x|`."""
     bars = re.match(r"\|([^|]+)\|", text[position:]) if operand else None
-    if bars:
-        return f"; write abs({bars[1].strip()}) for {bars[0]}"
-    number = re.search(r"(?<![\w.])([\d.]+)\s*$", text[:position])
-    unit = re.match(r"%|[A-Za-z][\w/^]*", text[position:])
-    if not (number and unit and unit[0] not in RESERVED):
-        return ""
-    return (
-        f"; if {unit[0]!r} is a unit, leave it out and give the number in the unit of the signal "
-        "(only deg and rad may follow a number)"
-    )
+    return f"; write abs({bars[1].strip()}) for {bars[0]}" if bars else ""
 
 
 def _misspelt_word(before: str) -> str:

@@ -19,9 +19,10 @@ from jaxtyping import Float
 from verifai_jax.core.messages.errors import missing_name
 from verifai_jax.core.values.trace import Trace, without_wrapping
 from verifai_jax.mtl import formula as ast
-from verifai_jax.mtl.evaluate import End, check_scalar, check_vector, samples, seconds_held
-from verifai_jax.mtl.expression import Arithmetic, Component, Duration, Number, Signal
+from verifai_jax.mtl.evaluate import End, check_scalar, check_vector, span_of
+from verifai_jax.mtl.expression import Arithmetic, Component, Number, Signal
 from verifai_jax.mtl.formula import Formula, Interval, Term
+from verifai_jax.mtl.sampled import ArrayOperations, Sampled, held
 from verifai_jax.mtl.semantics import alone, compared
 from verifai_jax.mtl.setting import check_trace, period
 from verifai_jax.mtl.tree import missing_case, postorder
@@ -205,8 +206,8 @@ class HostValues:
             match part:
                 case Number(value):
                     values[id(part)] = np.full((1,), value)
-                case Duration():
-                    values[id(part)] = self._duration(part, pad)
+                case Sampled():
+                    values[id(part)] = _held(self._sampled(part), pad)
                 case Signal(name):
                     values[id(part)] = self._signal(name, pad)
                 case Component(Signal(name) as vector, index):
@@ -233,18 +234,23 @@ class HostValues:
             padded[name] = _held(self.signals[name], pad)
         return padded[name]
 
-    def _duration(self, e: Duration, pad: int) -> Values:
-        truth = self._value(e.operand, True, 0)
-        truth = np.broadcast_to(truth, (self.length, *truth.shape[1:]))
-        n = int(samples(e.window, self.dt, Interval(0.0, e.window))) * self.stride
-        return _held(seconds_held(truth, n, self.dt / self.stride, np), pad)
+    def _sampled(self, e: Sampled) -> Values:
+        like = np.ones((self.length, *(1,) * self.lanes))
+        operands = [
+            held(self._value(part, True, 0), np)
+            if isinstance(part, Formula)
+            else self._expression(part, 0) * like
+            for part in e.operands
+        ]
+        running = np.maximum.accumulate
+        of = ArrayOperations(
+            self.dt / self.stride, np, lambda name, values: FUNCTIONS[name](*values), running, like
+        )
+        span = (0, 0) if e.window is None else self._span(e.window)
+        return e.value(of, operands, span[0], int(span[1]))
 
 
-@functools.lru_cache(1024)
-def _span(interval: Interval, dt: float, stride: int) -> tuple[int, float]:
-    """Return the first and the last sample of an interval, relative to now."""
-    first, last = (samples(t, dt, interval) * stride for t in (interval.start, interval.end))
-    return int(first), last
+_span = functools.lru_cache(1024)(span_of)
 
 
 def _in_order(e: Term) -> tuple[Term, ...]:

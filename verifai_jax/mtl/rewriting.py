@@ -91,9 +91,9 @@ def _simplified_node(f: Formula) -> Formula:
             | ast.Once(inner, Interval(0.0, 0.0))
         ):
             return inner
-        case ast.Always(ast.Always(inner, low), high):
+        case ast.Always(ast.Always(inner, low), high) if low.closed and high.closed:
             return ast.Always(inner, _sum(low, high))
-        case ast.Eventually(ast.Eventually(inner, low), high):
+        case ast.Eventually(ast.Eventually(inner, low), high) if low.closed and high.closed:
             return ast.Eventually(inner, _sum(low, high))
         case ast.Until(ast.Constant(True), right, interval):
             return simplify(ast.Eventually(right, interval))

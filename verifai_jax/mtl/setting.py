@@ -15,8 +15,8 @@ from verifai_jax.core.messages.text import format_seconds, format_time
 from verifai_jax.core.values.trace import Samples, Trace, as_array, check_period
 from verifai_jax.mtl._parse import parse
 from verifai_jax.mtl.evaluate import End, Evaluator
-from verifai_jax.mtl.expression import durations_in
 from verifai_jax.mtl.formula import Formula
+from verifai_jax.mtl.sampled import sampled_in
 from verifai_jax.mtl.semantics import Semantics
 
 
@@ -105,7 +105,7 @@ def prepare(
         trace = trace.hold()
     trace = trace.finely()
     # Under "hold" only what is counted depends on where a trace ended.
-    ends = end != "hold" or durations_in(formula)
+    ends = end != "hold" or sampled_in(formula)
     valid = jnp.asarray(trace.valid) if trace.valid is not None and ends else None
     signals = numbers_of_signals({name: trace.signals[name] for name in formula.signals()})
     setting = Setting(
