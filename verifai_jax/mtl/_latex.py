@@ -35,6 +35,9 @@ def latex(f: Formula) -> str:
 
 
 def _expression_latex(e: Term, outer: int = 0) -> str:
+    if e.opened:
+        text = str(e).replace("_", r"\_").replace("%", r"\%")
+        return rf"\mathrm{{{text}}}"
     match e:
         case Number(value):
             return f"({number_text(value)})" if value < 0 and outer > 0 else number_text(value)

@@ -20,6 +20,7 @@ from verifai_jax.core.messages.text import format_seconds
 from verifai_jax.mtl import formula as ast
 from verifai_jax.mtl import windows
 from verifai_jax.mtl.expression import Arithmetic, Component, Number, Signal
+from verifai_jax.mtl.fitting import fitted
 from verifai_jax.mtl.formula import Formula, Interval, Term
 from verifai_jax.mtl.sampled import ArrayOperations, Sampled, held
 from verifai_jax.mtl.semantics import alone, compared
@@ -88,7 +89,8 @@ class Evaluator:
     valid samples, `[*lanes]` (truncate only; all when None). `lanes` is the number of lane axes;
     `open_right` makes windows half-open, as with `compat="pymtl"`. One period `dt` is `stride`
     samples long (`Trace.finely`), so windows, next and previous are that many times longer.
-    `truths` are the signals of truth values, which are numbers 1 and 0.
+    `truths` are the signals of truth values, which are numbers 1 and 0, and `units` those that are
+    known.
     """
 
     signals: Mapping[str, Float[Array, "time ..."]]
@@ -102,6 +104,7 @@ class Evaluator:
     lanes: int = 0
     stride: int = 1
     truths: frozenset[str] = frozenset()
+    units: Mapping[str, str] = field(default_factory=dict)
     #: Added to the values of leaves, `[time, *lanes]` each; differentiating by it weighs them.
     nudges: Mapping[Formula, Float[Array, "time ..."]] = field(default_factory=dict)
     _memo: dict[Any, Array] = field(default_factory=dict)
@@ -114,6 +117,12 @@ class Evaluator:
     @property
     def _hold(self) -> bool:
         return self.end != "truncate"
+
+    @property
+    def sizes(self) -> dict[str, int]:
+        """The numbers of components of vector signals."""
+        vectors = ((name, x) for name, x in self.signals.items() if x.ndim == 2 + self.lanes)
+        return {name: x.shape[-1] for name, x in vectors}
 
     def span(self, interval: Interval) -> tuple[int, float]:
         """Return the first and last sample of an interval, relative to now."""
@@ -191,13 +200,15 @@ class Evaluator:
     def _leaf(self, f: Formula, first: int, last: int) -> Array:
         start, stop = min(first, self._last), min(last, self._last)
         boolean = self.kind == "boolean"
-        match f:
+        match fitted(f, self.units, self.sizes):
             case ast.Predicate(comparison, left, right):
                 a, b = (self.expression(e, start, stop) for e in (left, right))
                 value = compared(comparison, a, b, boolean, jnp)
             case ast.Atom(e):
                 value = alone(self.expression(e, start, stop), e, self.truths)
                 value = compared(">", value, 0.0, boolean, jnp)
+            case several:
+                value = self.value(several, start, stop)
         if f in self.nudges:
             value = value + self.nudges[f][start : stop + 1]
         return self._extended(value, last - first + 1)

@@ -171,6 +171,11 @@ class Number(Expression):
     def number(self) -> float:
         return self.value
 
+    @property
+    def seconds(self) -> float:
+        """The number as a time in seconds."""
+        return self.value
+
     def __neg__(self) -> "Expression":
         return Number(-self.value)
 

@@ -22,7 +22,7 @@ from verifai_jax.mtl.expression import (
 from verifai_jax.mtl.formula import Formula, Interval
 from verifai_jax.mtl.grammar import FormulaSyntaxError, Tree
 from verifai_jax.mtl.sampled import text_functions
-from verifai_jax.mtl.words import ANGLES, FUNCTIONS, NUMBERS
+from verifai_jax.mtl.words import ANGLES, FUNCTIONS, NUMBERS, TIMES
 
 MAX_DEPTH = 100
 """Operators, or parentheses, that may stand within each other: far from where Python gives up."""
@@ -211,9 +211,8 @@ class ExpressionBuilder(abc.ABC):
             return Part(Number(float(number)), *self._span(tree))
         if (measured := text_functions().get("unit")) is not None:
             return Part(measured(str(number), str(unit)), *self._span(tree))
-        if str(unit) not in ANGLES:
-            raise self._fail(str(unknown_name("unit", str(unit), ANGLES)), *self._span(tree))
-        return Part(Number(float(number) * ANGLES[str(unit)]), *self._span(tree))
+        size = ANGLES[str(unit)] if str(unit) in ANGLES else float(TIMES[str(unit)])
+        return Part(Number(float(number) * size), *self._span(tree))
 
     def _name(self, tree: Tree) -> Part:
         name = str(tree.children[0])
@@ -253,6 +252,9 @@ class ExpressionBuilder(abc.ABC):
             return Part(base**exponent, *span)
         if str(name) not in FUNCTIONS:
             return Part(self._called(name, arguments), *span)
+        for tree in arguments:
+            if tree.data == "interval":
+                raise self._fail(f"{name} takes numbers, and no interval", *self._span(tree))
         parts = tuple(self._expression(self._build(c)) for c in arguments)
         try:
             return Part(Arithmetic(str(name), parts), *span)

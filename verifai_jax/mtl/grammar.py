@@ -5,7 +5,7 @@ import functools
 import re
 from typing import Any, Protocol, runtime_checkable
 
-from verifai_jax.mtl.words import NAME, OPERATORS, RESERVED, WORDS
+from verifai_jax.mtl.words import ANGLES, NAME, OPERATORS, RESERVED, TIMES, WORDS
 
 UNARY = tuple(word for word, o in OPERATORS.items() if o.side and o.operands == 1)
 """Temporal operators in front of one operand."""
@@ -59,9 +59,16 @@ class Tree(Protocol):
 
 
 @functools.cache
-def parser() -> Any:
-    """Return the LALR parser, made once."""
+def parser(units: tuple[str, ...] = ()) -> Any:
+    """Return the LALR parser, made once.
+
+    **Arguments:**
+    - `units`: words that may follow a number, besides times and angles.
+    """
     import lark
+
+    known = sorted({*TIMES, *ANGLES, *units}, key=len, reverse=True)
+    after = "|".join(re.escape(unit).replace("/", r"\/") for unit in known)
 
     def keyword(word: str) -> str:
         # An underscore may join an operator to its interval: `alw_[0,10]`.
@@ -87,8 +94,7 @@ def parser() -> Any:
         ?impl: or_ (IMPLIES or_)*
         ?or_: and_ (OR and_)*
         ?and_: bin (AND bin)*
-        ?bin: unary (_binary unary)*
-        _binary: ({" | ".join(w.upper() for w in BINARY)}) [interval]
+        ?bin: unary (({" | ".join(w.upper() for w in BINARY)}) [interval] unary)*
         ?unary: NOT unary -> negation
               | ({" | ".join(w.upper() for w in UNARY)}) [interval] unary -> temporal
               | cmp
@@ -125,7 +131,7 @@ def parser() -> Any:
         POWER: "**"
         STAR: "*"
         SLASH: "/"
-        UNIT: /(?:%|[A-Za-z°µ]\w*(?:\/[A-Za-z]\w*(?:(?:\^|\*\*)\d)?)?)(?!\w)/
+        UNIT.5: /(?:{after})(?!\w)/
         LSQB: "["
         RSQB: "]"
         LPAR: "("
@@ -150,7 +156,7 @@ _GROUPS = (
     ({"UNTIL"}, "until"),
     ({"COMPARISON"}, "a comparison (<=, >, ...)"),
     ({"PLUS"}, "arithmetic"),
-    ({"UNIT"}, "a unit"),
+    ({"UNIT"}, "a unit (s, ms, us, ns, min, h, d)"),
     ({"COMMA"}, "','"),
     ({"COLON"}, "':'"),
     ({"RPAR"}, "')'"),
@@ -193,9 +199,18 @@ def explain_error(error: Exception, text: str) -> FormulaSyntaxError:
 
 
 def _habit(text: str, position: int, operand: bool) -> str:
-    """Return advice on what is written otherwise elsewhere: `|x|`."""
+    """Return advice on what is written otherwise elsewhere: `|x|`, and units of numbers."""
     bars = re.match(r"\|([^|]+)\|", text[position:]) if operand else None
-    return f"; write abs({bars[1].strip()}) for {bars[0]}" if bars else ""
+    if bars:
+        return f"; write abs({bars[1].strip()}) for {bars[0]}"
+    number = re.search(r"(?<![\w.])([\d.]+)\s*$", text[:position])
+    unit = re.match(r"%|[A-Za-z][\w/^]*", text[position:])
+    if not (number and unit and unit[0] not in RESERVED):
+        return ""
+    return (
+        f"; if {unit[0]!r} is a unit, leave it out and give the number in the unit of the signal, "
+        "or in one of vj.mtl.UNITS"
+    )
 
 
 def _misspelt_word(before: str) -> str:

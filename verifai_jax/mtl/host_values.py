@@ -21,6 +21,7 @@ from verifai_jax.core.values.trace import Trace, without_wrapping
 from verifai_jax.mtl import formula as ast
 from verifai_jax.mtl.evaluate import End, check_scalar, check_vector, span_of
 from verifai_jax.mtl.expression import Arithmetic, Component, Number, Signal
+from verifai_jax.mtl.fitting import fitted
 from verifai_jax.mtl.formula import Formula, Interval, Term
 from verifai_jax.mtl.sampled import ArrayOperations, Sampled, held
 from verifai_jax.mtl.semantics import alone, compared
@@ -45,6 +46,7 @@ class HostValues:
     - `end`: how the trace continues after the last sample, `"hold"` or `"truncate"`.
     - `lanes`: number of lane axes.
     - `truths`: names of the signals of truth values, which are numbers 1 and 0.
+    - `units`: the units of signals, as far as they are known.
     - `blend`: share of the sum of all operands that `&` and `|` add to the deciding one, so that a
       search notices when another operand improves. 0 for the robustness.
     """
@@ -56,6 +58,7 @@ class HostValues:
     lanes: int = 0
     blend: float = 0.0
     truths: frozenset[str] = frozenset()
+    units: Mapping[str, str] = field(default_factory=dict)
     _padded: dict[int, dict[str, Values]] = field(default_factory=dict)
     _known: dict[tuple[Formula, bool, int], Values] = field(default_factory=dict)
 
@@ -75,7 +78,12 @@ class HostValues:
                 joined = np.concatenate([own[:, None], rows], axis=1)
                 signals[name] = joined.reshape(-1, *own.shape[1:])
         truths = frozenset(filter(trace.is_truth, signals))
-        return cls(signals, dt, end, trace.stride, truths=truths)
+        return cls(signals, dt, end, trace.stride, truths=truths, units=trace.units)
+
+    @functools.cached_property
+    def _sizes(self) -> dict[str, int]:
+        vectors = ((name, x) for name, x in self.signals.items() if x.ndim == 2 + self.lanes)
+        return {name: x.shape[-1] for name, x in vectors}
 
     @property
     def length(self) -> int:
@@ -168,6 +176,8 @@ class HostValues:
         top = 1.0 if boolean else math.inf
         below = [self._value(part, boolean, pad) for part in f.valued()]
         hold = self.end == "hold"
+        if isinstance(f, ast.Leaf) and (own := fitted(f, self.units, self._sizes)) is not f:
+            return self._value(own, boolean, pad)
         match f:
             case ast.Constant(value):
                 return np.full((self.length + pad, *(1,) * self.lanes), top if value else -top)

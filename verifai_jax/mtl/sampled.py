@@ -16,7 +16,7 @@ from typing import Any, ClassVar, Generic, TypeVar
 import numpy as np
 
 from verifai_jax.core.display.extensions import extension, extensions
-from verifai_jax.mtl.expression import Expression, Signal, constant_value, expression
+from verifai_jax.mtl.expression import Expression, Number, Signal, constant_value, expression
 from verifai_jax.mtl.formula import Formula, Interval, Next, Prev, Term, Witness, formula
 from verifai_jax.mtl.tree import Node, postorder
 from verifai_jax.mtl.words import number_text
@@ -137,7 +137,7 @@ class Sampled(Signal, abc.ABC):
         positive and finite.
         """
         if isinstance(window, Expression):
-            window = constant_value(window)
+            window = window.seconds if isinstance(window, Number) else constant_value(window)
             if window is None:
                 raise ValueError(f"the window of {cls.function} is a number of seconds")
         if isinstance(window, float | int):
@@ -225,6 +225,12 @@ def text_functions() -> dict[str, Callable[..., Any]]:
         names = getattr(module, "FUNCTIONS", {})
         found |= {word: getattr(module, name) for word, name in names.items()}
     return found
+
+
+def unit_words() -> tuple[str, ...]:
+    """Return the units of add-ons that may follow a number in a text."""
+    modules = [extension("verifai_jax.formulas", p) for p in extensions("verifai_jax.formulas")]
+    return tuple(word for module in modules for word in getattr(module, "UNITS", ()))
 
 
 def sampled_in(*formulas: Formula) -> tuple[Sampled, ...]:

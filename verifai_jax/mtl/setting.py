@@ -44,7 +44,8 @@ class Setting(NamedTuple):
     """All static settings of one evaluation.
 
     `length` counts samples. One period `dt` is `stride` samples long: more than one if values were
-    recorded between the samples. `truths` are the signals of truth values.
+    recorded between the samples. `truths` are the signals of truth values, and `units` those that are
+    known.
     """
 
     formula: Formula
@@ -57,6 +58,7 @@ class Setting(NamedTuple):
     compat: str | None
     stride: int = 1
     truths: frozenset[str] = frozenset()
+    units: tuple[tuple[str, str], ...] = ()
 
 
 def as_formula(formula: Formula | str) -> Formula:
@@ -111,6 +113,7 @@ def prepare(
     setting = Setting(
         formula, trace.length, dt, semantics.kind, semantics.error, semantics.bound, end, compat,
         stride, frozenset(name for name in formula.signals() if trace.is_truth(name)),
+        tuple((name, trace.units[name]) for name in formula.signals() if name in trace.units),
     )  # fmt: skip
     tau = None
     if semantics.kind == "smooth" and semantics.error is None:
@@ -255,5 +258,5 @@ def evaluator_of(
     of, pymtl = setting, setting.compat == "pymtl"
     return Evaluator(
         signals, of.length, of.dt, of.kind, tau, of.end, valid, pymtl, lanes,
-        stride=of.stride, truths=of.truths,
+        stride=of.stride, truths=of.truths, units=dict(of.units),
     )  # fmt: skip

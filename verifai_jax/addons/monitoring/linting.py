@@ -10,7 +10,7 @@ that never hold, are never near to a change, or look beyond the end.
 
 import math
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -27,11 +27,12 @@ from verifai_jax.core.values.trace import Trace
 from verifai_jax.mtl import formula as ast
 from verifai_jax.mtl.bounds import predicates_of
 from verifai_jax.mtl.evaluate import End
-from verifai_jax.mtl.expression import durations_in
+from verifai_jax.mtl.fitting import assumptions
 from verifai_jax.mtl.formula import FALSE, TRUE, Formula, surface
 from verifai_jax.mtl.host_values import HostValues
 from verifai_jax.mtl.requirements import Requirement
 from verifai_jax.mtl.rewriting import nnf, replaced
+from verifai_jax.mtl.sampled import sampled_in
 from verifai_jax.mtl.shortfalls import Shortfall, shortfalls, shortfalls_in
 
 FAR, NEVER = 2.5, 0.5
@@ -65,6 +66,10 @@ def lint(
     read = dict.fromkeys(name for each in requirements for name in each.formalized.signals())
     said = {name: unit for trace in traces.values() for name, unit in trace.units.items()}
     known = units_of([*names, *read], said | dict(units or {}))
+    traces = {
+        name: replace(trace, units={n: u for n, u in known.items() if n in trace.signals})
+        for name, trace in traces.items()
+    }
     found: list[Finding] = []
     for each in requirements:
         found += _Linter(each, traces, known, end).findings()
@@ -277,8 +282,11 @@ class _Linter:
         """Return how far the margin of a predicate moves in the recordings."""
         every = np.concatenate([np.ravel(each.values(leaf)) for each in self.recordings])
         spread = float(np.ptp(every[np.isfinite(every)]))
-        # Seconds that are counted may be all of their window.
-        spread = max([spread, *(each.window for each in durations_in(leaf))])
+        # What is counted, in seconds or samples, may be all of its window.
+        dt = min(each.values.dt for each in self.recordings)
+        for each in sampled_in(leaf):
+            if each.counted and each.window is not None:
+                spread = max(spread, each.window.end, each.window.end / dt)
         sizes = [np.abs(e.values.signals[n]).max() for e in self.recordings for n in leaf.signals()]
         # Flags, modes and counts are often constant, so that a bound next to one says nothing.
         still = STILL * float(max(sizes)) if max(sizes) > 3 or max(sizes) % 1 else math.inf
@@ -305,7 +313,7 @@ class _Linter:
         for part, (word, _) in written.items():
             if word != "until" or not isinstance(part, ast.Until):
                 continue
-            weak = part.left.weak_until(part.right, part.interval.start, part.interval.end)
+            weak = part.left.weak_until(part.right, part.interval)
             changed = replaced(self.formula, {part: weak})
             only = [
                 each.name
@@ -340,6 +348,8 @@ class _Linter:
 
     def _dimensions(self) -> Check:
         """Find units that do not go together, and a robustness of several units."""
+        for sentence in assumptions(self.formula, self.units) if self.traces else ():
+            yield self._found("units", self.formula, sentence)
         owners: dict[str, Formula] = {}
         for leaf in predicates_of(self.formula):
             faults: list[str] = []

@@ -19,7 +19,7 @@ import math
 import re
 import tomllib
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from importlib import resources
 from typing import Any
 
@@ -28,18 +28,17 @@ from verifai_jax.mtl import formula as ast
 from verifai_jax.mtl._parse import parse
 from verifai_jax.mtl.expression import (
     Arithmetic,
-    Duration,
     Number,
     Signal,
     constant_value,
-    duration,
     expression,
 )
 from verifai_jax.mtl.formula import Formula, Interval, Term
 from verifai_jax.mtl.requirements import Requirement
+from verifai_jax.mtl.sampled import Sampled
 from verifai_jax.mtl.tree import postorder
 
-_WORDS = re.compile(r'"[^"\n]*"|[\[\],:]|\?([A-Za-z_]\w*)')
+_WORDS = re.compile(r'"[^"\n]*"|[\[\]),:]|\?([A-Za-z_]\w*)')
 _START, _END = 1e-300, 1e300
 """Times of parameters while their values are unknown: multiples of these, below and above any that
 a person writes, so that an interval with one of them and another number ends after it starts."""
@@ -104,14 +103,23 @@ class Parametric:
         operands = [self._filled(part, values, positive) for part in f.operands()]
         if not f.operator.timed:
             return ast.build(f.operator.word, operands)
-        ends = (f.interval.start, f.interval.end)
-        ends = (values[self.slots[t]] if t in self.slots else t for t in ends)
-        return ast.build(f.operator.word, operands, Interval(*ends))
+        return ast.build(f.operator.word, operands, self._interval(f.interval, values))
+
+    def _interval(self, span: Interval, values: Mapping[str, float]) -> Interval:
+        start, end = (
+            values[self.slots[t]] if t in self.slots else t for t in (span.start, span.end)
+        )
+        return replace(span, start=start, end=end)
 
     def _with_numbers(self, e: Term, values: Mapping[str, float]) -> Term:
         match e:
-            case Duration():
-                return duration(self._filled(e.operand, values, None), e.window)
+            case Sampled():
+                return e.changed(
+                    lambda part: self._filled(part, values, None)
+                    if isinstance(part, Formula)
+                    else self._with_numbers(part, values),
+                    None if e.window is None else self._interval(e.window, values),
+                )
             case Signal(name) if name.startswith("?"):
                 return Number(values[name[1:]])
             case Arithmetic(name, arguments):
@@ -184,7 +192,7 @@ def read_parametric(
     def put(match: re.Match[str]) -> str:
         nonlocal inside
         word, name = match[0], match[1]
-        inside = (inside or word == "[") and word != "]"
+        inside = (inside or word == "[") and word not in ("]", ")")
         if name is None:
             return word
         if names.setdefault(name, inside) != inside:
@@ -218,7 +226,7 @@ def _term_signs(e: Term, name: str) -> set[int]:
     if name not in e.signals():
         return set()
     match e:
-        case Duration():
+        case Sampled():
             return {0}
         case Signal():
             return {1}
