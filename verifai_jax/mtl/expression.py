@@ -9,6 +9,7 @@ import re
 from collections.abc import Callable
 from dataclasses import dataclass
 from operator import methodcaller
+from typing import Any
 
 from verifai_jax.core.messages.errors import unknown_name
 from verifai_jax.mtl.formula import Formula, Predicate, Term, formula
@@ -200,6 +201,10 @@ class Signal(Expression):
     @property
     def is_signal(self) -> bool:
         return True
+
+    def changed(self, change: Callable[[Any], Any]) -> "Signal":
+        """Return the same function of changed operands, for a signal that is computed of others."""
+        return self
 
     def signals(self) -> tuple[str, ...]:
         return (self.name,)

@@ -10,7 +10,7 @@ import functools
 from collections.abc import Callable, Mapping
 
 from verifai_jax.mtl import formula as ast
-from verifai_jax.mtl.expression import Arithmetic, Expression, expression
+from verifai_jax.mtl.expression import Arithmetic, Expression, Signal, expression
 from verifai_jax.mtl.formula import Formula, Term
 from verifai_jax.mtl.rewriting import replaced
 from verifai_jax.mtl.sampled import Sampled, sampled_in, with_counted
@@ -83,6 +83,6 @@ def rebuilt(e: Term, change: Callable[[Term], Term | None]) -> Expression:
         return expression(new)
     if isinstance(e, Arithmetic):
         return Arithmetic(e.name, tuple(rebuilt(a, change) for a in e.arguments))
-    if isinstance(e, Sampled):
+    if isinstance(e, Signal):
         return e.changed(lambda a: a if isinstance(a, Formula) else rebuilt(a, change))
     return expression(e)

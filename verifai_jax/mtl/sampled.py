@@ -213,7 +213,7 @@ def duration(operand: Formula | Term, window: Term | Interval | float) -> Sample
 
 def window_text(window: Interval) -> str:
     """Return the text of a window: the number alone of `[0,5)`, which is the last 5 s."""
-    plain = window == Interval(0.0, window.end, open_end=True)
+    plain = window.start == 0 and window.open_end and not window.open_start
     return number_text(window.end) if plain else str(window)
 
 

@@ -4,8 +4,9 @@ They hold if the comparison holds for all (or any) of the elements. An evaluatio
 there are, and replaces the comparison by one for each: `x[0] < 3 & x[1] < 3`.
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from typing import Any
 
 from verifai_jax.core.messages.text import listed
 from verifai_jax.mtl import formula as ast
@@ -23,6 +24,10 @@ class Elements(Signal):
     operand: Expression
     every: bool
     opened = 1
+
+    def changed(self, change: Callable[[Any], Any]) -> "Elements":
+        """Return the elements of a changed expression."""
+        return (all_of if self.every else any_of)(change(self.operand))
 
     @property
     def is_signal(self) -> bool:

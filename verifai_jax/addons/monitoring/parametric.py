@@ -35,7 +35,7 @@ from verifai_jax.mtl.expression import (
 )
 from verifai_jax.mtl.formula import Formula, Interval, Term
 from verifai_jax.mtl.requirements import Requirement
-from verifai_jax.mtl.sampled import Sampled
+from verifai_jax.mtl.sampled import Sampled, sampled_in
 from verifai_jax.mtl.tree import postorder
 
 _WORDS = re.compile(r'"[^"\n]*"|[\[\]),:]|\?([A-Za-z_]\w*)')
@@ -85,10 +85,9 @@ class Parametric:
         """
         match f:
             case ast.Predicate(comparison, left, right):
-                if not any(name in self.names for name in _parameters(left, right)):
-                    return f
-                equal = {True: _CLOSED, False: _OPEN, None: {}}[positive]
-                comparison = equal.get(comparison, comparison)
+                if _parameters(left, right):
+                    equal = {True: _CLOSED, False: _OPEN, None: {}}[positive]
+                    comparison = equal.get(comparison, comparison)
                 left, right = (self._with_numbers(e, values) for e in (left, right))
                 return ast.Predicate(comparison, left, right)
             case ast.Atom(e):
@@ -214,7 +213,15 @@ def read_parametric(
             f"{text!r} has no parameter: write ?name for a number or a time that is to be found, "
             "as in always[0, ?T] (distance > ?d)"
         )
-    return Parametric(text, parse(plain, known, definitions), tuple(names), slots)
+    tree = parse(plain, known, definitions)
+    spans = [part.interval for part in tree.subformulas() if part.side and part.operator.timed]
+    for span in [*spans, *(each.window for each in sampled_in(tree))]:
+        if span and not span.closed and {span.start, span.end} & slots.keys():
+            raise ValueError(
+                f"a time that is to be found is an end that belongs to its interval, as in "
+                f"[0, ?T]; got {text!r}"
+            )
+    return Parametric(text, tree, tuple(names), slots)
 
 
 def _parameters(*terms: Term) -> list[str]:

@@ -150,11 +150,11 @@ class Quantity(Number):
         own = [each for each in _quantities(leaf) if each.scale[0] not in ("rad", "s")]
         unknown = [str(part) for part in _readings(leaf) if _scale(part, units) is None]
         if own and unknown:
-            one = len(unknown) == 1
+            known = next((s for part in _readings(leaf) if (s := _scale(part, units))), None)
+            names = [unit for unit, scale in SCALES.items() if scale == known]
             yield (
-                f"the unit{'' if one else 's'} of {listed(unknown)} {'is' if one else 'are'} not "
-                f"known, so {own[0]} was taken as {own[0].value:z.6g} {own[0].scale[0]}: give "
-                f"{'it' if one else 'them'}, as in units={{{unknown[0]!r}: {own[0].unit!r}}}"
+                f"no unit is known of {listed(unknown)} in {leaf}, and {(names or own[0].scale)[0]} "
+                f"is taken for granted: give it, as in units={{{unknown[0]!r}: {own[0].unit!r}}}"
             )
 
 
@@ -184,7 +184,7 @@ def completed(
         formula = as_formula(each)
         known = units_of(formula.signals(), units or {})
         for sentence in assumptions(formula, known):
-            raise ValueError(f"{formula}: {sentence.replace('was taken', 'would be taken')}")
+            raise ValueError(sentence.replace(" is taken for granted", " cannot be guessed"))
         found[name] = fitted(formula, known, sizes or {})
     return found
 
