@@ -8,13 +8,15 @@ The formula alone shows parts without effect and parts that cannot be true; reco
 that never hold, are never near to a change, or look beyond the end.
 """
 
+import contextlib
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
 
+from verifai_jax.addons.monitoring.across import across
 from verifai_jax.addons.monitoring.distinguishing import free_difference
 from verifai_jax.addons.monitoring.findings import Finding, Findings
 from verifai_jax.addons.monitoring.free_traces import FreeTraces
@@ -27,7 +29,7 @@ from verifai_jax.core.values.trace import Trace
 from verifai_jax.mtl import formula as ast
 from verifai_jax.mtl.bounds import predicates_of
 from verifai_jax.mtl.evaluate import End
-from verifai_jax.mtl.fitting import assumptions
+from verifai_jax.mtl.fitting import assumptions, fitted
 from verifai_jax.mtl.formula import FALSE, TRUE, Formula, surface
 from verifai_jax.mtl.host_values import HostValues
 from verifai_jax.mtl.requirements import Requirement
@@ -48,7 +50,8 @@ def lint(
     formulas: Requirements, signals: Recordings | None = None, *,
     units: Mapping[str, str] | None = None, end: End = "hold",
 ) -> Findings:  # fmt: skip
-    """Find parts of formulas that may not say what their author meant.
+    """Find parts of formulas that may not say what their author meant, and formulas of a set that
+    do not go together: contradictions, duplicates, one implied by another, several units.
 
     **Arguments:**
     - `formulas`: a formula, a sequence of formulas, or a dictionary by identifier;
@@ -67,14 +70,43 @@ def lint(
     said = {name: unit for trace in traces.values() for name, unit in trace.units.items()}
     known = units_of([*names, *read], said | dict(units or {}))
     traces = {
-        name: replace(trace, units={n: u for n, u in known.items() if n in trace.signals})
+        name: replace(trace, units=units_of(trace.signals, trace.units | dict(units or {})))
         for name, trace in traces.items()
     }
     found: list[Finding] = []
     for each in requirements:
         found += _Linter(each, traces, known, end).findings()
+    found += _units_in_set(requirements, traces)
+    whole: dict[str, Formula] = {}
+    for each in requirements:
+        sizes = {n: int(np.shape(x)[1]) for t in traces.values() for n, x in t.signals.items()
+                 if np.ndim(x) == 2}  # fmt: skip
+        with contextlib.suppress(ValueError):  # Which its own findings tell.
+            whole[each.id] = fitted(each.formalized, known, sizes)
+    pairs, left = across(whole)
     unread = tuple(name for name in names if name not in read)
-    return Findings(requirements, tuple(found), len(traces), unread)
+    return Findings(requirements, (*found, *pairs), len(traces), unread, left)
+
+
+def _units_in_set(
+    requirements: Sequence[Requirement], traces: Mapping[str, Trace]
+) -> Check:
+    """Find signals that have one unit here and another there."""
+    said: dict[str, dict[str, str]] = {}
+    for source, trace in traces.items():
+        for name, unit in trace.units.items():
+            said.setdefault(name, {}).setdefault(unit, source)
+    for each in requirements:
+        names = each.formalized.signals()
+        if len(names) == 1 and (unit := plain_unit(each.unit)):
+            said.setdefault(names[0], {}).setdefault(unit, each.id)
+    reading = {name: each for each in reversed(requirements) for name in each.formalized.signals()}
+    for name, sources in said.items():
+        if len(sources) > 1 and name in reading:
+            where = " and ".join(f"{unit} in {source}" for unit, source in sources.items())
+            said_so = f"{name} is in {where}"
+            advice = "Convert one of them, or give the unit with the number, as in 130 km/h."
+            yield Finding(reading[name].id, "units", name, said_so, advice)
 
 
 class _Recording(NamedTuple):
