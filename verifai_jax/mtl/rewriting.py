@@ -140,6 +140,17 @@ def replaced(f: Formula, parts: Mapping[Formula, Formula]) -> Formula:
     return rebuild(f, tuple(replaced(part, parts) for part in f.operands()))
 
 
+def asked_at_once(f: Formula) -> Formula:
+    """Return a formula without operators that look ahead which must hold at time 0 if `f` does."""
+    f = nnf(f)
+    match f:
+        case ast.And(parts):
+            return simplify(ast.And(tuple(map(asked_at_once, parts))))
+        case ast.Always(part, span) if span.start == 0 and not span.open_start:
+            return asked_at_once(part)
+    return TRUE if any(part.side == "ahead" for part in f.subformulas(valued=True)) else f
+
+
 def expand(f: Formula) -> Formula:
     """Return a formula without `Derived` operators: each is replaced by its meaning."""
     known: dict[Formula, Formula] = {}

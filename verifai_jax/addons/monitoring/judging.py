@@ -41,6 +41,7 @@ from verifai_jax.mtl.fitting import assumptions
 from verifai_jax.mtl.formula import Formula
 from verifai_jax.mtl.host_values import HostValues
 from verifai_jax.mtl.requirements import Requirement
+from verifai_jax.mtl.rewriting import asked_at_once
 from verifai_jax.mtl.setting import SamplingError, check_horizon, check_reach, check_signals, period
 from verifai_jax.mtl.shortfalls import shortfalls_in
 
@@ -253,6 +254,8 @@ def finder(trace: Trace, reading: Reading) -> Callable[[Formula], tuple[Found, s
             check_horizon(formula, own, values.dt)
         notes = [str(note) for note in own.notes if note not in trace.notes]
         notes += assumptions(formula, trace.units)
+        if (values.truth(asked_at_once(formula))[0] < 0).any():
+            notes.append("it is violated already at the first sample")
         return _found(formula, values, own, reading), "; ".join(notes)
 
     return find
