@@ -14,9 +14,9 @@ from typing import cast
 import numpy as np
 
 from verifai_jax.core.compute.compilation import Slot
+from verifai_jax.core.values.trace import Trace
 from verifai_jax.evaluation.engine import Engine
 from verifai_jax.evaluation.evaluator import Evaluator
-from verifai_jax.core.values.trace import Trace
 from verifai_jax.falsification.table import ErrorTable
 from verifai_jax.mtl.formula import Formula
 from verifai_jax.mtl.host_values import HostValues
@@ -144,9 +144,7 @@ def notes_after(
 def note_on_time_0(formulas: Mapping[str, Formula], trace: Trace) -> tuple[str, ...]:
     """Return a note if a trace violates formulas already at its first sample."""
     values = HostValues.of(trace)
-    early = [
-        name for name, f in formulas.items() if (values.truth(asked_at_once(f))[0] < 0).any()
-    ]
+    early = [name for name, f in formulas.items() if (values.truth(asked_at_once(f))[0] < 0).any()]
     which = "the property" if len(formulas) == 1 else f"formula {', '.join(map(repr, early))}"
     said = f"{which} is violated already at time 0: does the start satisfy it?"
     return (said,) if early else ()

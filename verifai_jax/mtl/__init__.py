@@ -36,8 +36,8 @@ from verifai_jax.mtl.setting import HorizonError, SamplingError
 
 __all__ = [
     "FALSE", "TRUE", "End", "Explanation", "Expression", "Formula", "FormulaSyntaxError",
-    "HorizonError", "Interval", "IntervalError", "Online", "Requirement", "SamplingError", "Semantics",
-    "SmoothingError", "always", "boolean", "duration", "during",
+    "HorizonError", "Interval", "IntervalError", "Online", "Requirement", "SamplingError",
+    "Semantics", "SmoothingError", "always", "boolean", "duration", "during",
     "eventually", "explain", "fall", "hard", "historically", "latex", "next_", "nnf",
     "once", "online", "parse", "phase", "prev", "rise",
     "robustness", "robustness_signal", "satisfied", "signal", "simplify", "since", "smooth",

@@ -136,8 +136,9 @@ class Sampled(Signal, abc.ABC):
         **Raises:** `ValueError` for a formula that looks ahead, and for a window that is not
         positive and finite.
         """
-        if isinstance(window, Expression):
-            window = window.seconds if isinstance(window, Number) else constant_value(window)
+        if isinstance(window, Term):
+            asked = expression(window)
+            window = asked.seconds if isinstance(asked, Number) else constant_value(asked)
             if window is None:
                 raise ValueError(f"the window of {cls.function} is a number of seconds")
         if isinstance(window, float | int):

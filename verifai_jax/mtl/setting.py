@@ -44,8 +44,8 @@ class Setting(NamedTuple):
     """All static settings of one evaluation.
 
     `length` counts samples. One period `dt` is `stride` samples long: more than one if values were
-    recorded between the samples. `truths` are the signals of truth values, and `units` those that are
-    known.
+    recorded between the samples. `truths` are the signals of truth values, and `units` the known
+    ones.
     """
 
     formula: Formula

@@ -138,9 +138,7 @@ class Term(Node, abc.ABC):
         return False
 
     @classmethod
-    def fitted(
-        cls, leaf: Any, units: Mapping[str, str], sizes: Mapping[str, int]
-    ) -> Any:
+    def fitted(cls, leaf: Any, units: Mapping[str, str], sizes: Mapping[str, int]) -> Any:
         """Return a predicate without expressions of this kind, which a recording completes."""
         return leaf
 

@@ -59,8 +59,9 @@ def animate(
     - `camera`: name of a camera of a MuJoCo model; by default the one that shows the motion best.
     - `size`: width and height of a frame in pixels.
     - `fps`: frames per second; chosen automatically when left out.
-    **Raises:** `ValueError` for a path that does not end in `.gif`, a camera without a MuJoCo model, and invalid sizes; `UnknownNameError` for a camera that
-    the model lacks; `film.NoRenderer` if MuJoCo cannot draw.
+    **Raises:** `ValueError` for a path that does not end in `.gif`, a camera without a MuJoCo
+    model, and invalid sizes; `UnknownNameError` for a camera that the model lacks;
+    `film.NoRenderer` if MuJoCo cannot draw.
     """
     _check_gif(path)
     check_film(size, fps)

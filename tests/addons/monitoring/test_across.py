@@ -101,16 +101,17 @@ def test_a_set_is_checked_in_the_units_of_its_signals():
     ]
     texts = {"R1": "always speed < 30 km/h", "R2": "always speed > 35 m/s"}
     found = mtl.lint(texts, recordings)
-    assert [f.kind for f in found] == ["never holds", "units", "contradiction"][-len(found):]
+    assert [f.kind for f in found] == ["never holds", "units", "contradiction"][-len(found) :]
     assert "speed is in km/h in recording 1 and m/s in recording 2" in str(found)
 
 
 def test_many_pairs_are_told_to_be_compared_by_proof_alone():
     formulas = {f"R{k}": mtl.parse(f"F[0,{k + 1}] (x > {k} & y > 1)") for k in range(4)}
     assert across(formulas, searched=2)[1] == 4
-    assert "3 pairs of formulas were compared by proof alone" in mtl.lint(
-        "always x > 1"
-    ).__class__((), (), 0, (), 3).summary()
+    assert (
+        "3 pairs of formulas were compared by proof alone"
+        in mtl.lint("always x > 1").__class__((), (), 0, (), 3).summary()
+    )
 
 
 def test_the_command_reads_several_files(tmp_path):

@@ -103,7 +103,7 @@ def _searched(one: str, other: str, formulas: Mapping[str, Formula]) -> Iterator
     except ValueError:
         return
 
-    def seen(wanted: tuple[bool, bool]) -> bool:
+    def seen(wanted: tuple[bool, ...]) -> bool:
         """Return whether a trace is found on which each formula holds, or not, as is wanted."""
         if ((a == wanted[0]) & (b == wanted[1])).any():
             return True
@@ -135,4 +135,3 @@ def _searched(one: str, other: str, formulas: Mapping[str, Formula]) -> Iterator
         yield _implied(one, other, formulas, SEARCH)
     elif not held[False, True]:
         yield _implied(other, one, formulas, SEARCH)
-

@@ -75,9 +75,7 @@ class Range(NamedTuple):
         """Return the range of the sums of its numbers and those of another range."""
         low = None if self.low is None or other.low is None else self.low + other.low
         high = None if self.high is None or other.high is None else self.high + other.high
-        return Range(
-            low, high, self.open_low or other.open_low, self.open_high or other.open_high
-        )
+        return Range(low, high, self.open_low or other.open_low, self.open_high or other.open_high)
 
 
 class Demand(NamedTuple):
@@ -241,7 +239,7 @@ def _looks(parts: Sequence[Formula]) -> bool:
 
 
 def _forms(factors: Mapping[Term, Fraction], span: Range) -> Iterator[tuple[Form, Range]]:
-    """Yield a sum in a range so that its first factor is 1; what is within an absolute value too."""
+    """Yield a sum in a range so that its first factor is 1, or what is in its absolute value."""
     terms = sorted(factors.items(), key=lambda item: str(item[0]))
     if not terms:
         return

@@ -219,8 +219,9 @@ class DenseValues:
 
     def formula(self, f: Formula, below: list[Piecewise]) -> Piecewise:
         if f.side and f.operator.timed and not f.interval.closed:
-            raise NotDense(f"{f} leaves out an end of its interval, which is a sample: judge it by "
-                           "robustness")
+            raise NotDense(
+                f"{f} leaves out an end of its interval, which is a sample: judge it by robustness"
+            )
         match f:
             case ast.Constant(value):
                 return self.constant(math.inf if value else -math.inf)

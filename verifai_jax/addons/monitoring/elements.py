@@ -79,7 +79,8 @@ class Elements(Signal):
             def component(part: Term) -> Term | None:
                 if isinstance(part, Component):
                     return part
-                return Component(part, k) if getattr(part, "name", "") in known else None
+                is_vector = isinstance(part, Signal) and part.name in known
+                return Component(expression(part), k) if is_vector else None
 
             def change(part: Term) -> Term | None:
                 return rebuilt(part.operand, component) if isinstance(part, Elements) else None

@@ -11,8 +11,8 @@ from pathlib import Path
 from xml.etree import ElementTree
 
 from verifai_jax.addons.monitoring.c_monitor import export_c
-from verifai_jax.addons.monitoring.quantities import completed
 from verifai_jax.addons.monitoring.margins import margins
+from verifai_jax.addons.monitoring.quantities import completed
 from verifai_jax.addons.monitoring.watching import FLAGS
 from verifai_jax.addons.native.native_code.machine_code import Unavailable, compile_library
 from verifai_jax.core.messages.checks import check_name

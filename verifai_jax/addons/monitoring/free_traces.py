@@ -164,7 +164,12 @@ def _clock(
     ends += [each.window.end for each in sampled_in(*formulas) if each.window is not None]
     if dt is None:
         # Seconds that are counted are multiples of the period, too, and so are their limits.
-        counts = [leaf for f in formulas for leaf in predicates_of(f) if any(e.function == "duration" for e in sampled_in(leaf))]
+        counts = [
+            leaf
+            for f in formulas
+            for leaf in predicates_of(f)
+            if any(e.function == "duration" for e in sampled_in(leaf))
+        ]
         limits = [number for leaf in counts for number in _numbers(leaf) if number > 0]
         exact = [Fraction(repr(t)) for t in (*ends, *limits)]
         common = Fraction(1) if not exact else _common(exact)

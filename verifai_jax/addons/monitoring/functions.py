@@ -10,7 +10,7 @@ before the first one. `docs/formulas.md` has the definitions.
 
 from collections.abc import Sequence
 
-from verifai_jax.mtl.expression import Expression, expression
+from verifai_jax.mtl.expression import expression
 from verifai_jax.mtl.formula import Formula, Interval, Term, formula
 from verifai_jax.mtl.sampled import Operations, Sampled, V
 

@@ -70,7 +70,7 @@ def lint(
     said = {name: unit for trace in traces.values() for name, unit in trace.units.items()}
     known = units_of([*names, *read], said | dict(units or {}))
     traces = {
-        name: replace(trace, units=units_of(trace.signals, trace.units | dict(units or {})))
+        name: replace(trace, units=units_of(trace.signals, dict(trace.units) | dict(units or {})))
         for name, trace in traces.items()
     }
     found: list[Finding] = []
@@ -78,9 +78,9 @@ def lint(
         found += _Linter(each, traces, known, end).findings()
     found += _units_in_set(requirements, traces)
     whole: dict[str, Formula] = {}
+    every = (signal for trace in traces.values() for signal in trace.signals.items())
+    sizes = {name: x.shape[1] for name, x in every if x.ndim == 2}
     for each in requirements:
-        sizes = {n: int(np.shape(x)[1]) for t in traces.values() for n, x in t.signals.items()
-                 if np.ndim(x) == 2}  # fmt: skip
         with contextlib.suppress(ValueError):  # Which its own findings tell.
             whole[each.id] = fitted(each.formalized, known, sizes)
     pairs, left = across(whole)
@@ -88,9 +88,7 @@ def lint(
     return Findings(requirements, (*found, *pairs), len(traces), unread, left)
 
 
-def _units_in_set(
-    requirements: Sequence[Requirement], traces: Mapping[str, Trace]
-) -> Check:
+def _units_in_set(requirements: Sequence[Requirement], traces: Mapping[str, Trace]) -> Check:
     """Find signals that have one unit here and another there."""
     said: dict[str, dict[str, str]] = {}
     for source, trace in traces.items():

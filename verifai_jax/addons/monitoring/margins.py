@@ -9,8 +9,8 @@ front.leaves                    # the results that are the margins
 from collections.abc import Callable, Mapping
 from typing import NamedTuple
 
-from verifai_jax.mtl.expression import Arithmetic, Component, Number, Signal
 from verifai_jax.mtl.evaluate import span_of
+from verifai_jax.mtl.expression import Arithmetic, Component, Number, Signal
 from verifai_jax.mtl.formula import Formula, Term
 from verifai_jax.mtl.sampled import Operations, Sampled
 from verifai_jax.mtl.semantics import boolean

@@ -114,9 +114,11 @@ class Parametric:
         match e:
             case Sampled():
                 return e.changed(
-                    lambda part: self._filled(part, values, None)
-                    if isinstance(part, Formula)
-                    else self._with_numbers(part, values),
+                    lambda part: (
+                        self._filled(part, values, None)
+                        if isinstance(part, Formula)
+                        else self._with_numbers(part, values)
+                    ),
                     None if e.window is None else self._interval(e.window, values),
                 )
             case Signal(name) if name.startswith("?"):

@@ -245,9 +245,7 @@ _STEPS: dict[str, Callable[..., float]] = {
 # Margins
 
 
-def _counted(
-    machine: PythonMachine, columns: Sequence[int]
-) -> Callable[[Sequence[float]], float]:
+def _counted(machine: PythonMachine, columns: Sequence[int]) -> Callable[[Sequence[float]], float]:
     """Return the function that tells, sample by sample, whether a formula holds: 1, 0 or NaN."""
 
     def holds(x: Sequence[float]) -> float:

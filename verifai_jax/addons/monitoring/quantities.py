@@ -61,8 +61,8 @@ SIZES: dict[str, dict[str, Fraction | int]] = {
     "mg/dL": {"mg/dL": 1},
     "mmol/L": {"mmol/L": 1},
 }  # fmt: skip
-"""Units by the coherent unit of their dimension, with their sizes in it. Temperatures in degrees and
-in kelvin are not converted, as their zeros differ."""
+"""Units by the coherent unit of their dimension, with their sizes in it. Temperatures in degrees
+and in kelvin are not converted, as their zeros differ."""
 RATES = {"m": "m/s", "m/s": "m/s^2", "m/s^2": "m/s^3", "rad": "rad/s", "rad/s": "rad/s^2"}
 """The coherent unit of the rate of change of a quantity."""
 Scale: TypeAlias = tuple[str, Fraction]
@@ -140,7 +140,6 @@ class Quantity(Number):
 
         return with_terms(leaf, change)
 
-
     @classmethod
     def assumed(cls, leaf: Formula, units: Mapping[str, str]) -> Iterator[str]:
         """Yield the unit in which signals of unknown units are taken to be.
@@ -151,9 +150,9 @@ class Quantity(Number):
         unknown = [str(part) for part in _readings(leaf) if _scale(part, units) is None]
         if own and unknown:
             known = next((s for part in _readings(leaf) if (s := _scale(part, units))), None)
-            names = [unit for unit, scale in SCALES.items() if scale == known]
+            taken = [*(unit for unit, s in SCALES.items() if s == known), own[0].scale[0]][0]
             yield (
-                f"no unit is known of {listed(unknown)} in {leaf}, and {(names or own[0].scale)[0]} "
+                f"no unit is known of {listed(unknown)} in {leaf}, and {taken} "
                 f"is taken for granted: give it, as in units={{{unknown[0]!r}: {own[0].unit!r}}}"
             )
 
@@ -239,9 +238,9 @@ def _is_linear(leaf: Formula) -> bool:
     for part in (part for term in leaf.terms() for part in postorder(term)):
         if isinstance(part, Arithmetic) and part.name not in _LINEAR:
             plain = [constant_value(a) is not None and not _has_unit(a) for a in part.arguments]
-            if part.name not in ("*", "/") or not any(plain[part.name == "/" :]):
-                if any(map(_has_unit, part.arguments)) or part.signals():
-                    return False
+            scaled = part.name in ("*", "/") and any(plain[part.name == "/" :])
+            if not scaled and (part.signals() or any(map(_has_unit, part.arguments))):
+                return False
     return True
 
 

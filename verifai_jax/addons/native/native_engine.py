@@ -24,8 +24,8 @@ from verifai_jax.addons.native.native_code.machine_code import Unavailable, comp
 from verifai_jax.core.compute.compilation import Slot
 from verifai_jax.evaluation.engine import FIRST, Engine, Wanted
 from verifai_jax.evaluation.verdicts import Verdicts
-from verifai_jax.mtl.sampled import sampled_in
 from verifai_jax.mtl.formula import Formula
+from verifai_jax.mtl.sampled import sampled_in
 from verifai_jax.mtl.tree import Term, postorder
 
 if TYPE_CHECKING:

@@ -1,7 +1,7 @@
 """A switch for people who read an error's sentence, and not its traceback: a class, a newcomer.
 
-    vj.plain_errors()                # from now on, in this notebook or program
-    vj.plain_errors(False)           # tracebacks again
+vj.plain_errors()                # from now on, in this notebook or program
+vj.plain_errors(False)           # tracebacks again
 """
 
 import functools
@@ -55,7 +55,9 @@ def _is_ours(file: str) -> bool:
 
 
 def _is_library(file: str) -> bool:
-    return _is_ours(file) or "site-packages" in file or file.startswith(("<frozen", sys.base_prefix))
+    return (
+        _is_ours(file) or "site-packages" in file or file.startswith(("<frozen", sys.base_prefix))
+    )
 
 
 def _show(kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:

@@ -44,7 +44,9 @@ def _term(e: Term) -> str:
     if not isinstance(e, Sampled):
         text = str(e)
         for part in postorder(e):
-            text = text.replace(str(part), f"({_term(part)})") if isinstance(part, Sampled) else text
+            text = (
+                text.replace(str(part), f"({_term(part)})") if isinstance(part, Sampled) else text
+            )
         return text
     parts = (
         _words(part, inner=True) if isinstance(part, Formula) else _term(part)

@@ -6,9 +6,9 @@
     with SimulationProgress("cartpole", budget, show=None) as progress:
         progress.update(simulations, counterexamples, best)
 
-Rich draws a line on the error stream, on a terminal or in a notebook that has ipywidgets. In another
-notebook a line is written over every second; elsewhere, such as in a pipe, one is written a minute. A call inside another one takes over
-its line while it runs.
+Rich draws a line on the error stream, on a terminal or in a notebook that has ipywidgets. In
+another notebook a line is written over every second; elsewhere, such as in a pipe, one is written a
+minute. A call inside another one takes over its line while it runs.
 """
 
 import contextlib
