@@ -131,7 +131,7 @@ def parser(units: tuple[str, ...] = ()) -> Any:
         POWER: "**"
         STAR: "*"
         SLASH: "/"
-        UNIT.5: /(?:{after})(?!\w)/
+        UNIT.5: /(?:{after})(?!\w|\/[A-Za-z]|\^|\*\*)/
         LSQB: "["
         RSQB: "]"
         LPAR: "("

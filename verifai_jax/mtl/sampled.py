@@ -25,7 +25,7 @@ V = TypeVar("V")
 
 
 class Operations(abc.ABC, Generic[V]):
-    """What a function of samples is computed by; `dt` is the time of a sample in seconds."""
+    """The operations of functions of samples; `dt` is the time of a sample in seconds."""
 
     dt: float
 
@@ -55,12 +55,12 @@ class Operations(abc.ABC, Generic[V]):
         return self._joined(word, x, n, True)
 
     def _joined(self, word: str, x: V, n: int, held: bool) -> V:
-        joined, behind, size = None, 0, 1
+        joined, ago, size = None, 0, 1
         while True:
             if n & size:
-                part = self.before(x, behind, held) if behind else x
+                part = self.before(x, ago, held) if ago else x
                 joined = part if joined is None else self.apply(word, joined, part)
-                behind += size
+                ago += size
             if joined is not None and 2 * size > n:
                 return joined
             x, size = self.apply(word, x, self.before(x, size, held)), 2 * size

@@ -54,9 +54,9 @@ def test_conditional_contradictions_name_the_conditions():
     )
 
 
-def random_requirement(rng):
+def random_requirement(rng, lefts):
     def predicate():
-        left = rng.choice(["x", "x", "abs(x)", "-x", "x + y", "2 * x - y"])
+        left = rng.choice(lefts)
         return f"{left} {rng.choice(['<', '<=', '>', '>=', '=='])} {rng.integers(-2, 3)}"
 
     a, b = sorted(int(k) for k in rng.integers(0, 3, 2))
@@ -65,11 +65,11 @@ def random_requirement(rng):
     return mtl.parse(f"{window} {inner.format(predicate(), predicate())}")
 
 
-def proofs_hold(seeds):
+def proofs_hold(seeds, lefts=("x", "x", "abs(x)", "-x", "x + y", "2 * x - y")):
     proved = 0
     for seed in seeds:
         rng = np.random.default_rng(seed)
-        f, g = random_requirement(rng), random_requirement(rng)
+        f, g = (random_requirement(rng, lefts) for _ in range(2))
         one, other = Demands.of(f), Demands.of(g)
         # Few levels make all cases come, also equality.
         signals = {name: rng.integers(-6, 7, (3, 1000)) / 2 for name in "xy"}
@@ -86,7 +86,7 @@ def proofs_hold(seeds):
 
 
 def test_no_trace_contradicts_a_proof():
-    assert proofs_hold(range(60)) > 2
+    assert proofs_hold(range(100), ["x"]) > 2
 
 
 @pytest.mark.thorough

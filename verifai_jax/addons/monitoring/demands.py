@@ -1,4 +1,4 @@
-"""What a formula asks of linear expressions at all, or at some, instants of a window.
+"""Ranges that a formula demands of linear expressions, at all or some instants of a window.
 
     Demands.of(parse("always[0, 9] abs(x) <= 2")).parts    # x <= 2 and x >= -2 from 0 s to 9 s
 
