@@ -24,7 +24,7 @@ from verifai_jax.mtl import formula as ast
 from verifai_jax.mtl._robustness import robustness
 from verifai_jax.mtl.evaluate import End
 from verifai_jax.mtl.expression import Number, Signal
-from verifai_jax.mtl.fitting import fitted
+from verifai_jax.mtl.fitting import fitted, sizes_of
 from verifai_jax.mtl.formula import Formula
 from verifai_jax.mtl.rewriting import nnf, rebuild, replaced
 from verifai_jax.mtl.semantics import Semantics, hard
@@ -68,7 +68,7 @@ class Goals:
             margin = evaluator.value(leaf, 0, setting.length - 1)
             size = sum(
                 jnp.mean(jnp.abs(jnp.asarray(evaluator.expression(side, 0, setting.length - 1))))
-                for part in fitted(leaf, evaluator.units, evaluator.sizes).subformulas()
+                for part in fitted(leaf, evaluator.units, sizes_of(arrays)).subformulas()
                 for side in part.terms()
             )
             scale = jnp.sqrt(jnp.var(margin) + (0.1 * size) ** 2)

@@ -20,7 +20,7 @@ from verifai_jax.core.messages.text import format_seconds
 from verifai_jax.mtl import formula as ast
 from verifai_jax.mtl import windows
 from verifai_jax.mtl.expression import Arithmetic, Component, Number, Signal
-from verifai_jax.mtl.fitting import fitted
+from verifai_jax.mtl.fitting import fitted, sizes_of
 from verifai_jax.mtl.formula import Formula, Interval, Term
 from verifai_jax.mtl.sampled import ArrayOperations, Sampled, held
 from verifai_jax.mtl.semantics import alone, compared
@@ -118,12 +118,6 @@ class Evaluator:
     def _hold(self) -> bool:
         return self.end != "truncate"
 
-    @property
-    def sizes(self) -> dict[str, int]:
-        """The numbers of components of vector signals."""
-        vectors = ((name, x) for name, x in self.signals.items() if x.ndim == 2 + self.lanes)
-        return {name: x.shape[-1] for name, x in vectors}
-
     def span(self, interval: Interval) -> tuple[int, float]:
         """Return the first and last sample of an interval, relative to now."""
         a, b = span_of(interval, self.dt, self.stride)
@@ -200,7 +194,7 @@ class Evaluator:
     def _leaf(self, f: Formula, first: int, last: int) -> Array:
         start, stop = min(first, self._last), min(last, self._last)
         boolean = self.kind == "boolean"
-        match fitted(f, self.units, self.sizes):
+        match fitted(f, self.units, sizes_of(self.signals, self.lanes)):
             case ast.Predicate(comparison, left, right):
                 a, b = (self.expression(e, start, stop) for e in (left, right))
                 value = compared(comparison, a, b, boolean, jnp)
@@ -245,14 +239,11 @@ class Evaluator:
             like = jnp.ones((self.length,) + (1,) * self.lanes, like.dtype)
             period = self.dt / self.stride
             of = ArrayOperations(period, jnp, _apply, partial(lax.cummax, axis=0), like)
-            operands = [
-                held(boolean.value(part, 0, self._last), jnp)
-                if isinstance(part, Formula)
-                else like * self.expression(part, 0, self._last)
-                for part in e.operands
-            ]
-            span = (0, 0) if e.window is None else span_of(e.window, self.dt, self.stride)
-            value = e.value(of, operands, span[0], int(span[1]))
+            value = e.computed(
+                of, lambda f: held(boolean.value(f, 0, self._last), jnp),
+                lambda part: like * self.expression(part, 0, self._last),
+                lambda window: span_of(window, self.dt, self.stride),
+            )  # fmt: skip
             if self.valid is not None:  # After the end it stays as it is.
                 rows = jnp.minimum(self._index(0, value), self.valid - 1)
                 shape = jnp.broadcast_shapes(rows.shape, value.shape)

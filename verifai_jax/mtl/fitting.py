@@ -8,6 +8,7 @@ Add-ons define them. Each evaluation fits the leaves of a formula to its signals
 
 import functools
 from collections.abc import Callable, Mapping
+from typing import Any
 
 from verifai_jax.mtl import formula as ast
 from verifai_jax.mtl.expression import Arithmetic, Expression, Signal, expression
@@ -42,10 +43,15 @@ def fitted(formula: Formula, units: Mapping[str, str], sizes: Mapping[str, int])
     return formula
 
 
+def sizes_of(signals: Mapping[str, Any], lanes: int = 0) -> dict[str, int]:
+    """Return the numbers of components of vector signals `[time, *lanes, k]`."""
+    return {name: x.shape[-1] for name, x in signals.items() if x.ndim == 2 + lanes}
+
+
 def assumptions(formula: Formula, units: Mapping[str, str]) -> tuple[str, ...]:
     """Return sentences on what is taken for granted of signals whose units are not known."""
     leaves = [leaf for f in with_counted(formula) for leaf in f.subformulas() if leaf.terms()]
-    kinds = _open_kinds(formula)
+    kinds = [kind for kind in _open_kinds(formula) if hasattr(kind, "assumed")]
     return tuple(dict.fromkeys(s for k in kinds for leaf in leaves for s in k.assumed(leaf, units)))
 
 
@@ -64,7 +70,7 @@ def with_terms(leaf: Formula, change: Callable[[Term], Term | None]) -> Formula:
 
 
 @functools.lru_cache(1024)
-def _open_kinds(formula: Formula) -> tuple[type[Term], ...]:
+def _open_kinds(formula: Formula) -> tuple[Any, ...]:
     leaves = (leaf for f in with_counted(formula) for leaf in f.subformulas())
     terms = [term for leaf in leaves for term in leaf.terms()]
     for each in sampled_in(formula):

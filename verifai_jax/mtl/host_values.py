@@ -21,7 +21,7 @@ from verifai_jax.core.values.trace import Trace, without_wrapping
 from verifai_jax.mtl import formula as ast
 from verifai_jax.mtl.evaluate import End, check_scalar, check_vector, span_of
 from verifai_jax.mtl.expression import Arithmetic, Component, Number, Signal
-from verifai_jax.mtl.fitting import fitted
+from verifai_jax.mtl.fitting import fitted, sizes_of
 from verifai_jax.mtl.formula import Formula, Interval, Term
 from verifai_jax.mtl.sampled import ArrayOperations, Sampled, held
 from verifai_jax.mtl.semantics import alone, compared
@@ -82,8 +82,7 @@ class HostValues:
 
     @functools.cached_property
     def _sizes(self) -> dict[str, int]:
-        vectors = ((name, x) for name, x in self.signals.items() if x.ndim == 2 + self.lanes)
-        return {name: x.shape[-1] for name, x in vectors}
+        return sizes_of(self.signals, self.lanes)
 
     @property
     def length(self) -> int:
@@ -246,18 +245,12 @@ class HostValues:
 
     def _sampled(self, e: Sampled) -> Values:
         like = np.ones((self.length, *(1,) * self.lanes))
-        operands = [
-            held(self._value(part, True, 0), np)
-            if isinstance(part, Formula)
-            else self._expression(part, 0) * like
-            for part in e.operands
-        ]
-        running = np.maximum.accumulate
-        of = ArrayOperations(
-            self.dt / self.stride, np, lambda name, values: FUNCTIONS[name](*values), running, like
-        )
-        span = (0, 0) if e.window is None else self._span(e.window)
-        return e.value(of, operands, span[0], int(span[1]))
+        functions: Callable[[str, list[Values]], Values] = lambda name, v: FUNCTIONS[name](*v)  # noqa: E731
+        of = ArrayOperations(self.dt / self.stride, np, functions, np.maximum.accumulate, like)
+        return e.computed(
+            of, lambda f: held(self._value(f, True, 0), np),
+            lambda part: self._expression(part, 0) * like, self._span,
+        )  # fmt: skip
 
 
 _span = functools.lru_cache(1024)(span_of)

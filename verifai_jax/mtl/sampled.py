@@ -163,6 +163,15 @@ class Sampled(Signal, abc.ABC):
         - `first`, `last`: the window in samples before now.
         """
 
+    def computed(
+        self, of: Operations[V], truth: Callable[[Formula], V], number: Callable[[Expression], V],
+        span: Callable[[Interval], tuple[int, float]],
+    ) -> V:  # fmt: skip
+        """Compute it by what gives 1 where a formula holds, numbers, and windows in samples."""
+        operands = [truth(p) if isinstance(p, Formula) else number(p) for p in self.operands]
+        first, last = (0, 0) if self.window is None else span(self.window)
+        return self.value(of, operands, first, int(last))
+
     def changed(self, change: Callable[[Any], Any], window: Interval | None = None) -> "Sampled":
         """Return the same function of changed operands, and of another window if one is given."""
         return self.of([change(each) for each in self.operands], window or self.window)

@@ -9,7 +9,7 @@ import abc
 import dataclasses
 import functools
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any, ClassVar, TypeVar
 
@@ -130,22 +130,13 @@ class Term(Node, abc.ABC):
         """Return the text, in parentheses if its operator binds weaker than `outer`."""
 
     opened: ClassVar[int] = 0
-    """Above zero for an expression that a recording completes; `fitting` does so in this order."""
+    """Above zero for an expression that a recording completes, by the class methods `fitted` and
+    `assumed` of its kind; in this order."""
 
     @property
     def is_signal(self) -> bool:
         """True for a signal or one component of it."""
         return False
-
-    @classmethod
-    def fitted(cls, leaf: Any, units: Mapping[str, str], sizes: Mapping[str, int]) -> Any:
-        """Return a predicate without expressions of this kind, which a recording completes."""
-        return leaf
-
-    @classmethod
-    def assumed(cls, leaf: Any, units: Mapping[str, str]) -> Iterator[str]:
-        """Yield what is taken for granted where a recording does not complete a predicate."""
-        yield from ()
 
     @property
     def number(self) -> float | None:

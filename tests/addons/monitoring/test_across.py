@@ -8,7 +8,7 @@ from click.testing import CliRunner
 
 from verifai_jax import mtl
 from verifai_jax.addons.monitoring.across import across
-from verifai_jax.addons.monitoring.commands.lint import lint
+from verifai_jax.addons.monitoring.commands.formula import lint
 from verifai_jax.addons.monitoring.demands import Demands
 from verifai_jax.core.values.trace import Trace
 from verifai_jax.mtl.host_values import HostValues

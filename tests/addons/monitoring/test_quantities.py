@@ -50,7 +50,7 @@ def test_what_is_not_known_is_said():
     assert [f.kind for f in mtl.lint("always v <= 108 km/h", plain)] == ["units"]
     assert not mtl.judge("always a <= 12deg", plain).rows[0].note  # rad, as everywhere
     for export in (mtl.watch, mtl.export_c):
-        with pytest.raises(ValueError, match="no unit is known of v .* give it, as in units="):
+        with pytest.raises(ValueError, match=r"no unit is known of v .* give it, as in units="):
             export("always v <= 108 km/h", 1.0)
     named = Trace({"v (km/h)": np.array([100.0])}, dt=1.0)
     assert mtl.judge('"v (km/h)" <= 30 m/s', named).rows[0].robustness == 8.0

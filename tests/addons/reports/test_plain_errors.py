@@ -69,8 +69,7 @@ def test_a_notebook_is_told_which_errors_to_show_so(monkeypatch, capsys):
 
 
 def test_notes_of_an_error_are_shown():
-    try:
+    with pytest.raises(vj.FormulaSyntaxError) as caught:
         vj.parse("x <")
-    except vj.FormulaSyntaxError as error:
-        error.add_note("see the grammar")
-        assert "see the grammar" in str(sentence(error))
+    caught.value.add_note("see the grammar")
+    assert "see the grammar" in str(sentence(caught.value))

@@ -28,7 +28,7 @@ from verifai_jax.addons.monitoring.resampling import Method, gaps, hold_note
 from verifai_jax.core.values.trace import Trace
 from verifai_jax.mtl import formula as ast
 from verifai_jax.mtl.expression import Arithmetic, Component, Number, Signal
-from verifai_jax.mtl.fitting import fitted
+from verifai_jax.mtl.fitting import fitted, sizes_of
 from verifai_jax.mtl.formula import Formula, Term
 from verifai_jax.mtl.host_values import FUNCTIONS, numbers
 from verifai_jax.mtl.sampled import Sampled
@@ -262,8 +262,7 @@ class DenseValues:
         return joined([kept, later], -1)
 
     def leaf(self, f: Formula) -> Piecewise:
-        vectors = ((name, x) for name, x in self.trace.signals.items() if x.ndim == 2)
-        fit = fitted(f, self.trace.units, {name: x.shape[-1] for name, x in vectors})
+        fit = fitted(f, self.trace.units, sizes_of(self.trace.signals))
         return self.predicate(f) if fit is f else self(fit)
 
     def predicate(self, f: Formula) -> Piecewise:

@@ -29,7 +29,7 @@ from verifai_jax.core.values.trace import Trace
 from verifai_jax.mtl import formula as ast
 from verifai_jax.mtl.bounds import predicates_of
 from verifai_jax.mtl.evaluate import End
-from verifai_jax.mtl.fitting import assumptions, fitted
+from verifai_jax.mtl.fitting import assumptions, fitted, sizes_of
 from verifai_jax.mtl.formula import FALSE, TRUE, Formula, surface
 from verifai_jax.mtl.host_values import HostValues
 from verifai_jax.mtl.requirements import Requirement
@@ -78,8 +78,7 @@ def lint(
         found += _Linter(each, traces, known, end).findings()
     found += _units_in_set(requirements, traces)
     whole: dict[str, Formula] = {}
-    every = (signal for trace in traces.values() for signal in trace.signals.items())
-    sizes = {name: x.shape[1] for name, x in every if x.ndim == 2}
+    sizes = {n: k for t in traces.values() for n, k in sizes_of(t.signals).items()}
     for each in requirements:
         with contextlib.suppress(ValueError):  # Which its own findings tell.
             whole[each.id] = fitted(each.formalized, known, sizes)

@@ -102,15 +102,12 @@ class _Builder(Operations[int]):
     def latest(self, event: int, x: int) -> int:
         return self.step("latest", event, x)
 
+    def holds(self, f: Formula) -> int:
+        """Return the number of the result that is 1 where a formula holds and 0 where not."""
+        return self.step("count", number=self.counted.setdefault(f, len(self.counted)))
+
     def sampled(self, e: Sampled) -> int:
-        operands = [
-            self.step("count", number=self.counted.setdefault(part, len(self.counted)))
-            if isinstance(part, Formula)
-            else self.expression(part)
-            for part in e.operands
-        ]
-        first, last = (0, 0) if e.window is None else span_of(e.window, self.dt)
-        return e.value(self, operands, first, int(last))
+        return e.computed(self, self.holds, self.expression, lambda w: span_of(w, self.dt))
 
     def leaf(self, f: Formula, sign: int, boolean: bool) -> int:
         left, comparison, right = f.compared or (*f.terms(), ">", None)

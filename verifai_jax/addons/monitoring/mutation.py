@@ -212,16 +212,7 @@ def _windows(interval: Interval, dt: float) -> Iterator[Interval]:
     for new in (start, middle), (start, 2 * end), (start, math.inf), (0.0, end), (middle, end):
         ends = tuple(round(t, 9) for t in new)
         if ends != (start, end) and ends[0] <= ends[1]:
-            yield _with_ends(interval, *ends)
-
-
-def _with_ends(interval: Interval, start: float, end: float) -> Interval:
-    """Return an interval with other ends, which belong to it as far as they can."""
-    longer = end > start
-    return Interval(
-        start, end, interval.open_start and longer,
-        interval.open_end and longer and math.isfinite(end),
-    )  # fmt: skip
+            yield Interval(ends[0], ends[1])
 
 
 def _changed_leaf(leaf: Formula) -> Iterator[Change]:

@@ -28,11 +28,13 @@ from verifai_jax.mtl import formula as ast
 from verifai_jax.mtl._parse import parse
 from verifai_jax.mtl.expression import (
     Arithmetic,
+    Expression,
     Number,
     Signal,
     constant_value,
     expression,
 )
+from verifai_jax.mtl.fitting import rebuilt
 from verifai_jax.mtl.formula import Formula, Interval, Term
 from verifai_jax.mtl.requirements import Requirement
 from verifai_jax.mtl.sampled import Sampled, sampled_in
@@ -110,23 +112,22 @@ class Parametric:
         )
         return replace(span, start=start, end=end)
 
-    def _with_numbers(self, e: Term, values: Mapping[str, float]) -> Term:
-        match e:
-            case Sampled():
-                return e.changed(
-                    lambda part: (
-                        self._filled(part, values, None)
-                        if isinstance(part, Formula)
-                        else self._with_numbers(part, values)
+    def _with_numbers(self, e: Term, values: Mapping[str, float]) -> Expression:
+        def change(part: Term) -> Term | None:
+            if isinstance(part, Sampled):
+                window = None if part.window is None else self._interval(part.window, values)
+                return part.changed(
+                    lambda a: (
+                        self._filled(a, values, None)
+                        if isinstance(a, Formula)
+                        else rebuilt(a, change)
                     ),
-                    None if e.window is None else self._interval(e.window, values),
+                    window,
                 )
-            case Signal(name) if name.startswith("?"):
-                return Number(values[name[1:]])
-            case Arithmetic(name, arguments):
-                filled = tuple(expression(self._with_numbers(a, values)) for a in arguments)
-                return Arithmetic(name, filled)
-        return e
+            known = isinstance(part, Signal) and part.name.startswith("?")
+            return Number(values[part.name[1:]]) if known else None  # pyright: ignore
+
+        return rebuilt(e, change)
 
     def direction(self, name: str) -> int:
         """Return how the robustness changes as a parameter grows, judging from the formula.

@@ -24,43 +24,35 @@ from verifai_jax.mtl.tree import postorder
 from verifai_jax.mtl.words import number_text
 
 _DEGREE = Fraction(math.pi) / 180
-_KILO, _MILLI, _MICRO, _MEGA = Fraction(1000), Fraction(1, 1000), Fraction(1, 10**6), 10**6
-_FOOT = Fraction("0.3048")
-SIZES: dict[str, dict[str, Fraction | int]] = {
-    "m": {
-        "m": 1, "km": _KILO, "cm": Fraction(1, 100), "mm": _MILLI, "um": _MICRO, "ft": _FOOT,
-        "mi": Fraction("1609.344"), "nmi": 1852,
-    },
-    "m/s": {
-        "m/s": 1, "km/h": Fraction(5, 18), "mph": Fraction("0.44704"), "kt": Fraction(463, 900),
-        "cm/s": Fraction(1, 100), "mm/s": _MILLI, "ft/s": _FOOT, "ft/min": _FOOT / 60,
-    },
-    "m/s^2": {"m/s^2": 1, "m/s2": 1, "m/s**2": 1, "km/h/s": Fraction(5, 18)},
-    "m/s^3": {"m/s^3": 1, "m/s3": 1, "m/s**3": 1},
-    "s": {
-        "s": 1, "ms": _MILLI, "us": _MICRO, "ns": _MICRO / 1000, "min": 60, "h": 3600, "d": 86400,
-    },
-    "rad": {"rad": 1, "deg": _DEGREE},
-    "rad/s": {"rad/s": 1, "deg/s": _DEGREE, "rpm": _DEGREE * 6},
-    "rad/s^2": {"rad/s^2": 1, "rad/s2": 1, "deg/s^2": _DEGREE, "deg/s2": _DEGREE},
-    "kg": {"kg": 1, "g": _MILLI, "t": _KILO},
-    "N": {"N": 1, "kN": _KILO},
-    "Nm": {"Nm": 1, "kNm": _KILO},
-    "W": {"W": 1, "mW": _MILLI, "kW": _KILO, "MW": _MEGA},
-    "J": {"J": 1, "kJ": _KILO, "Wh": 3600, "kWh": 3_600_000},
-    "V": {"V": 1, "mV": _MILLI, "kV": _KILO},
-    "A": {"A": 1, "mA": _MILLI},
-    "Hz": {"Hz": 1, "kHz": _KILO, "MHz": _MEGA},
-    "Pa": {
-        "Pa": 1, "hPa": 100, "kPa": _KILO, "MPa": _MEGA, "mbar": 100, "bar": 100_000,
-        "psi": Fraction("6894.757"),
-    },
-    "K": {"K": 1},
-    "degC": {"degC": 1},
-    "1": {"%": Fraction(1, 100)},
-    "mg/dL": {"mg/dL": 1},
-    "mmol/L": {"mmol/L": 1},
-}  # fmt: skip
+_SIZES = """
+m: m 1, km 1000, cm 0.01, mm 0.001, um 1e-6, ft 0.3048, mi 1609.344, nmi 1852
+m/s: m/s 1, km/h 5/18, mph 0.44704, kt 463/900, cm/s 0.01, mm/s 0.001, ft/s 0.3048, ft/min 0.00508
+m/s^2: m/s^2 1, m/s2 1, m/s**2 1, km/h/s 5/18
+m/s^3: m/s^3 1, m/s3 1, m/s**3 1
+s: s 1, ms 0.001, us 1e-6, ns 1e-9, min 60, h 3600, d 86400
+kg: kg 1, g 0.001, t 1000
+N: N 1, kN 1000
+Nm: Nm 1, kNm 1000
+W: W 1, mW 0.001, kW 1000, MW 1e6
+J: J 1, kJ 1000, Wh 3600, kWh 3.6e6
+V: V 1, mV 0.001, kV 1000
+A: A 1, mA 0.001
+Hz: Hz 1, kHz 1000, MHz 1e6
+Pa: Pa 1, hPa 100, kPa 1000, MPa 1e6, mbar 100, bar 1e5, psi 6894.757
+K: K 1
+degC: degC 1
+1: % 0.01
+mg/dL: mg/dL 1
+mmol/L: mmol/L 1
+"""
+SIZES: dict[str, dict[str, Fraction]] = {
+    base: {unit: Fraction(size) for unit, size in map(str.split, sizes.split(","))}
+    for base, sizes in (line.split(": ") for line in _SIZES.strip().splitlines())
+} | {
+    "rad": {"rad": Fraction(1), "deg": _DEGREE},
+    "rad/s": {"rad/s": Fraction(1), "deg/s": _DEGREE, "rpm": _DEGREE * 6},
+    "rad/s^2": {"rad/s^2": Fraction(1), "deg/s^2": _DEGREE, "deg/s2": _DEGREE},
+}
 """Units by the coherent unit of their dimension, with their sizes in it. Temperatures in degrees
 and in kelvin are not converted, as their zeros differ."""
 RATES = {"m": "m/s", "m/s": "m/s^2", "m/s^2": "m/s^3", "rad": "rad/s", "rad/s": "rad/s^2"}
@@ -68,7 +60,7 @@ RATES = {"m": "m/s", "m/s": "m/s^2", "m/s^2": "m/s^3", "rad": "rad/s", "rad/s": 
 Scale: TypeAlias = tuple[str, Fraction]
 """A coherent unit, and the size of a unit in it."""
 SCALES: dict[str, Scale] = {
-    unit: (base, Fraction(size)) for base, units in SIZES.items() for unit, size in units.items()
+    unit: (base, size) for base, units in SIZES.items() for unit, size in units.items()
 }
 UNITS = tuple(SCALES)
 """What may follow a number in a text."""
