@@ -31,28 +31,12 @@ class Range(NamedTuple):
     open_low: bool = False
     open_high: bool = False
 
-    def within(self, other: "Range") -> bool:
-        """Return whether all of its numbers are in another range."""
-        return all(
-            theirs is None
-            or (
-                own is not None
-                and (sign * own > sign * theirs or (own == theirs and (is_open or not other_open)))
-            )
-            for sign, own, theirs, is_open, other_open in (
-                (1, self.low, other.low, self.open_low, other.open_low),
-                (-1, self.high, other.high, self.open_high, other.open_high),
-            )
-        )
-
     def apart(self, other: "Range") -> bool:
         """Return whether it has no number of another range."""
-        return any(
-            one.high is not None
-            and two.low is not None
-            and (one.high < two.low or (one.high == two.low and (one.open_high or two.open_low)))
-            for one, two in ((self, other), (other, self))
-        )
+        low, high, open_low, open_high = self.met(other)
+        return low is not None and high is not None and (
+            low > high or (low == high and (open_low or open_high))
+        )  # fmt: skip
 
     def met(self, other: "Range") -> "Range":
         """Return the numbers that are in both ranges."""
@@ -65,17 +49,15 @@ class Range(NamedTuple):
     def times(self, factor: Fraction) -> "Range":
         """Return the range of its numbers multiplied by a factor."""
         low, high = (None if end is None else end * factor for end in self[:2])
-        return (
-            Range(low, high, self.open_low, self.open_high)
-            if factor > 0
-            else Range(high, low, self.open_high, self.open_low)
-        )
+        ends = Range(low, high, self.open_low, self.open_high)
+        return ends if factor > 0 else Range(high, low, self.open_high, self.open_low)
 
     def plus(self, other: "Range") -> "Range":
         """Return the range of the sums of its numbers and those of another range."""
-        low = None if self.low is None or other.low is None else self.low + other.low
-        high = None if self.high is None or other.high is None else self.high + other.high
-        return Range(low, high, self.open_low or other.open_low, self.open_high or other.open_high)
+        pairs = zip(self[:2], other[:2], strict=True)
+        low, high = (None if a is None or b is None else a + b for a, b in pairs)
+        opened = (a or b for a, b in zip(self[2:], other[2:], strict=True))
+        return Range(low, high, *opened)
 
 
 class Demand(NamedTuple):
@@ -160,21 +142,20 @@ class Demands:
     def _gives(self, theirs: Demand) -> bool:
         if theirs.every:
             known = self.known(theirs.form, theirs.start, theirs.end, theirs.guard)
-            return known.within(theirs.range)
-        some = (
-            own.form == theirs.form
-            and theirs.start <= own.start
-            and own.end <= theirs.end
-            and own.guard in (None, theirs.guard)
-            and own.range.within(theirs.range)
+            return known.met(theirs.range) == known
+        some = [
+            own.range
             for own in self.parts
-        )
+            if own.form == theirs.form and own.guard in (None, theirs.guard)
+            and theirs.start <= own.start and own.end <= theirs.end
+        ]  # fmt: skip
         starts = {theirs.start, *(own.start for own in self.parts if own.every)}
-        return any(some) or any(
-            self.known(theirs.form, t, t, theirs.guard).within(theirs.range)
+        some += [
+            self.known(theirs.form, t, t, theirs.guard)
             for t in starts
             if theirs.start <= t <= theirs.end
-        )
+        ]
+        return any(each.met(theirs.range) == each for each in some)
 
 
 def _exclusive(one: Formula, other: Formula) -> bool:

@@ -8,7 +8,6 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from verifai_jax.core.messages.text import listed
 from verifai_jax.mtl import formula as ast
 from verifai_jax.mtl.expression import Component, Expression, Signal, expression
 from verifai_jax.mtl.fitting import rebuilt, with_terms
@@ -72,8 +71,7 @@ class Elements(Signal):
                 f"sizes={{{name!r}: 3}}"
             )
         if len(set(known.values())) > 1:
-            lengths = listed([f"{name} has {n}" for name, n in known.items()])
-            raise ValueError(f"{leaf} needs vectors of one size, and {lengths}")
+            raise ValueError(f"{leaf} needs vectors of one size; got {known}")
 
         def of(k: int) -> Formula:
             def component(part: Term) -> Term | None:

@@ -103,9 +103,6 @@ class Quantity(Number):
         if not own:
             return leaf
         base = own[0].scale[0]
-        for each in own[1:]:
-            if each.scale[0] != base and _is_linear(leaf):
-                raise ValueError(f"{leaf} has {own[0]} and {each}, which do not go together")
         known = {part: scale for part in _readings(leaf) if (scale := _scale(part, units))}
         if not _is_linear(leaf):
             if any(size != 1 for _, size in known.values()):
@@ -113,8 +110,8 @@ class Quantity(Number):
                     f"{leaf} has a quantity in a product, where {next(iter(known))} is not "
                     "converted: write the number in its unit"
                 )
-            known = {}
-        for part, (other, _) in known.items():
+            own, known = own[:1], {}
+        for part, (other, _) in [*((each, each.scale) for each in own), *known.items()]:
             if other != base:
                 raise ValueError(
                     f"{leaf} does not go together: {part} has a unit of {other}, and {own[0]} one "

@@ -63,10 +63,9 @@ def _term(e: Term) -> str:
 def _when(interval: Interval, side: str) -> str:
     start, endless = format_seconds(interval.start), interval.end == math.inf
     end = "" if endless else f"to {format_seconds(interval.end)}"
-    left_out = [f"{t:zg} s" for t, is_open in (
-        (interval.start, interval.open_start), (interval.end, interval.open_end)
-    ) if is_open]  # fmt: skip
-    without = f" (without {' and '.join(left_out)})" if left_out else ""
+    ends = ((start, interval.open_start), (format_seconds(interval.end), interval.open_end))
+    without = " and ".join(text for text, is_open in ends if is_open)
+    without = f" (without {without})" if without else ""
     if side == "back":
         return f", {start} {'ago or earlier' if endless else f'{end} ago'}{without}"
     return f" from {start} {'on' if endless else end}{without}"
