@@ -21,6 +21,7 @@ from verifai_jax.falsification.table import ErrorTable
 from verifai_jax.mtl.formula import Formula
 from verifai_jax.mtl.host_values import HostValues
 from verifai_jax.mtl.rewriting import asked_at_once
+from verifai_jax.mtl.sampled import sampled_in
 from verifai_jax.problem.dependence import has_gradient
 from verifai_jax.problem.problem import Problem
 from verifai_jax.problem.silent_mistakes import is_quick, silent_mistakes
@@ -52,6 +53,9 @@ def notes_before(problem: Problem, search: Search) -> tuple[str, ...]:
             f"search {search!r} follows gradients and there are none: the robustness is constant "
             "between jumps; use 'cross_entropy' or another search without gradients",
         )
+    sampled = sampled_in(*problem.formulas.values()) if search.needs_derivatives else ()
+    if steps := [each for each in sampled if len(each.counted) == len(each.operands)]:
+        notes += (f"search {search!r} follows gradients, and that of {steps[0]} is zero",)
     return notes
 
 

@@ -101,7 +101,7 @@ class ArrayOperations(Operations[Any]):
 
 def held(truth: Any, xp: Any) -> Any:
     """Return 1 where a formula holds and 0 where not, of its truth; NaN where that is unknown."""
-    return xp.where(xp.isnan(truth), truth, (truth > 0).astype(truth.dtype))
+    return xp.where(xp.isnan(truth), np.nan, (truth > 0).astype(truth.dtype))
 
 
 @dataclass(frozen=True, eq=False, repr=False)

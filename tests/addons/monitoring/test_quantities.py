@@ -172,6 +172,16 @@ def test_mining_finds_bounds_and_windows_of_functions():
         mtl.mine("always[0, ?T) x > 0", [trace])
 
 
+def test_a_count_has_no_gradient_which_is_said():
+    problem = vj.Problem(
+        "p", {"a": vj.Box(-1, 1)},
+        lambda features, key=None: vj.Trace({"x": features["a"] * np.ones(5)}, dt=1.0),
+        "always count(x > 0.5, 3) <= 2",
+    )  # fmt: skip
+    (note,) = vj.falsify(problem, "gradient", 64).notes
+    assert "follows gradients, and that of count(x > 0.5, 3) is zero" in note
+
+
 def test_a_run_says_what_it_takes_for_granted():
     problem = vj.Problem(
         "car", {"v0": vj.Box(0, 40)},

@@ -236,7 +236,9 @@ def _changed_terms(*terms: Expression) -> Iterator[tuple[Expression, ...]]:
 
 
 def _changed_term(term: Expression) -> Iterator[Expression]:
-    if isinstance(term, Number):
+    if isinstance(term, Number) and term.opened:
+        yield from (Arithmetic("*", (Number(share), term)) for share in (1 - MOVED, 1 + MOVED))
+    elif isinstance(term, Number):
         for share in (1 - MOVED, 1 + MOVED) if term.value else ():
             yield Number(float(f"{term.value * share:z.12g}"))
         if not term.value:

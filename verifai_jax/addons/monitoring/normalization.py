@@ -89,4 +89,5 @@ def _mapped(f: Formula, scales: Mapping[Formula, float]) -> Formula:
 
 
 def _over(e: Term, scale: float) -> Expression:
-    return Number(e.value / scale) if isinstance(e, Number) else expression(e) / scale
+    plain = isinstance(e, Number) and not e.opened
+    return Number(e.value / scale) if plain else expression(e) / scale  # pyright: ignore
