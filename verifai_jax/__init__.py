@@ -49,6 +49,7 @@ if TYPE_CHECKING:
     from verifai_jax.addons.fuzzing import FuzzCoverage as FuzzCoverage
     from verifai_jax.addons.fuzzing import FuzzRun as FuzzRun
     from verifai_jax.addons.fuzzing import fuzz as fuzz
+    from verifai_jax.addons.reports import plain_errors as plain_errors
     from verifai_jax.addons.rl import policies as policies
     from verifai_jax.addons.rl.policies import policy as policy
     from verifai_jax.addons.scenic import ProgramError as ProgramError

@@ -50,6 +50,22 @@ def test_a_stream_that_is_closed_or_missing_has_no_viewer(monkeypatch):
     some_progress()
 
 
+def test_a_notebook_without_widgets_has_one_line_that_is_written_over(monkeypatch):
+    stream = io.StringIO()
+    monkeypatch.setattr(sys, "stderr", stream)
+    monkeypatch.setitem(sys.modules, "ipykernel", type(sys)("ipykernel"))
+    monkeypatch.setattr(progress, "has_viewer", lambda: False)
+    monkeypatch.setattr(progress, "EVERY", 60.0)
+    with SimulationProgress("cars", 100) as shown:
+        shown.update(40, 1, -0.5)
+        time.sleep(1.3)
+    time.sleep(0.1)
+    text = stream.getvalue()
+    assert text.startswith("\rcars: 40/100 simulations")
+    assert text.endswith("\r")
+    assert "\n" not in text
+
+
 @shows_progress("comparing")
 def compare_things(thing, budget=100, *, progress=None, inside=lambda: None):
     inside()

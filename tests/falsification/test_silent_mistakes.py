@@ -231,9 +231,17 @@ class TestRuns:
             notes = vj.falsify(problem, "uniform", 4, confirm=False).notes
             assert [note[: len(start)] for note in notes] == ([start] if start else [])
 
+    def test_a_start_that_violates_the_property_is_told(self):
+        for spec, told in (("always x > 2", True), ("always[0.1, 1] x > 2", False)):
+            problem = vj.Problem("p", SPACE, both, spec)
+            notes = vj.falsify(problem, "uniform", 64, batch=64).notes
+            assert any("all 64 simulations" in note for note in notes)
+            assert any("violated already at time 0" in note for note in notes) == told
+
     def test_nearly_everything_fails(self):
         problem = vj.Problem("p", SPACE, both, "always (x > 0.98 & y < 2)")
-        (note,) = vj.falsify(problem, "uniform", 200, batch=40).notes
+        note, early = vj.falsify(problem, "uniform", 200, batch=40).notes
+        assert early.startswith("the property is violated already at time 0")
         assert "of 200 simulations with a verdict violate the property, nearly all of the" in note
 
     def test_nothing_comes_near(self):

@@ -7,15 +7,8 @@ import operator
 from hypothesis import strategies as st
 
 from verifai_jax.mtl import formula as ast
-from verifai_jax.mtl.expression import (
-    Arithmetic,
-    Component,
-    Duration,
-    Number,
-    Signal,
-    duration,
-    signal,
-)
+from verifai_jax.mtl.expression import Arithmetic, Component, Number, Signal, signal
+from verifai_jax.mtl.sampled import Duration, duration
 
 DT = 0.5
 COMPARE = {
@@ -50,9 +43,9 @@ class Oracle:
         match e:
             case Number(value):
                 return value
-            case Duration(_, counted, window):
+            case Duration(_, (counted,), window):
                 now = min(i, self.length - 1)
-                ago = max(0, now - round(window / DT) + 1)
+                ago = max(0, now - round(window.end / DT) + 1)
                 return DT * sum(self.holds(counted, k) for k in range(ago, now + 1))
             case Signal(name):
                 return self.signals[name][min(i, self.length - 1)]

@@ -129,7 +129,7 @@ class Replay(InNotebook):
         self, path: str | Path | None = None, *, camera: str | None = None,
         size: Sequence[int] | None = None, fps: float | None = None,
     ) -> Any:  # fmt: skip
-        """Draw the simulation as an animated GIF, which notebooks display.
+        """Draw the simulation, or else its signals, as an animated GIF, which notebooks display.
 
         **Arguments:**
         - `path`: a file to write as well; none when left out.
@@ -137,8 +137,8 @@ class Replay(InNotebook):
           best.
         - `size`: width and height of a frame in pixels.
         - `fps`: frames per second; chosen automatically when left out.
-        **Raises:** `ValueError` for a problem without `draw`, without a MuJoCo model and without a
-        Gymnasium environment; `UnknownNameError` for a camera that the model lacks.
+        **Raises:** `ValueError` for a camera without a MuJoCo model; `UnknownNameError` for a
+        camera that the model lacks.
         """
         draw = lazy_import("verifai_jax.pictures.animation", "animate")
         return draw(self, path, camera=camera, size=size, fps=fps)

@@ -28,10 +28,16 @@ from verifai_jax.falsification.loop import COMPILE, CONFIRM, REST, SEARCH, SIMUL
 from verifai_jax.falsification.model_changes import SourcesWhenAsked
 from verifai_jax.falsification.run import Run
 from verifai_jax.falsification.run_folder import write_record
-from verifai_jax.falsification.silent_mistakes import cut_short_note, nominal_note, notes_after
+from verifai_jax.falsification.silent_mistakes import (
+    cut_short_note,
+    nominal_note,
+    note_on_time_0,
+    notes_after,
+)
 from verifai_jax.falsification.summary import first_message
 from verifai_jax.falsification.validation import space_as_data
 from verifai_jax.problem.model_digest import digest_of_model
+from verifai_jax.problem.silent_mistakes import is_quick
 from verifai_jax.search import Search
 from verifai_jax.statistics.stopping import Stop
 
@@ -237,6 +243,9 @@ class Running:
         """Return the result with notes on common properties of all its simulations."""
         rounds, search = self.rounds, self.rounds.search
         after = notes_after(rounds.table, result.formulas, search, self.warm)
+        if after and rounds.table.counts.violating and is_quick(rounds.problem):
+            row = int(rounds.table.violating.index[0])
+            after += note_on_time_0(rounds.problem.formulas, result.replay(row).trace)
         if not rounds.exhausted:
             simulated = len(rounds.table) - len(rounds.first)
             total = search.total(rounds.problem.space.cube)

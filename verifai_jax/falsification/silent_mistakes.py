@@ -14,9 +14,14 @@ from typing import cast
 import numpy as np
 
 from verifai_jax.core.compute.compilation import Slot
+from verifai_jax.core.values.trace import Trace
 from verifai_jax.evaluation.engine import Engine
 from verifai_jax.evaluation.evaluator import Evaluator
 from verifai_jax.falsification.table import ErrorTable
+from verifai_jax.mtl.formula import Formula
+from verifai_jax.mtl.host_values import HostValues
+from verifai_jax.mtl.rewriting import asked_at_once
+from verifai_jax.mtl.sampled import sampled_in
 from verifai_jax.problem.dependence import has_gradient
 from verifai_jax.problem.problem import Problem
 from verifai_jax.problem.silent_mistakes import is_quick, silent_mistakes
@@ -27,8 +32,8 @@ ENOUGH = 32
 """Minimum number of simulations with a verdict for a note on a common property."""
 MAX_SAMPLES = 5_000_000
 """Maximum samples of a batch that is simulated for the nominal features alone."""
-NEARLY_ALL = 0.95
-"""Share of the prior that violates the property, above which that is hardly meant."""
+NEARLY_ALL = 0.9
+"""Share of the prior that violates the property, from which on that is hardly meant."""
 HARDLY_MOVES = 0.05
 """Range of the robustness, as a share of its least value, that counts as no change."""
 
@@ -48,6 +53,9 @@ def notes_before(problem: Problem, search: Search) -> tuple[str, ...]:
             f"search {search!r} follows gradients and there are none: the robustness is constant "
             "between jumps; use 'cross_entropy' or another search without gradients",
         )
+    sampled = sampled_in(*problem.formulas.values()) if search.needs_derivatives else ()
+    if steps := [each for each in sampled if len(each.counted) == len(each.operands)]:
+        notes += (f"search {search!r} follows gradients, and that of {steps[0]} is zero",)
     return notes
 
 
@@ -124,7 +132,7 @@ def notes_after(
             f"all {count} simulations with a verdict violate the property: are the formula and "
             "its units right?",
         )
-    if search.samples_prior and table.counts.violating > NEARLY_ALL * count:
+    if search.samples_prior and table.counts.violating >= NEARLY_ALL * count:
         return (
             f"{table.counts.violating} of {count} simulations with a verdict violate the property, "
             "nearly all of the prior: are the formula and its units right?",
@@ -135,6 +143,15 @@ def notes_after(
     else:
         ranges = {f"formula {name!r}": _range(table, f"rho.{name}") for name in formulas}
     return tuple(note for which, ends in ranges.items() for note in _never_near(which, ends, count))
+
+
+def note_on_time_0(formulas: Mapping[str, Formula], trace: Trace) -> tuple[str, ...]:
+    """Return a note if a trace violates formulas already at its first sample."""
+    values = HostValues.of(trace)
+    early = [name for name, f in formulas.items() if (values.truth(asked_at_once(f))[0] < 0).any()]
+    which = "the property" if len(formulas) == 1 else f"formula {', '.join(map(repr, early))}"
+    said = f"{which} is violated already at time 0: does the start satisfy it?"
+    return (said,) if early else ()
 
 
 def cut_short_note(search: Search, total: int | None, simulated: int) -> tuple[str, ...]:

@@ -10,8 +10,8 @@ from verifai_jax.mtl._parse import parse
 from verifai_jax.mtl._robustness import robustness, robustness_signal, satisfied
 from verifai_jax.mtl._smoothing_error import SmoothingError, smoothing_error
 from verifai_jax.mtl.evaluate import End, IntervalError
-from verifai_jax.mtl.expression import Expression, duration, signal
-from verifai_jax.mtl.formula import FALSE, TRUE, Formula
+from verifai_jax.mtl.expression import Expression, signal
+from verifai_jax.mtl.formula import FALSE, TRUE, Formula, Interval
 from verifai_jax.mtl.grammar import FormulaSyntaxError
 from verifai_jax.mtl.operators import (
     always,
@@ -30,13 +30,14 @@ from verifai_jax.mtl.operators import (
 )
 from verifai_jax.mtl.requirements import Requirement
 from verifai_jax.mtl.rewriting import nnf, simplify
+from verifai_jax.mtl.sampled import duration
 from verifai_jax.mtl.semantics import Semantics, boolean, hard, smooth
 from verifai_jax.mtl.setting import HorizonError, SamplingError
 
 __all__ = [
     "FALSE", "TRUE", "End", "Explanation", "Expression", "Formula", "FormulaSyntaxError",
-    "HorizonError", "IntervalError", "Online", "Requirement", "SamplingError", "Semantics",
-    "SmoothingError", "always", "boolean", "duration", "during",
+    "HorizonError", "Interval", "IntervalError", "Online", "Requirement", "SamplingError",
+    "Semantics", "SmoothingError", "always", "boolean", "duration", "during",
     "eventually", "explain", "fall", "hard", "historically", "latex", "next_", "nnf",
     "once", "online", "parse", "phase", "prev", "rise",
     "robustness", "robustness_signal", "satisfied", "signal", "simplify", "since", "smooth",

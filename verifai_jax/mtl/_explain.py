@@ -211,6 +211,7 @@ def _influence(
             setting.end,
             stride=setting.stride,
             truths=setting.truths,
+            units=dict(setting.units),
             nudges=dict(zip(leaves, nudges, strict=True)),
         )
         return e.value(setting.formula, 0, 0)[0]

@@ -4,8 +4,9 @@ latex(eventually(signal("x") <= 2, 0, 4))    # \Diamond_{[0, 4]} \left(\mathit{x
 """
 
 from verifai_jax.mtl import formula as ast
-from verifai_jax.mtl.expression import PRECEDENCE, Arithmetic, Component, Duration, Number, Signal
+from verifai_jax.mtl.expression import PRECEDENCE, Arithmetic, Component, Number, Signal
 from verifai_jax.mtl.formula import Formula, Term, surface
+from verifai_jax.mtl.sampled import Sampled, window_text
 from verifai_jax.mtl.tree import missing_case
 from verifai_jax.mtl.words import COMPARISONS, OPERATORS, number_text
 
@@ -24,7 +25,8 @@ def latex(f: Formula) -> str:
     symbol = OPERATORS[word].latex
     if interval is not None and not interval.everything:
         end = r"\infty" if interval.end == float("inf") else number_text(interval.end)
-        symbol += f"_{{[{number_text(interval.start)}, {end}]}}"
+        left, right = "[("[interval.open_start], "])"[interval.open_end]
+        symbol += f"_{{{left}{number_text(interval.start)}, {end}{right}}}"
     parts = [
         latex(p) if not p.operands() and len(operands) > 1 else rf"\left({latex(p)}\right)"
         for p in operands
@@ -33,12 +35,17 @@ def latex(f: Formula) -> str:
 
 
 def _expression_latex(e: Term, outer: int = 0) -> str:
+    if e.opened:
+        text = str(e).replace("_", r"\_").replace("%", r"\%")
+        return rf"\mathrm{{{text}}}"
     match e:
         case Number(value):
             return f"({number_text(value)})" if value < 0 and outer > 0 else number_text(value)
-        case Duration(_, operand, window):
-            text = rf"\mathrm{{duration}}_{{{number_text(window)}}}"
-            return rf"{text}\left({latex(operand)}\right)"
+        case Sampled(_, operands, window):
+            below = "" if window is None else f"_{{{window_text(window)}}}"
+            word = e.function.replace("_", r"\_")
+            texts = (latex(o) if isinstance(o, Formula) else _expression_latex(o) for o in operands)
+            return rf"\mathrm{{{word}}}{below}\left({', '.join(texts)}\right)"
         case Signal(name):
             return rf"\mathit{{{name.replace('_', chr(92) + '_')}}}"
         case Component(vector, index):

@@ -28,8 +28,8 @@ from verifai_jax.core.messages.errors import missing_name
 from verifai_jax.core.values.gaps import with_gaps
 from verifai_jax.mtl._parse import parse
 from verifai_jax.mtl.evaluate import Evaluator
-from verifai_jax.mtl.expression import durations_in
 from verifai_jax.mtl.formula import Formula
+from verifai_jax.mtl.sampled import sampled_in
 from verifai_jax.mtl.semantics import Kind, Semantics, hard
 from verifai_jax.mtl.streams import Op, Plan, streams
 from verifai_jax.mtl.tree import missing_case
@@ -121,8 +121,8 @@ def online(
     """
     formula = parse(formula) if isinstance(formula, str) else formula
     monitor = Online(formula, dt, semantics.kind, gaps)
-    if counted := durations_in(formula):
-        raise ValueError(f"{counted[0]} is counted by watch and export_c, and not by online")
+    if sampled := sampled_in(formula):
+        raise ValueError(f"{sampled[0]} is computed by watch and export_c, and not by online")
     _plan(monitor)
     return monitor
 

@@ -19,7 +19,8 @@ from verifai_jax.mtl import formula as ast
 from verifai_jax.mtl.expression_builder import MAX_DEPTH, ExpressionBuilder, Part
 from verifai_jax.mtl.formula import Formula, Interval
 from verifai_jax.mtl.grammar import FormulaSyntaxError, Tree, explain_error, parser
-from verifai_jax.mtl.words import NAME, NUMBERS, OPERATORS
+from verifai_jax.mtl.sampled import unit_words
+from verifai_jax.mtl.words import NAME, NUMBERS, OPERATORS, TIMES
 
 MAX_TOKENS = 10_000
 """Words and symbols that a formula's text may have. Far more than a person writes: a file that
@@ -81,7 +82,10 @@ def _read(
     try:
         tree = parser().parse(text)
     except lark.UnexpectedInput as error:
-        raise explain_error(error, text) from None
+        try:  # Units of add-ons, which few texts have.
+            tree = parser(unit_words()).parse(text)
+        except lark.UnexpectedInput:
+            raise explain_error(error, text) from None
 
     def reads(offered: str) -> bool:
         if not offers or len(offered) > MAX_OFFERED:
@@ -111,15 +115,6 @@ def _check_size(text: str) -> None:
             )
 
 
-UNITS = {
-    "s": Decimal(1),
-    "ms": Decimal("1e-3"),
-    "us": Decimal("1e-6"),
-    "ns": Decimal("1e-9"),
-    "min": Decimal(60),
-    "h": Decimal(3600),
-    "d": Decimal(86400),
-}
 _CONNECTIVES = ("iff", "impl", "or_", "and_", "bin", "negation", "temporal")
 
 
@@ -278,17 +273,18 @@ class FormulaBuilder(ExpressionBuilder):
     def _interval(self, tree: Tree | None) -> Interval:
         if tree is None:
             return ast.EVERYTHING
-        low, high = (self._bound(child) for child in tree.children)
+        opening, *bounds, closing = tree.children
+        low, high = map(self._bound, bounds)
         span = self._span(tree)
         if low < 0:
             raise self._fail("an interval starts at 0 or later", *span)
         if high < low:
-            ends = (_text(self.text, child) for child in reversed(tree.children))
+            ends = (_text(self.text, child) for child in reversed(bounds))
             offer = self._offered(": write ", f"[{', '.join(ends)}]", within='F{} "s"')
             raise self._fail(f"an interval ends no earlier than it starts{offer}", *span)
         if low == float("inf"):
             raise self._fail("an interval starts at a finite time", *span)
-        return Interval(low, high)
+        return Interval(low, high, opening == "(", closing == ")")
 
     def _bound(self, tree: Tree) -> float:
         if len(tree.children) == 1:
@@ -306,8 +302,10 @@ class FormulaBuilder(ExpressionBuilder):
                 str(unknown_name("constant", name, ["inf", *self.constants])), *self._span(tree)
             )
         minus, number, unit = tree.children
+        if str(unit or "s") not in TIMES:
+            raise self._fail(str(unknown_name("unit of time", str(unit), TIMES)), *self._span(tree))
         try:
-            value = float(Decimal(str(number)) * UNITS[str(unit or "s")])
+            value = float(Decimal(str(number)) * Decimal(TIMES[str(unit or "s")]))
         except (DecimalException, ValueError):
             value = math.inf
         if math.isinf(value):

@@ -8,9 +8,9 @@ from verifai_jax.mtl.expression import (
     Signal,
     constant_value,
     expression,
-    with_counted,
 )
 from verifai_jax.mtl.formula import Formula, Predicate, Term
+from verifai_jax.mtl.sampled import with_counted
 
 
 def signal_bounds(formula: Formula, signal: str) -> list[tuple[Formula, list[Expression]]]:

@@ -22,12 +22,13 @@ from verifai_jax.core.values.clauses import ABSENT, CLAUSES
 from verifai_jax.core.values.trace import Trace
 from verifai_jax.mtl import formula as ast
 from verifai_jax.mtl._robustness import robustness
-from verifai_jax.mtl.evaluate import End, Evaluator
+from verifai_jax.mtl.evaluate import End
 from verifai_jax.mtl.expression import Number, Signal
+from verifai_jax.mtl.fitting import fitted, sizes_of
 from verifai_jax.mtl.formula import Formula
 from verifai_jax.mtl.rewriting import nnf, rebuild, replaced
 from verifai_jax.mtl.semantics import Semantics, hard
-from verifai_jax.mtl.setting import prepare
+from verifai_jax.mtl.setting import evaluator_of, prepare
 
 GOALS = 16
 """Greatest number of goals; the last one has all that a conjunction has beyond. Each costs an
@@ -63,12 +64,12 @@ class Goals:
         signals = {}
         for i, leaf in enumerate(self.leaves):
             setting, arrays, _, valid = prepare(leaf, trace, hard, end, None)
-            clock = setting.length, setting.dt
-            evaluator = Evaluator(arrays, *clock, valid=valid, truths=setting.truths)
+            evaluator = evaluator_of(setting, arrays, None, valid, 0)
             margin = evaluator.value(leaf, 0, setting.length - 1)
             size = sum(
                 jnp.mean(jnp.abs(jnp.asarray(evaluator.expression(side, 0, setting.length - 1))))
-                for side in leaf.terms()
+                for part in fitted(leaf, evaluator.units, sizes_of(arrays)).subformulas()
+                for side in part.terms()
             )
             scale = jnp.sqrt(jnp.var(margin) + (0.1 * size) ** 2)
             scale = jax.lax.stop_gradient(scale)

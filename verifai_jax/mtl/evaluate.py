@@ -8,17 +8,21 @@ therefore cost nothing, and unbounded windows end there.
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any, Literal
 
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 from jaxtyping import Array, Float
 
 from verifai_jax.core.messages.text import format_seconds
 from verifai_jax.mtl import formula as ast
 from verifai_jax.mtl import windows
-from verifai_jax.mtl.expression import Arithmetic, Component, Duration, Number, Signal
+from verifai_jax.mtl.expression import Arithmetic, Component, Number, Signal
+from verifai_jax.mtl.fitting import fitted, sizes_of
 from verifai_jax.mtl.formula import Formula, Interval, Term
+from verifai_jax.mtl.sampled import ArrayOperations, Sampled, held
 from verifai_jax.mtl.semantics import alone, compared
 from verifai_jax.mtl.tree import missing_case
 
@@ -48,21 +52,16 @@ def samples(time: float, dt: float, interval: Interval) -> float:
     return round(n)
 
 
-def seconds_held(truth: Any, n: int, dt: float, xp: Any) -> Any:
-    """Return the seconds, among the last `n` samples, in which truth values were above zero.
+def span_of(interval: Interval, dt: float, stride: int = 1) -> tuple[int, float]:
+    """Return the first and the last sample of an interval, relative to now.
 
-    **Arguments:**
-    - `truth`: `[time, *lanes]`; the result is NaN while one of the values is.
-    - `xp`: the array module, NumPy or `jax.numpy`.
+    **Raises:** `IntervalError` for an end that is not a multiple of `dt`, and for no sample.
     """
-
-    def within(marks: Any) -> Any:
-        total = xp.cumsum(marks, axis=0)
-        return total - xp.concatenate([xp.zeros_like(total[:n]), total[:-n]])
-
-    if n > len(truth):
-        n = len(truth)
-    return xp.where(within(xp.isnan(truth)) > 0, xp.nan, within(truth > 0) * dt)
+    first = int(samples(interval.start, dt, interval)) * stride + interval.open_start
+    last = samples(interval.end, dt, interval) * stride - interval.open_end
+    if last < first:
+        raise IntervalError(f"the interval {interval} has no sample every {format_seconds(dt)}")
+    return first, last
 
 
 def check_scalar(e: Term, shape: Sequence[int], lanes: int) -> None:
@@ -90,7 +89,8 @@ class Evaluator:
     valid samples, `[*lanes]` (truncate only; all when None). `lanes` is the number of lane axes;
     `open_right` makes windows half-open, as with `compat="pymtl"`. One period `dt` is `stride`
     samples long (`Trace.finely`), so windows, next and previous are that many times longer.
-    `truths` are the signals of truth values, which are numbers 1 and 0.
+    `truths` are the signals of truth values, which are numbers 1 and 0, and `units` those that are
+    known.
     """
 
     signals: Mapping[str, Float[Array, "time ..."]]
@@ -104,6 +104,7 @@ class Evaluator:
     lanes: int = 0
     stride: int = 1
     truths: frozenset[str] = frozenset()
+    units: Mapping[str, str] = field(default_factory=dict)
     #: Added to the values of leaves, `[time, *lanes]` each; differentiating by it weighs them.
     nudges: Mapping[Formula, Float[Array, "time ..."]] = field(default_factory=dict)
     _memo: dict[Any, Array] = field(default_factory=dict)
@@ -119,11 +120,8 @@ class Evaluator:
 
     def span(self, interval: Interval) -> tuple[int, float]:
         """Return the first and last sample of an interval, relative to now."""
-        a = samples(interval.start, self.dt, interval) * self.stride
-        b = samples(interval.end, self.dt, interval) * self.stride
-        if self.open_right and b > a:
-            b -= 1
-        return int(a), b
+        a, b = span_of(interval, self.dt, self.stride)
+        return a, b - (self.open_right and b > a)
 
     def settles(self, f: Formula) -> int:
         """Return the instant from which `f` is constant under `hold`; the last sample otherwise."""
@@ -196,13 +194,15 @@ class Evaluator:
     def _leaf(self, f: Formula, first: int, last: int) -> Array:
         start, stop = min(first, self._last), min(last, self._last)
         boolean = self.kind == "boolean"
-        match f:
+        match fitted(f, self.units, sizes_of(self.signals, self.lanes)):
             case ast.Predicate(comparison, left, right):
                 a, b = (self.expression(e, start, stop) for e in (left, right))
                 value = compared(comparison, a, b, boolean, jnp)
             case ast.Atom(e):
                 value = alone(self.expression(e, start, stop), e, self.truths)
                 value = compared(">", value, 0.0, boolean, jnp)
+            case several:
+                value = self.value(several, start, stop)
         if f in self.nudges:
             value = value + self.nudges[f][start : stop + 1]
         return self._extended(value, last - first + 1)
@@ -212,8 +212,8 @@ class Evaluator:
         match e:
             case Number(value):
                 return value
-            case Duration():
-                return self._duration(e)[start : stop + 1]
+            case Sampled():
+                return self._sampled(e)[start : stop + 1]
             case Signal(name):
                 signal = self.signals[name]
                 check_scalar(e, signal.shape, self.lanes)
@@ -232,20 +232,25 @@ class Evaluator:
                 return self._arithmetic(e, start, stop)
         raise missing_case("the value", e)
 
-    def _duration(self, e: Duration) -> Float[Array, "time *lanes"]:
+    def _sampled(self, e: Sampled) -> Float[Array, "time *lanes"]:
         if e not in self._memo:
             boolean = replace(self, kind="boolean", nudges={}, _memo={}, _settled={})
-            truth = boolean.value(e.operand, 0, self._last)
-            dtype = next(iter(self.signals.values())).dtype
-            n = int(samples(e.window, self.dt, Interval(0.0, e.window))) * self.stride
-            seconds = seconds_held(truth, n, self.dt / self.stride, jnp).astype(dtype)
-            if self.valid is not None:  # After the end nothing is counted.
-                rows = jnp.minimum(self._index(0, seconds), self.valid - 1)
-                shape = jnp.broadcast_shapes(rows.shape, seconds.shape)
-                seconds = jnp.take_along_axis(
-                    jnp.broadcast_to(seconds, shape), jnp.broadcast_to(rows, shape), axis=0
+            like = next(iter(self.signals.values()))
+            like = jnp.ones((self.length,) + (1,) * self.lanes, like.dtype)
+            period = self.dt / self.stride
+            of = ArrayOperations(period, jnp, _apply, partial(lax.cummax, axis=0), like)
+            value = e.computed(
+                of, lambda f: held(boolean.value(f, 0, self._last), jnp),
+                lambda part: like * self.expression(part, 0, self._last),
+                lambda window: span_of(window, self.dt, self.stride),
+            )  # fmt: skip
+            if self.valid is not None:  # After the end it stays as it is.
+                rows = jnp.minimum(self._index(0, value), self.valid - 1)
+                shape = jnp.broadcast_shapes(rows.shape, value.shape)
+                value = jnp.take_along_axis(
+                    jnp.broadcast_to(value, shape), jnp.broadcast_to(rows, shape), axis=0
                 )
-            self._memo[e] = seconds
+            self._memo[e] = value
         return self._memo[e]
 
     def _arithmetic(self, e: Arithmetic, start: int, stop: int) -> Array | float:

@@ -9,10 +9,11 @@ import re
 from collections.abc import Callable
 from dataclasses import dataclass
 from operator import methodcaller
+from typing import Any
 
 from verifai_jax.core.messages.errors import unknown_name
-from verifai_jax.mtl.formula import Formula, Next, Predicate, Prev, Term, Witness, formula
-from verifai_jax.mtl.tree import Node, postorder
+from verifai_jax.mtl.formula import Formula, Predicate, Term, formula
+from verifai_jax.mtl.tree import postorder
 from verifai_jax.mtl.words import FUNCTIONS, NUMBERS, name_text, number_text
 
 CONSTANT: dict[str, Callable[..., float]] = {
@@ -171,6 +172,11 @@ class Number(Expression):
     def number(self) -> float:
         return self.value
 
+    @property
+    def seconds(self) -> float:
+        """The number as a time in seconds."""
+        return self.value
+
     def __neg__(self) -> "Expression":
         return Number(-self.value)
 
@@ -196,86 +202,16 @@ class Signal(Expression):
     def is_signal(self) -> bool:
         return True
 
+    def changed(self, change: Callable[[Any], Any]) -> "Signal":
+        """Return the same function of changed operands, for a signal that is computed of others."""
+        return self
+
     def signals(self) -> tuple[str, ...]:
         return (self.name,)
 
     def text(self, outer: int = 0) -> str:
         """Return its name, in quotes if the grammar needs them."""
         return name_text(self.name)
-
-
-@dataclass(frozen=True, eq=False, repr=False)
-class Duration(Signal):
-    """The number of seconds, within the last `window` seconds, in which a formula held.
-
-    Each sample counts as one period, and there are none before the first one. Like any signal of
-    the recording, it keeps its last value under the end "hold".
-    """
-
-    operand: Formula
-    window: float
-
-    def __post_init__(self) -> None:
-        if not (self.window > 0 and math.isfinite(self.window)):
-            raise ValueError(
-                f"the window of a duration must be a positive number of seconds; got {self.window}"
-            )
-        for part in self.operand.subformulas(valued=True):
-            if part.side == "ahead":
-                raise ValueError(
-                    f"what is counted must be known at the present sample, but {part} looks ahead: "
-                    "use an operator that looks back, such as once"
-                )
-
-    @property
-    def is_signal(self) -> bool:
-        """False, because its text is that of a function."""
-        return False
-
-    def below(self) -> tuple[Node, ...]:
-        """Return nothing, so that a walk over expressions meets no formula."""
-        return ()
-
-    def signals(self) -> tuple[str, ...]:
-        """Return the names of the signals of the counted formula."""
-        return self.operand.signals()
-
-    def text(self, outer: int = 0) -> str:
-        """Return the text of the function."""
-        return self.name
-
-
-def duration(operand: Formula | Term, window: float) -> Duration:
-    """Count the seconds, within the last `window` seconds, in which a formula held.
-
-    `always(duration(signal("speed") > 30, 60) <= 3)` is "at most 3 s in any 60 s", in text
-    `always duration(speed > 30, 60) <= 3`.
-
-    **Raises:** `ValueError` for a formula that looks ahead, and for a window that is not positive.
-    """
-    counted = formula(operand)
-    return Duration(f"duration({counted}, {number_text(window)})", counted, float(window))
-
-
-def durations_in(*formulas: Formula) -> tuple[Duration, ...]:
-    """Return the durations in formulas, each once."""
-    leaves = (leaf for f in formulas for leaf in f.subformulas())
-    parts = (part for leaf in leaves for term in leaf.terms() for part in postorder(term))
-    return tuple(dict.fromkeys(part for part in parts if isinstance(part, Duration)))
-
-
-def about_single_samples(*formulas: Formula) -> list[Formula]:
-    """Return the parts that depend on the sampling period: they count or order samples."""
-    parts = (part for f in formulas for part in f.subformulas(valued=True))
-    return [f for f in parts if isinstance(f, Next | Prev | Witness) or durations_in(f)]
-
-
-def with_counted(*formulas: Formula) -> list[Formula]:
-    """Return formulas together with those that their durations count."""
-    found = list(formulas)
-    for each in found:
-        found += [d.operand for d in durations_in(each) if d.operand not in found]
-    return found
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -318,7 +254,8 @@ class Arithmetic(Expression):
         if minimum is not None and (n != 1 if minimum == 1 else n < minimum):
             wanted = "one argument" if minimum == 1 else "two arguments or more"
             raise ValueError(f"{self.name} takes {wanted}; got {n}")
-        if self.name == "norm" and isinstance(self.arguments[0], Duration):
+        argument = self.arguments[0]
+        if self.name == "norm" and isinstance(argument, Signal) and not argument.is_signal:
             raise ValueError(f"norm takes a vector signal; got {self}")
         values = [constant_value(argument) for argument in self.arguments]
         if self.name == "/" and values[1] == 0.0:

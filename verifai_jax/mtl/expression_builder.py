@@ -4,6 +4,7 @@ Types are checked here and in `formula_builder`, on the tree, where the position
 suggest corrected texts; each suggestion was parsed before it is shown.
 """
 
+import inspect
 import itertools
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -16,12 +17,11 @@ from verifai_jax.mtl.expression import (
     Expression,
     Number,
     Signal,
-    constant_value,
-    duration,
 )
-from verifai_jax.mtl.formula import Formula
+from verifai_jax.mtl.formula import Formula, Interval
 from verifai_jax.mtl.grammar import FormulaSyntaxError, Tree
-from verifai_jax.mtl.words import ANGLES, FUNCTIONS, NUMBERS
+from verifai_jax.mtl.sampled import text_functions
+from verifai_jax.mtl.words import ANGLES, FUNCTIONS, NUMBERS, TIMES
 
 MAX_DEPTH = 100
 """Operators, or parentheses, that may stand within each other: far from where Python gives up."""
@@ -206,7 +206,12 @@ class ExpressionBuilder:
 
     def _number(self, tree: Tree) -> Part:
         number, unit = tree.children
-        return Part(Number(float(number) * ANGLES[str(unit or "rad")]), *self._span(tree))
+        if unit is None:
+            return Part(Number(float(number)), *self._span(tree))
+        if (measured := text_functions().get("unit")) is not None:
+            return Part(measured(str(number), str(unit)), *self._span(tree))
+        size = ANGLES[str(unit)] if str(unit) in ANGLES else float(TIMES[str(unit)])
+        return Part(Number(float(number) * size), *self._span(tree))
 
     def _name(self, tree: Tree) -> Part:
         name = str(tree.children[0])
@@ -244,22 +249,39 @@ class ExpressionBuilder:
         if str(name) == "pow" and len(arguments) == 2:
             base, exponent = (self._expression(self._build(c)) for c in arguments)
             return Part(base**exponent, *span)
-        if str(name) == "duration" and len(arguments) == 2:
-            counted, window = map(self._build, arguments)
-            seconds = constant_value(self._expression(window))
-            if seconds is None:
-                raise self._fail(
-                    "the window of a duration is a number of seconds", window.start, window.end
-                )
-            return Part(duration(self._formula(counted), seconds), *span)
         if str(name) not in FUNCTIONS:
-            error = unknown_name("function", str(name), [*FUNCTIONS, "duration"])
-            raise self._fail(str(error), name.start_pos, name.start_pos + len(name))
+            return Part(self._called(name, arguments), *span)
+        for tree in arguments:
+            if tree.data == "interval":
+                raise self._fail(f"{name} takes numbers, and no interval", *self._span(tree))
         parts = tuple(self._expression(self._build(c)) for c in arguments)
         try:
             return Part(Arithmetic(str(name), parts), *span)
         except ValueError as error:
             raise self._fail(str(error), *span) from None
+
+    def _called(self, name: Any, arguments: list[Tree]) -> Formula | Expression:
+        """Return what a function that is not arithmetic makes of formulas, numbers, intervals."""
+        known = text_functions()
+        if str(name) not in known or str(name) == "unit":
+            error = unknown_name("function", str(name), [*FUNCTIONS, *known])
+            raise self._fail(str(error), name.start_pos, name.start_pos + len(name))
+        given = [
+            self._interval(tree) if tree.data == "interval" else self._build(tree).value
+            for tree in arguments
+        ]
+        function = known[str(name)]
+        try:
+            inspect.signature(function).bind(*given)
+        except TypeError as error:
+            wanted = ", ".join(inspect.signature(function).parameters)
+            reason = f"{name} takes ({wanted}): {error}"
+            raise self._fail(reason, name.start_pos, name.start_pos + len(name)) from None
+        return function(*given)
+
+    def _interval(self, tree: Tree | None) -> Interval:
+        """Return the interval of a tree."""
+        raise NotImplementedError
 
     def _parens(self, tree: Tree) -> Part:
         part = self._build(tree.children[0])

@@ -28,6 +28,8 @@ from verifai_jax.mtl.words import COMPARISONS, OPERATORS, Text, operator_text
 
 Formulaic: TypeAlias = Union["Formula", Term]
 """A formula, or an expression that is its own robustness."""
+Start: TypeAlias = float | Interval
+"""The beginning of a closed interval in seconds, or a whole interval."""
 
 
 class Formula(Tree):
@@ -69,21 +71,22 @@ class Formula(Tree):
         other = formula(other)
         return Or((And((self, other)), And((Not(self), Not(other)))))
 
-    def until(self, other: Formulaic, a: float = 0.0, b: float = math.inf) -> "Formula":
+    def until(self, other: Formulaic, a: Start = 0.0, b: float = math.inf) -> "Formula":
         """Require `other` `a` to `b` seconds ahead, and `self` at every earlier instant."""
-        return Until(self, formula(other), Interval(a, b))
+        return Until(self, formula(other), interval_of(a, b))
 
-    def weak_until(self, other: Formulaic, a: float = 0.0, b: float = math.inf) -> "Formula":
+    def weak_until(self, other: Formulaic, a: Start = 0.0, b: float = math.inf) -> "Formula":
         """Require `self` until `other` holds, or `self` throughout `[0, b]`."""
-        return Or((self.until(other, a, b), Always(self, Interval(0.0, b))))
+        span = interval_of(a, b)
+        return Or((Until(self, formula(other), span), Always(self, _from_now(span))))
 
-    def release(self, other: Formulaic, a: float = 0.0, b: float = math.inf) -> "Formula":
+    def release(self, other: Formulaic, a: Start = 0.0, b: float = math.inf) -> "Formula":
         """Require `other` up to and including the instant at which `self` holds: dual to until."""
-        return Not(Until(Not(self), Not(formula(other)), Interval(a, b)))
+        return Not(Until(Not(self), Not(formula(other)), interval_of(a, b)))
 
-    def since(self, other: Formulaic, a: float = 0.0, b: float = math.inf) -> "Formula":
+    def since(self, other: Formulaic, a: Start = 0.0, b: float = math.inf) -> "Formula":
         """Require `other` at some instant from `a` to `b` seconds ago, and `self` ever since."""
-        return Since(self, formula(other), Interval(a, b))
+        return Since(self, formula(other), interval_of(a, b))
 
     def signals(self) -> tuple[str, ...]:
         """Return the names of the signals in it, in order of appearance."""
@@ -368,8 +371,8 @@ NODES: dict[str, Callable[..., Formula]] = {
     "implies": Formula.implies,
     "iff": Formula.iff,
     "xor": Formula.__xor__,
-    "weak_until": lambda left, right, span: left.weak_until(right, span.start, span.end),
-    "release": lambda left, right, span: left.release(right, span.start, span.end),
+    "weak_until": lambda left, right, span: left.weak_until(right, span),
+    "release": lambda left, right, span: left.release(right, span),
     **{kind.word: kind for kind in (Always, Eventually, Historically, Once, Until, Since)},
 }
 """What makes each operator of its operands, and of its interval if it takes one."""
@@ -398,9 +401,7 @@ def surface(f: Formula) -> tuple[str, tuple[Formula, ...], Interval | None]:
             return "release", (p, q), interval
         case Or((And((p, q)), And((Not(r), Not(s))))) if p == r and q == s:
             return "iff", (p, q), None
-        case Or((Until(p, q, interval), Always(r, Interval(0.0, end)))) if (
-            p == r and end == interval.end
-        ):
+        case Or((Until(p, q, interval), Always(r, kept))) if p == r and kept == _from_now(interval):
             return "weak_until", (p, q), interval
         case Or((Not(p), q)):
             return "implies", (p, q), None
@@ -415,6 +416,15 @@ TRUE = Constant(True)
 """The formula that always holds."""
 FALSE = Constant(False)
 """The formula that never holds."""
+
+
+def interval_of(a: Start, b: float) -> Interval:
+    """Return the closed interval from `a` to `b`, or the interval that is given instead of `a`."""
+    return a if isinstance(a, Interval) else Interval(a, b)
+
+
+def _from_now(span: Interval) -> Interval:
+    return Interval(0.0, span.end, open_end=span.open_end)
 
 
 def formula(value: Formulaic) -> Formula:

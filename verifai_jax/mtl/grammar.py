@@ -5,7 +5,7 @@ import functools
 import re
 from typing import Any, Protocol, runtime_checkable
 
-from verifai_jax.mtl.words import ANGLES, NAME, OPERATORS, RESERVED, WORDS
+from verifai_jax.mtl.words import ANGLES, NAME, OPERATORS, RESERVED, TIMES, WORDS
 
 UNARY = tuple(word for word, o in OPERATORS.items() if o.side and o.operands == 1)
 """Temporal operators in front of one operand."""
@@ -59,9 +59,16 @@ class Tree(Protocol):
 
 
 @functools.cache
-def parser() -> Any:
-    """Return the LALR parser, made once."""
+def parser(units: tuple[str, ...] = ()) -> Any:
+    """Return the LALR parser, made once.
+
+    **Arguments:**
+    - `units`: words that may follow a number, besides times and angles.
+    """
     import lark
+
+    known = sorted({*TIMES, *ANGLES, *units}, key=len, reverse=True)
+    after = "|".join(re.escape(unit).replace("/", r"\/") for unit in known)
 
     def keyword(word: str) -> str:
         # An underscore may join an operator to its interval: `alw_[0,10]`.
@@ -87,8 +94,7 @@ def parser() -> Any:
         ?impl: or_ (IMPLIES or_)*
         ?or_: and_ (OR and_)*
         ?and_: bin (AND bin)*
-        ?bin: unary (_binary unary)*
-        _binary: ({" | ".join(w.upper() for w in BINARY)}) [interval]
+        ?bin: unary (({" | ".join(w.upper() for w in BINARY)}) [interval] unary)*
         ?unary: NOT unary -> negation
               | ({" | ".join(w.upper() for w in UNARY)}) [interval] unary -> temporal
               | cmp
@@ -102,14 +108,15 @@ def parser() -> Any:
                  | postfix
         ?postfix: atom
                 | atom "[" NUMBER "]" -> component
-        ?atom: NUMBER [ANGLE] -> number
+        ?atom: NUMBER [UNIT] -> number
              | NAME -> name
              | QUOTED -> quoted
              | TRUE -> true
              | FALSE -> false
-             | NAME "(" iff ("," iff)* ")" -> call
+             | NAME "(" _argument ("," _argument)* ")" -> call
              | "(" iff ")" -> parens
-        interval: "[" bound ("," | ":") bound "]"
+        _argument: iff | interval
+        interval: (LSQB | LPAR) bound ("," | ":") bound (RSQB | RPAR)
         bound: [MINUS] NUMBER [UNIT] | NAME
 
         {unary}
@@ -124,8 +131,11 @@ def parser() -> Any:
         POWER: "**"
         STAR: "*"
         SLASH: "/"
-        UNIT.5: /(?:min|ms|us|ns|s|h|d)(?!\w)/
-        ANGLE.5: /(?:{"|".join(ANGLES)})(?!\w)/
+        UNIT.5: /(?:{after})(?!\w|\/[A-Za-z]|\^|\*\*)/
+        LSQB: "["
+        RSQB: "]"
+        LPAR: "("
+        RPAR: ")"
         NUMBER: /(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][+-]?\d+)?/
         NAME: /{NAME.pattern}/
         QUOTED: /"[^"\n]+"/
@@ -147,7 +157,6 @@ _GROUPS = (
     ({"COMPARISON"}, "a comparison (<=, >, ...)"),
     ({"PLUS"}, "arithmetic"),
     ({"UNIT"}, "a unit (s, ms, us, ns, min, h, d)"),
-    ({"ANGLE"}, "a unit of angle (deg, rad)"),
     ({"COMMA"}, "','"),
     ({"COLON"}, "':'"),
     ({"RPAR"}, "')'"),
@@ -199,8 +208,8 @@ def _habit(text: str, position: int, operand: bool) -> str:
     if not (number and unit and unit[0] not in RESERVED):
         return ""
     return (
-        f"; if {unit[0]!r} is a unit, leave it out and give the number in the unit of the signal "
-        "(only deg and rad may follow a number)"
+        f"; if {unit[0]!r} is a unit, leave it out and give the number in the unit of the signal, "
+        "or in one of vj.mtl.UNITS"
     )
 
 

@@ -19,9 +19,11 @@ from jaxtyping import Float
 from verifai_jax.core.messages.errors import missing_name
 from verifai_jax.core.values.trace import Trace, without_wrapping
 from verifai_jax.mtl import formula as ast
-from verifai_jax.mtl.evaluate import End, check_scalar, check_vector, samples, seconds_held
-from verifai_jax.mtl.expression import Arithmetic, Component, Duration, Number, Signal
+from verifai_jax.mtl.evaluate import End, check_scalar, check_vector, span_of
+from verifai_jax.mtl.expression import Arithmetic, Component, Number, Signal
+from verifai_jax.mtl.fitting import fitted, sizes_of
 from verifai_jax.mtl.formula import Formula, Interval, Term
+from verifai_jax.mtl.sampled import ArrayOperations, Sampled, held
 from verifai_jax.mtl.semantics import alone, compared
 from verifai_jax.mtl.setting import check_trace, period
 from verifai_jax.mtl.tree import missing_case, postorder
@@ -44,6 +46,7 @@ class HostValues:
     - `end`: how the trace continues after the last sample, `"hold"` or `"truncate"`.
     - `lanes`: number of lane axes.
     - `truths`: names of the signals of truth values, which are numbers 1 and 0.
+    - `units`: the units of signals, as far as they are known.
     - `blend`: share of the sum of all operands that `&` and `|` add to the deciding one, so that a
       search notices when another operand improves. 0 for the robustness.
     """
@@ -55,6 +58,7 @@ class HostValues:
     lanes: int = 0
     blend: float = 0.0
     truths: frozenset[str] = frozenset()
+    units: Mapping[str, str] = field(default_factory=dict)
     _padded: dict[int, dict[str, Values]] = field(default_factory=dict)
     _known: dict[tuple[Formula, bool, int], Values] = field(default_factory=dict)
 
@@ -74,7 +78,11 @@ class HostValues:
                 joined = np.concatenate([own[:, None], rows], axis=1)
                 signals[name] = joined.reshape(-1, *own.shape[1:])
         truths = frozenset(filter(trace.is_truth, signals))
-        return cls(signals, dt, end, trace.stride, truths=truths)
+        return cls(signals, dt, end, trace.stride, truths=truths, units=trace.units)
+
+    @functools.cached_property
+    def _sizes(self) -> dict[str, int]:
+        return sizes_of(self.signals, self.lanes)
 
     @property
     def length(self) -> int:
@@ -167,6 +175,8 @@ class HostValues:
         top = 1.0 if boolean else math.inf
         below = [self._value(part, boolean, pad) for part in f.valued()]
         hold = self.end == "hold"
+        if isinstance(f, ast.Leaf) and (own := fitted(f, self.units, self._sizes)) is not f:
+            return self._value(own, boolean, pad)
         match f:
             case ast.Constant(value):
                 return np.full((self.length + pad, *(1,) * self.lanes), top if value else -top)
@@ -205,8 +215,8 @@ class HostValues:
             match part:
                 case Number(value):
                     values[id(part)] = np.full((1,), value)
-                case Duration():
-                    values[id(part)] = self._duration(part, pad)
+                case Sampled():
+                    values[id(part)] = _held(self._sampled(part), pad)
                 case Signal(name):
                     values[id(part)] = self._signal(name, pad)
                 case Component(Signal(name) as vector, index):
@@ -233,18 +243,17 @@ class HostValues:
             padded[name] = _held(self.signals[name], pad)
         return padded[name]
 
-    def _duration(self, e: Duration, pad: int) -> Values:
-        truth = self._value(e.operand, True, 0)
-        truth = np.broadcast_to(truth, (self.length, *truth.shape[1:]))
-        n = int(samples(e.window, self.dt, Interval(0.0, e.window))) * self.stride
-        return _held(seconds_held(truth, n, self.dt / self.stride, np), pad)
+    def _sampled(self, e: Sampled) -> Values:
+        like = np.ones((self.length, *(1,) * self.lanes))
+        functions: Callable[[str, list[Values]], Values] = lambda name, v: FUNCTIONS[name](*v)  # noqa: E731
+        of = ArrayOperations(self.dt / self.stride, np, functions, np.maximum.accumulate, like)
+        return e.computed(
+            of, lambda f: held(self._value(f, True, 0), np),
+            lambda part: self._expression(part, 0) * like, self._span,
+        )  # fmt: skip
 
 
-@functools.lru_cache(1024)
-def _span(interval: Interval, dt: float, stride: int) -> tuple[int, float]:
-    """Return the first and the last sample of an interval, relative to now."""
-    first, last = (samples(t, dt, interval) * stride for t in (interval.start, interval.end))
-    return int(first), last
+_span = functools.lru_cache(1024)(span_of)
 
 
 def _in_order(e: Term) -> tuple[Term, ...]:

@@ -1,4 +1,6 @@
-"""Temporal operators as functions; times are in seconds, and intervals are closed.
+"""Temporal operators as functions; times are in seconds, and intervals from `a` to `b` are closed.
+
+An `Interval` given instead of `a` may leave out one of its ends.
 
 always(abs(signal("x")) <= 2.4, 0, 4)
 until(signal("request") > 0, signal("grant") > 0, 0.2, 0.6)
@@ -13,42 +15,43 @@ from verifai_jax.mtl.formula import (
     Formula,
     Formulaic,
     Historically,
-    Interval,
     Next,
     Not,
     Once,
     Prev,
+    Start,
     build,
     formula,
+    interval_of,
 )
 
 
-def always(operand: Formulaic, a: float = 0.0, b: float = math.inf) -> Formula:
+def always(operand: Formulaic, a: Start = 0.0, b: float = math.inf) -> Formula:
     """Require `operand` at every instant from `a` to `b` seconds ahead."""
-    return Always(formula(operand), Interval(a, b))
+    return Always(formula(operand), interval_of(a, b))
 
 
-def eventually(operand: Formulaic, a: float = 0.0, b: float = math.inf) -> Formula:
+def eventually(operand: Formulaic, a: Start = 0.0, b: float = math.inf) -> Formula:
     """Require `operand` at some instant from `a` to `b` seconds ahead."""
-    return Eventually(formula(operand), Interval(a, b))
+    return Eventually(formula(operand), interval_of(a, b))
 
 
-def historically(operand: Formulaic, a: float = 0.0, b: float = math.inf) -> Formula:
+def historically(operand: Formulaic, a: Start = 0.0, b: float = math.inf) -> Formula:
     """Require `operand` at every instant from `a` to `b` seconds ago."""
-    return Historically(formula(operand), Interval(a, b))
+    return Historically(formula(operand), interval_of(a, b))
 
 
-def once(operand: Formulaic, a: float = 0.0, b: float = math.inf) -> Formula:
+def once(operand: Formulaic, a: Start = 0.0, b: float = math.inf) -> Formula:
     """Require `operand` at some instant from `a` to `b` seconds ago."""
-    return Once(formula(operand), Interval(a, b))
+    return Once(formula(operand), interval_of(a, b))
 
 
-def until(left: Formulaic, right: Formulaic, a: float = 0.0, b: float = math.inf) -> Formula:
+def until(left: Formulaic, right: Formulaic, a: Start = 0.0, b: float = math.inf) -> Formula:
     """Require `right` `a` to `b` seconds ahead, and `left` at every earlier instant."""
     return formula(left).until(right, a, b)
 
 
-def since(left: Formulaic, right: Formulaic, a: float = 0.0, b: float = math.inf) -> Formula:
+def since(left: Formulaic, right: Formulaic, a: Start = 0.0, b: float = math.inf) -> Formula:
     """Require `right` at some instant from `a` to `b` seconds ago, and `left` ever since."""
     return formula(left).since(right, a, b)
 

@@ -91,9 +91,9 @@ def _simplified_node(f: Formula) -> Formula:
             | ast.Once(inner, Interval(0.0, 0.0))
         ):
             return inner
-        case ast.Always(ast.Always(inner, low), high):
+        case ast.Always(ast.Always(inner, low), high) if low.closed and high.closed:
             return ast.Always(inner, _sum(low, high))
-        case ast.Eventually(ast.Eventually(inner, low), high):
+        case ast.Eventually(ast.Eventually(inner, low), high) if low.closed and high.closed:
             return ast.Eventually(inner, _sum(low, high))
         case ast.Until(ast.Constant(True), right, interval):
             return simplify(ast.Eventually(right, interval))
@@ -138,6 +138,17 @@ def replaced(f: Formula, parts: Mapping[Formula, Formula]) -> Formula:
     if f in parts:
         return parts[f]
     return rebuild(f, tuple(replaced(part, parts) for part in f.operands()))
+
+
+def asked_at_once(f: Formula) -> Formula:
+    """Return a formula without operators that look ahead which must hold at time 0 if `f` does."""
+    f = nnf(f)
+    match f:
+        case ast.And(parts):
+            return simplify(ast.And(tuple(map(asked_at_once, parts))))
+        case ast.Always(part, span) if span.start == 0 and not span.open_start:
+            return asked_at_once(part)
+    return TRUE if any(part.side == "ahead" for part in f.subformulas(valued=True)) else f
 
 
 def expand(f: Formula) -> Formula:

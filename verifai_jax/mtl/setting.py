@@ -15,8 +15,8 @@ from verifai_jax.core.messages.text import format_seconds, format_time
 from verifai_jax.core.values.trace import Samples, Trace, as_array, check_period
 from verifai_jax.mtl._parse import parse
 from verifai_jax.mtl.evaluate import End, Evaluator
-from verifai_jax.mtl.expression import durations_in
 from verifai_jax.mtl.formula import Formula
+from verifai_jax.mtl.sampled import sampled_in
 from verifai_jax.mtl.semantics import Semantics
 
 
@@ -44,7 +44,8 @@ class Setting(NamedTuple):
     """All static settings of one evaluation.
 
     `length` counts samples. One period `dt` is `stride` samples long: more than one if values were
-    recorded between the samples. `truths` are the signals of truth values.
+    recorded between the samples. `truths` are the signals of truth values, and `units` the known
+    ones.
     """
 
     formula: Formula
@@ -57,6 +58,7 @@ class Setting(NamedTuple):
     compat: str | None
     stride: int = 1
     truths: frozenset[str] = frozenset()
+    units: tuple[tuple[str, str], ...] = ()
 
 
 def as_formula(formula: Formula | str) -> Formula:
@@ -105,12 +107,13 @@ def prepare(
         trace = trace.hold()
     trace = trace.finely()
     # Under "hold" only what is counted depends on where a trace ended.
-    ends = end != "hold" or durations_in(formula)
+    ends = end != "hold" or sampled_in(formula)
     valid = jnp.asarray(trace.valid) if trace.valid is not None and ends else None
     signals = numbers_of_signals({name: trace.signals[name] for name in formula.signals()})
     setting = Setting(
         formula, trace.length, dt, semantics.kind, semantics.error, semantics.bound, end, compat,
         stride, frozenset(name for name in formula.signals() if trace.is_truth(name)),
+        tuple((name, trace.units[name]) for name in formula.signals() if name in trace.units),
     )  # fmt: skip
     tau = None
     if semantics.kind == "smooth" and semantics.error is None:
@@ -255,5 +258,5 @@ def evaluator_of(
     of, pymtl = setting, setting.compat == "pymtl"
     return Evaluator(
         signals, of.length, of.dt, of.kind, tau, of.end, valid, pymtl, lanes,
-        stride=of.stride, truths=of.truths,
+        stride=of.stride, truths=of.truths, units=dict(of.units),
     )  # fmt: skip

@@ -14,11 +14,11 @@ from typing import NamedTuple
 
 from verifai_jax.mtl import formula as ast
 from verifai_jax.mtl._parse import parse
-from verifai_jax.mtl.evaluate import samples
-from verifai_jax.mtl.expression import Duration, durations_in
+from verifai_jax.mtl.evaluate import span_of
 from verifai_jax.mtl.formula import Formula
 from verifai_jax.mtl.rewriting import expand, simplify
-from verifai_jax.mtl.semantics import Semantics, boolean, hard
+from verifai_jax.mtl.sampled import sampled_in
+from verifai_jax.mtl.semantics import Semantics, hard
 from verifai_jax.mtl.tree import missing_case
 
 LARGEST = 2**27
@@ -66,22 +66,13 @@ class Output(NamedTuple):
     ends: bool
 
 
-class Count(NamedTuple):
-    """A duration used by leaves: the plan of its formula, and `n` samples with period `dt`."""
-
-    duration: Duration
-    plan: "Plan"
-    n: int
-    dt: float
-
-
 class Plan(NamedTuple):
     """The operations at each sample of monitors of several formulas.
 
     - `formulas`: the formulas by name.
     - `leaves`: the leaves with the signs of their margins.
     - `top`: the maximum value: infinity, or 1 for truth values.
-    - `counts`: the durations that the leaves use.
+    - `dt`: the sampling period in seconds.
     """
 
     formulas: Mapping[str, Formula]
@@ -89,14 +80,16 @@ class Plan(NamedTuple):
     ops: tuple[Op, ...]
     outputs: tuple[Output, ...]
     top: float
-    counts: tuple[Count, ...]
+    dt: float
 
     @property
     def memory(self) -> int:
         """Number of samples stored in the windows."""
         held = {"delay": 1, "window": 1, "until": 2, "since": 2}
-        counted = sum(count.n + count.plan.memory for count in self.counts)
-        return counted + sum(op.n * held.get(op.kind, 0) for op in self.ops)
+        sampled = sampled_in(*(f for f, _ in self.leaves))
+        spans = [span_of(e.window, self.dt) for e in sampled if e.window is not None]
+        stored = int(sum(2 * (last + 1) for _, last in spans))
+        return stored + sum(op.n * held.get(op.kind, 0) for op in self.ops)
 
 
 def streams(
@@ -128,14 +121,7 @@ def streams(
         slot, delay = plan.stream(f, 1) if every else (plan.at_start(f, 1), 0)
         wait = delay if every else plan.settling(f) + 1
         outputs.append(Output(slot, delay, wait, plan.ends(f)))
-    counts = tuple(
-        Count(
-            each, streams(each.operand, dt, boolean, every=True),
-            int(samples(each.window, dt, ast.Interval(0.0, each.window))), dt,
-        )
-        for each in durations_in(*(f for f, _ in plan.leaves))
-    )  # fmt: skip
-    made = Plan(parsed, tuple(plan.leaves), tuple(plan.ops), tuple(outputs), plan.top, counts)
+    made = Plan(parsed, tuple(plan.leaves), tuple(plan.ops), tuple(outputs), plan.top, dt)
     if made.memory > LARGEST:
         raise ValueError(
             f"the windows hold {made.memory} samples, and a monitor may hold {LARGEST}: sample "
@@ -156,8 +142,7 @@ class _Layout:
         self._settlings: dict[Formula, int] = {}
 
     def span(self, interval: ast.Interval) -> tuple[int, float]:
-        a = samples(interval.start, self.dt, interval)
-        return int(a), samples(interval.end, self.dt, interval)
+        return span_of(interval, self.dt)
 
     def op(self, kind: str, inputs: tuple[int, ...] = (), n: int = 0, sign: int = 1,
            number: float = 0.0, start: int = 0, end: float = 0.0) -> int:  # fmt: skip

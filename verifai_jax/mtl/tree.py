@@ -129,6 +129,10 @@ class Term(Node, abc.ABC):
     def text(self, outer: int = 0) -> str:
         """Return the text, in parentheses if its operator binds weaker than `outer`."""
 
+    opened: ClassVar[int] = 0
+    """Above zero for an expression that a recording completes, by the class methods `fitted` and
+    `assumed` of its kind; in this order."""
+
     @property
     def is_signal(self) -> bool:
         """True for a signal or one component of it."""
@@ -149,10 +153,15 @@ class Term(Node, abc.ABC):
 
 @dataclass(frozen=True)
 class Interval:
-    """A closed interval of time in seconds; `end` may be infinite."""
+    """An interval of time in seconds; `end` may be infinite.
+
+    It is closed unless `open_start` or `open_end` leaves out that end, as in `[0,5)`.
+    """
 
     start: float = 0.0
     end: float = math.inf
+    open_start: bool = False
+    open_end: bool = False
 
     def __post_init__(self) -> None:
         start, end = float(self.start), float(self.end)
@@ -162,14 +171,22 @@ class Interval:
             raise ValueError(f"an interval starts at a finite time, at least 0; got {self}")
         if not end >= start:
             raise ValueError(f"an interval ends no earlier than it starts; got {self}")
+        if not self.closed and (end == start or (self.open_end and math.isinf(end))):
+            raise ValueError(f"an interval without one of its ends is longer; got {self}")
+
+    @property
+    def closed(self) -> bool:
+        """True if both ends belong to it."""
+        return not (self.open_start or self.open_end)
 
     @property
     def everything(self) -> bool:
         """True for `[0, inf]`, which is not written."""
-        return self.start == 0 and self.end == math.inf
+        return self == EVERYTHING
 
     def __str__(self) -> str:
-        return f"[{number_text(self.start)},{number_text(self.end)}]"
+        ends = f"{number_text(self.start)},{number_text(self.end)}"
+        return f"{'[('[self.open_start]}{ends}{'])'[self.open_end]}"
 
 
 EVERYTHING = Interval()
@@ -278,4 +295,7 @@ class Tree(Node):
         """
         if not self.side:
             return 0.0, 0.0
-        return (self.interval.start, self.interval.end) if self.operator.timed else (dt, dt)
+        if not self.operator.timed:
+            return dt, dt
+        i = self.interval
+        return i.start + dt * i.open_start, i.end - dt * i.open_end

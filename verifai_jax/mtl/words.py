@@ -21,6 +21,10 @@ FUNCTIONS = {
 """Functions of expressions, with the smallest number of their arguments."""
 NUMBERS = {"pi": math.pi}
 """Numbers that a text may name without defining them; a signal of that name stands in quotes."""
+TIMES = {
+    "s": "1", "ms": "1e-3", "us": "1e-6", "ns": "1e-9", "min": "60", "h": "3600", "d": "86400"
+}  # fmt: skip
+"""Units that may follow a time, in seconds, as decimal numbers."""
 ANGLES = {"deg": math.pi / 180, "rad": 1.0}
 """Units that may follow a number in an expression, in rad."""
 

@@ -18,6 +18,8 @@ from verifai_jax.pictures.style import DPI, new_figure
 FRAMES_PER_SECOND = 25
 SIZE = (572, 330)
 """Width and height in pixels of a frame that a problem draws itself."""
+LINES = 8
+"""Signals that are drawn at most where nothing else is."""
 
 
 @dataclass(frozen=True)
@@ -49,7 +51,7 @@ def animate(
 
     The problem's `draw(axes, trace, sample, features)` draws one frame. Without it, MuJoCo draws a
     system that has a MuJoCo model (`vj.mujoco`, `vj.brax`), and an environment of Gymnasium draws
-    itself.
+    itself; of any other one the monitored signals are drawn as they grow.
 
     **Arguments:**
     - `replay`: the result of `run.replay`.
@@ -57,9 +59,9 @@ def animate(
     - `camera`: name of a camera of a MuJoCo model; by default the one that shows the motion best.
     - `size`: width and height of a frame in pixels.
     - `fps`: frames per second; chosen automatically when left out.
-    **Raises:** `ValueError` for any other problem without `draw`, for a path that does not end in
-    `.gif`, a camera without a MuJoCo model, and invalid sizes; `UnknownNameError` for a camera that
-    the model lacks; `film.NoRenderer` if MuJoCo cannot draw.
+    **Raises:** `ValueError` for a path that does not end in `.gif`, a camera without a MuJoCo
+    model, and invalid sizes; `UnknownNameError` for a camera that the model lacks;
+    `film.NoRenderer` if MuJoCo cannot draw.
     """
     _check_gif(path)
     check_film(size, fps)
@@ -76,10 +78,7 @@ def animate(
     elif filmed is not None:
         animation = Animation(filmed.gif(pixels, camera, fps))
     else:
-        raise ValueError(
-            f"problem {replay.problem.name!r} cannot be animated: it has no draw function "
-            "(axes, trace, sample, features), no MuJoCo model and no environment of Gymnasium"
-        )
+        animation = Animation(_drawn(replay, _signals(replay), pixels or SIZE, fps))
     if path is not None:
         animation.save(path)
     return animation
@@ -116,6 +115,31 @@ def _drawn(
     file = io.BytesIO()
     images[0].save(file, "GIF", save_all=True, append_images=images[1:], duration=shown, loop=0)
     return file.getvalue()
+
+
+def _signals(replay: Replay) -> Callable[..., None]:
+    """Return the function that draws the monitored signals up to a sample."""
+    clock = np.asarray(replay.trace.clock())
+    columns: dict[str, np.ndarray] = {}
+    for name in replay.problem.monitored:
+        signal = np.asarray(replay.trace.signals[name], float).reshape(len(clock), -1)
+        names = [name] if signal.shape[1] == 1 else [f"{name}[{k}]" for k in range(len(signal[0]))]
+        columns |= dict(zip(names, signal.T, strict=True))
+    shown = dict(list(columns.items())[:LINES])
+    every = np.concatenate([each[np.isfinite(each)] for each in shown.values()])
+    low, high = (every.min(), every.max()) if every.size else (0.0, 1.0)
+    room = 0.05 * (high - low) or 1.0
+
+    def draw(axes: Any, trace: object, sample: int, features: object) -> None:
+        for number, (name, values) in enumerate(shown.items()):
+            axes.plot(clock[: sample + 1], values[: sample + 1], color=f"C{number}")
+            at = (0.02, 0.94 - 0.07 * number)
+            axes.text(*at, name, color=f"C{number}", transform=axes.transAxes)
+        axes.set_xlim(clock[0], clock[-1])
+        axes.set_ylim(low - room, high + room)
+        axes.set_xlabel("time (s)")
+
+    return draw
 
 
 class _Layout(NamedTuple):

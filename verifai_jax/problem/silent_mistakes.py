@@ -15,6 +15,7 @@ from verifai_jax.core.compute.compilation import Slot
 from verifai_jax.core.compute.fingerprint import used_inputs
 from verifai_jax.core.values.trace import Trace
 from verifai_jax.features import Domain
+from verifai_jax.mtl.fitting import assumptions
 from verifai_jax.mtl.shortfalls import shortfalls
 from verifai_jax.problem.problem import KEPT, QUICK, Problem
 from verifai_jax.problem.tracing import judged_results, traced_by_default
@@ -46,9 +47,12 @@ def formula_notes(problem: Problem, trace: Trace | None = None) -> tuple[str, ..
     duration = None if length is None or not (dt or length == 1) else (length - 1) * dt
     # A black box whose traces are not known may return single samples.
     return tuple(
-        f"in {'the formula' if len(problem.formulas) == 1 else f'formula {name!r}'}, {fall}"
+        f"in {'the formula' if len(problem.formulas) == 1 else f'formula {name!r}'}, {said}"
         for name, formula in problem.formulas.items()
-        for fall in (() if known is None else shortfalls(formula, dt, duration, problem.end))
+        for said in (
+            *(() if known is None else shortfalls(formula, dt, duration, problem.end)),
+            *assumptions(formula, {}),
+        )
     )
 
 

@@ -135,7 +135,7 @@ def test_the_text_of_what_is_counted_reads_back(text):
     [
         ("duration(eventually[0, 1] x > 0, 3) < 1", "looks ahead: use an operator that looks back"),
         ("duration(x > 0, 0) < 1", "must be a positive number of seconds; got 0"),
-        ("duration(x > 0, y) < 1", "the window of a duration is a number of seconds"),
+        ("duration(x > 0, y) < 1", "the window of duration is a number of seconds"),
         ("duration(x > 0) < 1", "no function 'duration'|duration"),
         ("duration(x > 0, 3)[0] < 1", "a component is a signal"),
         ("norm(duration(x > 0, 3)) < 1", "norm takes a vector signal"),
@@ -150,7 +150,7 @@ def test_where_nothing_counts_it_is_said():
     trace = Trace({"x": np.ones(4)}, dt=0.5)
     with pytest.raises(mtl.IntervalError, match="not a multiple"):
         mtl.robustness("duration(x > 0, 0.7) > 0", trace)
-    with pytest.raises(ValueError, match="is counted by watch and export_c, and not by online"):
+    with pytest.raises(ValueError, match="is computed by watch and export_c, and not by online"):
         mtl.online("duration(x > 0, 1) > 0", 0.5)
-    with pytest.raises(ValueError, match="counts samples, and between samples there are none"):
+    with pytest.raises(ValueError, match="is about samples, and between samples there are none"):
         mtl.dense_robustness("duration(x > 0, 1) > 0", trace)

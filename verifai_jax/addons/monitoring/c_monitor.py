@@ -11,10 +11,11 @@ import re
 from collections.abc import Mapping, Sequence
 
 from verifai_jax.addons.monitoring.margins import Margins, Step, margins
+from verifai_jax.addons.monitoring.quantities import completed
 from verifai_jax.core.messages.text import printable
 from verifai_jax.mtl.formula import Formula
 from verifai_jax.mtl.semantics import Semantics, hard
-from verifai_jax.mtl.streams import Count, Op, Plan, streams
+from verifai_jax.mtl.streams import Op, Plan, streams
 from verifai_jax.mtl.tree import missing_case
 from verifai_jax.mtl.words import number_text
 
@@ -87,18 +88,19 @@ static inline void vj_bound(double *to, const double *leaf, int32_t n, double bo
   for (int32_t i = 0; i < n; i++) { to[i] = (leaf[i] != leaf[i]) ? bound : leaf[i]; }
 }
 
-/* Seconds of the last n samples in which something held; NaN while one of them is unknown. */
-static inline double vj_count(
-  double *ring, int32_t n, int32_t *at, double *held, double *unknown, double dt, double truth)
+/* 1 if something holds and 0 if not, of its truth; NaN if that is unknown. */
+static inline double vj_held(double truth)
 {
-  const bool is_nan = (truth != truth);
-  const double now = is_nan ? 2.0 : ((truth > 0.0) ? 1.0 : 0.0);
-  const double before = ring[*at];
-  ring[*at] = now;
-  *at = ((*at + 1) < n) ? (*at + 1) : 0;
-  *held += ((now == 1.0) ? 1.0 : 0.0) - ((before == 1.0) ? 1.0 : 0.0);
-  *unknown += (is_nan ? 1.0 : 0.0) - ((before == 2.0) ? 1.0 : 0.0);
-  return (*unknown > 0.0) ? (double)NAN : (*held * dt);
+  return (truth != truth) ? truth : ((truth > 0.0) ? 1.0 : 0.0);
+}
+
+/* The value at the latest event, or at the first sample; NaN while it is unknown whether it was. */
+static inline double vj_latest(double *kept, bool first, double event, double x)
+{
+  if (event != event) { *kept = event; }
+  else if (first || (event > 0.0)) { *kept = x; }
+  else { /* nothing new */ }
+  return *kept;
 }
 
 /* The value n samples ago. */
@@ -279,6 +281,7 @@ static inline void @name_finish(const @name *m, @name *scratch, double out[@outp
 def export_c(
     formulas: Formula | str | Mapping[str, Formula | str], dt: float, name: str = "monitor", *,
     semantics: Semantics = hard, every: bool = False, sizes: Mapping[str, int] | None = None,
+    units: Mapping[str, str] | None = None,
 ) -> str:  # fmt: skip
     """Return a C99 header with a monitor of one formula, or of several by name.
 
@@ -291,7 +294,7 @@ def export_c(
     - `name`: the name of the C type, and the prefix of its functions.
     - `semantics`: `hard` or `boolean`.
     - `every`: whether each formula is evaluated at every instant, not only at time 0.
-    - `sizes`: number of components of each signal whose norm the formulas use.
+    - `sizes`, `units`: as in `watch`.
     **Returns:** the text of the header.
     **Raises:** the errors of `watch`; `ValueError` for a name that is not a C identifier, or that C
     or the code itself uses.
@@ -305,7 +308,7 @@ def export_c(
             f"the name of a monitor must be free in C, where {name!r} means something else or may; "
             f"such as {name.lower()}_monitor"
         )
-    plan = streams(formulas, dt, semantics, every)
+    plan = streams(completed(formulas, units, sizes), dt, semantics, every)
     front = margins(plan, sizes or {})
     columns = [
         f"x[{k}] {n}{'' if i is None else f'[{i}]'}" for k, (n, i) in enumerate(front.columns)
@@ -326,9 +329,9 @@ def monitor_code(plan: Plan, front: Margins, name: str) -> str:
     """Return the type of a monitor and its functions, without the functions they call."""
     code, counted = _Code(plan.top), _Code(plan.top)
     inner, counts = [], []
-    for k, (count, (own, columns)) in enumerate(zip(plan.counts, front.counts, strict=True)):
-        inner.append(monitor_code(count.plan, own, f"{name}_counted{k}"))
-        counts += counted.count(k, count, columns, f"{name}_counted{k}")
+    for k, (within, own, columns) in enumerate(front.counts):
+        inner.append(monitor_code(within, own, f"{name}_counted{k}"))
+        counts += counted.count(k, columns, f"{name}_counted{k}")
     values = [
         f"({_number(op.number)})" if op.kind == "number" else f"v{k}"
         for k, op in enumerate(plan.ops)
@@ -339,7 +342,7 @@ def monitor_code(plan: Plan, front: Margins, name: str) -> str:
         for k, o in enumerate(plan.outputs)
     ]
     waits = [output.wait for output in plan.outputs]
-    lines, texts = _margin_lines(front)
+    lines, texts = _margin_lines(front, counted)
     given = [f"m->now.leaf[{k}] = {texts[i]};" for k, i in enumerate(front.leaves)]
     given = given or ["(void)x;", "m->now.leaf[0] = 0.0;"]
     parts = {
@@ -354,7 +357,7 @@ def monitor_code(plan: Plan, front: Margins, name: str) -> str:
     return "".join([*inner, re.sub(r"@(\w+)", lambda found: str(parts[found[1]]), text)])
 
 
-def _margin_lines(front: Margins) -> tuple[list[str], list[str]]:
+def _margin_lines(front: Margins, memory: "_Code") -> tuple[list[str], list[str]]:
     """Return a line for each operation, and the text by which its result is read."""
     lines: list[str] = []
     texts: list[str] = []
@@ -365,15 +368,26 @@ def _margin_lines(front: Margins) -> tuple[list[str], list[str]]:
             case "number":
                 text = f"({step.number!r})"
             case _:
-                text = f"a{len(lines)}"
-                of = _operation(step, [texts[i] for i in step.inputs])
-                lines.append(f"const double {text} = {of};")
+                text = f"a{len(texts)}"
+                of = _operation(step, [texts[i] for i in step.inputs], memory, len(texts))
+                *before, value = of.split("\n")
+                lines += before
+                lines.append(f"const double {text} = {value};")
         texts.append(text)
     return lines, texts
 
 
-def _operation(step: Step, v: Sequence[str]) -> str:
+def _operation(step: Step, v: Sequence[str], memory: "_Code", k: int) -> str:
+    n = int(step.number)
     match step.kind:
+        case "delay" | "lag":
+            ring, at = memory.array(f"s{k}", n, 0.0), memory.index(f"t{k}")
+            fill = f"if (m->now.count == 0) {{ vj_fill({ring}, {n}, {v[0]}); }}"
+            delay = f"vj_delay({ring}, {n}, {at}, {v[0]})"
+            return f"{fill}\n{delay}" if step.kind == "lag" else delay
+        case "latest":
+            kept = memory.number(f"s{k}", 0.0)
+            return f"vj_latest({kept}, m->now.count == 0, {v[0]}, {v[1]})"
         case "+" | "-" | "*" | "/":
             return f"{v[0]} {step.kind} {v[1]}"
         case "neg":
@@ -384,7 +398,7 @@ def _operation(step: Step, v: Sequence[str]) -> str:
         case "norm":
             return f"sqrt({' + '.join(f'({a} * {a})' for a in v)})"
         case "power":
-            return f"vj_power({v[0]}, {int(step.number)})"
+            return f"vj_power({v[0]}, {n})"
         case "truth":
             return f"vj_truth({v[0]}, {str(bool(step.number)).lower()})"
     function = {"abs": "fabs", "**": "pow"}.get(step.kind, step.kind)
@@ -424,18 +438,15 @@ class _Code:
         self.starts.append(f"m->{name} = 0;")
         return f"&m->{name}"
 
-    def count(self, k: int, count: Count, columns: Sequence[int], kind: str) -> list[str]:
-        """Return the lines that count, by a monitor of the `kind` within this one."""
+    def count(self, k: int, columns: Sequence[int], kind: str) -> list[str]:
+        """Return the lines that tell what holds, by a monitor of the `kind` within this one."""
         self.fields.append(f"{kind} m{k};")
         self.starts.append(f"{kind}_start(&m->m{k});")
-        ring, at = self.array(f"c{k}", count.n, 0.0), self.index(f"j{k}")
-        sums = f"{self.number(f'h{k}', 0.0)}, {self.number(f'u{k}', 0.0)}"
         given = ", ".join(f"x[{column}]" for column in columns) or "0.0"
-        rooms = f"{ring}, {count.n}, {at}, {sums}, {count.dt!r}"
         return [
             f"const double y{k}[] = {{ {given} }};",
             f"{kind}_step(&m->m{k}, y{k});",
-            f"const double n{k} = vj_count({rooms}, m->m{k}.out[0]);",
+            f"const double n{k} = vj_held(m->m{k}.out[0]);",
         ]
 
     def stream(self, k: int, op: Op, names: Sequence[str]) -> str:

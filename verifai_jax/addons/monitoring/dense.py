@@ -27,9 +27,11 @@ from verifai_jax.addons.monitoring.piecewise import (
 from verifai_jax.addons.monitoring.resampling import Method, gaps, hold_note
 from verifai_jax.core.values.trace import Trace
 from verifai_jax.mtl import formula as ast
-from verifai_jax.mtl.expression import Arithmetic, Component, Duration, Number, Signal
+from verifai_jax.mtl.expression import Arithmetic, Component, Number, Signal
+from verifai_jax.mtl.fitting import fitted, sizes_of
 from verifai_jax.mtl.formula import Formula, Term
 from verifai_jax.mtl.host_values import FUNCTIONS, numbers
+from verifai_jax.mtl.sampled import Sampled
 from verifai_jax.mtl.semantics import alone
 from verifai_jax.mtl.setting import as_formula, check_trace, resolution_of
 from verifai_jax.mtl.tree import missing_case, postorder
@@ -216,6 +218,10 @@ class DenseValues:
         return Piecewise(self.times[:1], one, one, one, self.snap)
 
     def formula(self, f: Formula, below: list[Piecewise]) -> Piecewise:
+        if f.side and f.operator.timed and not f.interval.closed:
+            raise NotDense(
+                f"{f} leaves out an end of its interval, which is a sample: judge it by robustness"
+            )
         match f:
             case ast.Constant(value):
                 return self.constant(math.inf if value else -math.inf)
@@ -256,6 +262,10 @@ class DenseValues:
         return joined([kept, later], -1)
 
     def leaf(self, f: Formula) -> Piecewise:
+        fit = fitted(f, self.trace.units, sizes_of(self.trace.signals))
+        return self.predicate(f) if fit is f else self(fit)
+
+    def predicate(self, f: Formula) -> Piecewise:
         if f.compared is None:
             (e,) = f.terms()
             truths = set(filter(self.trace.is_truth, e.signals()))
@@ -275,9 +285,9 @@ class DenseValues:
             match part:
                 case Number(value):
                     values[id(part)] = self.constant(value)
-                case Duration():
+                case Sampled():
                     raise NotDense(
-                        f"{part} counts samples, and between samples there are none: judge it by "
+                        f"{part} is about samples, and between samples there are none: judge it by "
                         "robustness"
                     )
                 case Signal(name):

@@ -18,7 +18,8 @@ class Finding(NamedTuple):
 
     - `requirement`: the identifier of the requirement.
     - `kind`: `"signal"`, `"window"`, `"vacuous"`, `"never near"`, `"never holds"`, `"until"`,
-      `"units"`, `"no effect"`, `"always true"`, `"always false"`, or `"no verdict"`.
+      `"units"`, `"no effect"`, `"always true"`, `"always false"`, or `"no verdict"`; of a set
+      `"contradiction"`, `"duplicate"` or `"implied"`.
     - `part`: the suspicious part of the formula.
     - `sentence`: the finding as a sentence.
     - `advice`: the probable intention.
@@ -37,12 +38,14 @@ class Findings(InNotebook):
 
     - `recordings`: number of recordings that were used.
     - `unread`: signals of the recordings that no formula uses.
+    - `not_searched`: pairs of formulas that were compared by proof alone, as there are many.
     """
 
     requirements: tuple[Requirement, ...] = field(repr=False)
     findings: tuple[Finding, ...]
     recordings: int
     unread: tuple[str, ...] = ()
+    not_searched: int = 0
 
     def __bool__(self) -> bool:
         return bool(self.findings)
@@ -73,6 +76,10 @@ class Findings(InNotebook):
                 lines += [f"    {finding.advice}"] if finding.advice else []
         if self.unread:
             lines += ["", f"No formula reads {listed(self.unread)}."]
+        if self.not_searched:
+            pairs = counted(self.not_searched, "pair")
+            lines += ["", f"{pairs} of formulas {'was' if self.not_searched == 1 else 'were'} "
+                          "compared by proof alone."]  # fmt: skip
         return "\n".join(lines)
 
     __str__ = summary

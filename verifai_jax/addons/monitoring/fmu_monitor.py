@@ -12,6 +12,7 @@ from xml.etree import ElementTree
 
 from verifai_jax.addons.monitoring.c_monitor import export_c
 from verifai_jax.addons.monitoring.margins import margins
+from verifai_jax.addons.monitoring.quantities import completed
 from verifai_jax.addons.monitoring.watching import FLAGS
 from verifai_jax.addons.native.native_code.machine_code import Unavailable, compile_library
 from verifai_jax.core.messages.checks import check_name
@@ -154,6 +155,7 @@ REFUSED = (
 def export_fmu(
     formulas: Formula | str | Mapping[str, Formula | str], dt: float, file: str | Path, *,
     semantics: Semantics = hard, every: bool = False, sizes: Mapping[str, int] | None = None,
+    units: Mapping[str, str] | None = None,
 ) -> Path:  # fmt: skip
     """Write a monitor as an FMU of FMI 2 for co-simulation, with its source in C.
 
@@ -165,7 +167,7 @@ def export_fmu(
     **Arguments:**
     - `dt`: sampling period in seconds; communication steps must be multiples of it.
     - `file`: the FMU to write.
-    - `semantics`, `every`, `sizes`: as in `export_c`.
+    - `semantics`, `every`, `sizes`, `units`: as in `export_c`.
     **Returns:** the path of the file. It contains a binary for this machine if there is a compiler,
     otherwise only the source, which the importing tool has to compile.
     **Raises:** the errors of `export_c`; `ValueError` for a file whose name does not end in `.fmu`,
@@ -174,6 +176,7 @@ def export_fmu(
     path = Path(file)
     if path.suffix != ".fmu":
         raise ValueError(f"the name of an FMU ends in .fmu; got {path.name}")
+    formulas = completed(formulas, units, sizes)
     plan = streams(formulas, dt, semantics, every)
     front = margins(plan, sizes or {})
     inputs = [n if i is None else f"{n}[{i}]" for n, i in front.columns]

@@ -25,12 +25,11 @@ from verifai_jax.mtl.expression import (
     Component,
     Number,
     constant_value,
-    durations_in,
     expression,
-    with_counted,
 )
 from verifai_jax.mtl.formula import Formula
 from verifai_jax.mtl.host_values import HostValues, Values
+from verifai_jax.mtl.sampled import sampled_in, with_counted
 from verifai_jax.mtl.tree import Tree, postorder
 
 LANES = 1024
@@ -162,10 +161,15 @@ def _clock(
     timed = [f for whole in formulas for f in postorder(whole) if isinstance(f, Tree) and f.side]
     intervals = [f.interval for f in timed if f.operator.timed]
     ends = [t for i in intervals for t in (i.start, i.end) if 0 < t < math.inf]
-    ends += [each.window for each in durations_in(*formulas)]
+    ends += [each.window.end for each in sampled_in(*formulas) if each.window is not None]
     if dt is None:
         # Seconds that are counted are multiples of the period, too, and so are their limits.
-        counts = [leaf for f in formulas for leaf in predicates_of(f) if durations_in(leaf)]
+        counts = [
+            leaf
+            for f in formulas
+            for leaf in predicates_of(f)
+            if any(e.function == "duration" for e in sampled_in(leaf))
+        ]
         limits = [number for leaf in counts for number in _numbers(leaf) if number > 0]
         exact = [Fraction(repr(t)) for t in (*ends, *limits)]
         common = Fraction(1) if not exact else _common(exact)

@@ -12,6 +12,7 @@ import functools
 import hashlib
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -36,9 +37,11 @@ from verifai_jax.core.values.trace import Trace
 from verifai_jax.evaluation.run_on import RunOn
 from verifai_jax.mtl._robustness import first_nan
 from verifai_jax.mtl.evaluate import End
+from verifai_jax.mtl.fitting import assumptions
 from verifai_jax.mtl.formula import Formula
 from verifai_jax.mtl.host_values import HostValues
 from verifai_jax.mtl.requirements import Requirement
+from verifai_jax.mtl.rewriting import asked_at_once
 from verifai_jax.mtl.setting import SamplingError, check_horizon, check_reach, check_signals, period
 from verifai_jax.mtl.shortfalls import shortfalls_in
 
@@ -223,6 +226,7 @@ def _even_step(trace: Trace) -> float:
 
 def finder(trace: Trace, reading: Reading) -> Callable[[Formula], tuple[Found, str]]:
     """Return a function that decides formulas on one trace, and notes how if that is not exact."""
+    trace = replace(trace, units=units_of(trace.signals, trace.units))
 
     @functools.cache
     def sampled() -> tuple[HostValues, Trace]:
@@ -240,15 +244,19 @@ def finder(trace: Trace, reading: Reading) -> Callable[[Formula], tuple[Found, s
             if reading.end == "strict":
                 check_reach(formula, float(dense.times[-1]), 0.0)
             try:
-                return _found(formula, dense, trace, reading), "; ".join(dense.held(formula))
+                notes = [*dense.held(formula), *assumptions(formula, trace.units)]
+                return _found(formula, dense, trace, reading), "; ".join(notes)
             except NotDense:
                 if reading.resample_to is None:
                     period(trace)  # Its error says what to do about an uneven clock.
         values, own = sampled()
         if reading.end == "strict":
             check_horizon(formula, own, values.dt)
-        off = [note for note in own.notes if note not in trace.notes]
-        return _found(formula, values, own, reading), "; ".join(off)
+        notes = [str(note) for note in own.notes if note not in trace.notes]
+        notes += assumptions(formula, trace.units)
+        if (values.truth(asked_at_once(formula))[0] < 0).any():
+            notes.append("it is violated already at the first sample")
+        return _found(formula, values, own, reading), "; ".join(notes)
 
     return find
 

@@ -8,13 +8,15 @@ The formula alone shows parts without effect and parts that cannot be true; reco
 that never hold, are never near to a change, or look beyond the end.
 """
 
+import contextlib
 import math
-from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
 
+from verifai_jax.addons.monitoring.across import across
 from verifai_jax.addons.monitoring.distinguishing import free_difference
 from verifai_jax.addons.monitoring.findings import Finding, Findings
 from verifai_jax.addons.monitoring.free_traces import FreeTraces
@@ -27,11 +29,12 @@ from verifai_jax.core.values.trace import Trace
 from verifai_jax.mtl import formula as ast
 from verifai_jax.mtl.bounds import predicates_of
 from verifai_jax.mtl.evaluate import End
-from verifai_jax.mtl.expression import durations_in
+from verifai_jax.mtl.fitting import assumptions, fitted, sizes_of
 from verifai_jax.mtl.formula import FALSE, TRUE, Formula, surface
 from verifai_jax.mtl.host_values import HostValues
 from verifai_jax.mtl.requirements import Requirement
 from verifai_jax.mtl.rewriting import nnf, replaced
+from verifai_jax.mtl.sampled import sampled_in
 from verifai_jax.mtl.shortfalls import Shortfall, shortfalls, shortfalls_in
 
 FAR, NEVER = 2.5, 0.5
@@ -47,7 +50,8 @@ def lint(
     formulas: Requirements, signals: Recordings | None = None, *,
     units: Mapping[str, str] | None = None, end: End = "hold",
 ) -> Findings:  # fmt: skip
-    """Find parts of formulas that may not say what their author meant.
+    """Find parts of formulas that may not say what their author meant, and formulas of a set that
+    do not go together: contradictions, duplicates, one implied by another, several units.
 
     **Arguments:**
     - `formulas`: a formula, a sequence of formulas, or a dictionary by identifier;
@@ -65,11 +69,41 @@ def lint(
     read = dict.fromkeys(name for each in requirements for name in each.formalized.signals())
     said = {name: unit for trace in traces.values() for name, unit in trace.units.items()}
     known = units_of([*names, *read], said | dict(units or {}))
+    traces = {
+        name: replace(trace, units=units_of(trace.signals, dict(trace.units) | dict(units or {})))
+        for name, trace in traces.items()
+    }
     found: list[Finding] = []
     for each in requirements:
         found += _Linter(each, traces, known, end).findings()
+    found += _units_in_set(requirements, traces)
+    whole: dict[str, Formula] = {}
+    sizes = {n: k for t in traces.values() for n, k in sizes_of(t.signals).items()}
+    for each in requirements:
+        with contextlib.suppress(ValueError):  # Which its own findings tell.
+            whole[each.id] = fitted(each.formalized, known, sizes)
+    pairs, left = across(whole)
     unread = tuple(name for name in names if name not in read)
-    return Findings(requirements, tuple(found), len(traces), unread)
+    return Findings(requirements, (*found, *pairs), len(traces), unread, left)
+
+
+def _units_in_set(requirements: Sequence[Requirement], traces: Mapping[str, Trace]) -> Check:
+    """Find signals that have one unit here and another there."""
+    said: dict[str, dict[str, str]] = {}
+    for source, trace in traces.items():
+        for name, unit in trace.units.items():
+            said.setdefault(name, {}).setdefault(unit, source)
+    for each in requirements:
+        names = each.formalized.signals()
+        if len(names) == 1 and (unit := plain_unit(each.unit)):
+            said.setdefault(names[0], {}).setdefault(unit, each.id)
+    reading = {name: each for each in reversed(requirements) for name in each.formalized.signals()}
+    for name, sources in said.items():
+        if len(sources) > 1 and name in reading:
+            where = " and ".join(f"{unit} in {source}" for unit, source in sources.items())
+            said_so = f"{name} is in {where}"
+            advice = "Convert one of them, or give the unit with the number, as in 130 km/h."
+            yield Finding(reading[name].id, "units", name, said_so, advice)
 
 
 class _Recording(NamedTuple):
@@ -277,8 +311,11 @@ class _Linter:
         """Return how far the margin of a predicate moves in the recordings."""
         every = np.concatenate([np.ravel(each.values(leaf)) for each in self.recordings])
         spread = float(np.ptp(every[np.isfinite(every)]))
-        # Seconds that are counted may be all of their window.
-        spread = max([spread, *(each.window for each in durations_in(leaf))])
+        # What is counted, in seconds or samples, may be all of its window.
+        dt = min(each.values.dt for each in self.recordings)
+        for each in sampled_in(leaf):
+            if each.counted and each.window is not None:
+                spread = max(spread, each.window.end, each.window.end / dt)
         sizes = [np.abs(e.values.signals[n]).max() for e in self.recordings for n in leaf.signals()]
         # Flags, modes and counts are often constant, so that a bound next to one says nothing.
         still = STILL * float(max(sizes)) if max(sizes) > 3 or max(sizes) % 1 else math.inf
@@ -305,7 +342,7 @@ class _Linter:
         for part, (word, _) in written.items():
             if word != "until" or not isinstance(part, ast.Until):
                 continue
-            weak = part.left.weak_until(part.right, part.interval.start, part.interval.end)
+            weak = part.left.weak_until(part.right, part.interval)
             changed = replaced(self.formula, {part: weak})
             only = [
                 each.name
@@ -340,6 +377,8 @@ class _Linter:
 
     def _dimensions(self) -> Check:
         """Find units that do not go together, and a robustness of several units."""
+        for sentence in assumptions(self.formula, self.units) if self.traces else ():
+            yield self._found("units", self.formula, sentence)
         owners: dict[str, Formula] = {}
         for leaf in predicates_of(self.formula):
             faults: list[str] = []

@@ -9,9 +9,12 @@ front.leaves                    # the results that are the margins
 from collections.abc import Callable, Mapping
 from typing import NamedTuple
 
-from verifai_jax.mtl.expression import Arithmetic, Component, Duration, Number, Signal
+from verifai_jax.mtl.evaluate import span_of
+from verifai_jax.mtl.expression import Arithmetic, Component, Number, Signal
 from verifai_jax.mtl.formula import Formula, Term
-from verifai_jax.mtl.streams import Plan
+from verifai_jax.mtl.sampled import Operations, Sampled
+from verifai_jax.mtl.semantics import boolean
+from verifai_jax.mtl.streams import Plan, streams
 from verifai_jax.mtl.tree import missing_case, postorder
 
 FEW = 64
@@ -23,8 +26,10 @@ class Step(NamedTuple):
     """One operation on earlier results.
 
     - `kind`: a kind of `Arithmetic`, or one of these: `column` and `count` (number `number` of the
-      sample, or of the counted durations), `number`, `power` (with the integer `number`), `truth`
-      (1 or -1 by the sign; `number` is 1 if zero counts as true).
+      sample, or of the counted formulas), `number`, `power` (with the integer `number`), `truth`
+      (1 or -1 by the sign; `number` is 1 if zero counts as true). Some remember: `delay` and `lag`
+      give the input `number` samples ago, before that exists 0 or the first one; `latest` the
+      second input at the latest sample at which the first was above 0, or at the first sample.
     """
 
     kind: str
@@ -38,13 +43,13 @@ class Margins(NamedTuple):
     - `columns`: the name of each signal, and the index of a component of a vector. With `apart` a
       signal that is a formula by itself has another column there, with `ALONE` before its name.
     - `leaves`: the index of the result that is each leaf's margin.
-    - `counts`: for each duration, the margins of the counted formula, and its columns among these.
+    - `counts`: for each counted formula its plan, its margins, and its columns among these.
     """
 
     columns: tuple[tuple[str, int | None], ...]
     steps: tuple[Step, ...]
     leaves: tuple[int, ...]
-    counts: tuple[tuple["Margins", tuple[int, ...]], ...]
+    counts: tuple[tuple[Plan, "Margins", tuple[int, ...]], ...]
 
 
 def margins(plan: Plan, sizes: Mapping[str, int], apart: bool = False) -> Margins:
@@ -58,18 +63,20 @@ def margins(plan: Plan, sizes: Mapping[str, int], apart: bool = False) -> Margin
     """
     made = _Builder(plan, sizes, apart)
     leaves = tuple(made.leaf(f, sign, plan.top == 1) for f, sign in plan.leaves)
-    counts: list[tuple[Margins, tuple[int, ...]]] = []
-    for count in plan.counts:
-        inner = margins(count.plan, sizes, apart)
-        counts.append((inner, tuple(made.number_of(*column) for column in inner.columns)))
+    counts: list[tuple[Plan, Margins, tuple[int, ...]]] = []
+    for counted in made.counted:
+        inner = streams(counted, plan.dt, boolean, every=True)
+        front = margins(inner, sizes, apart)
+        counts.append((inner, front, tuple(made.number_of(*column) for column in front.columns)))
     return Margins(tuple(made.columns), tuple(made.steps), leaves, tuple(counts))
 
 
-class _Builder:
+class _Builder(Operations[int]):
     def __init__(self, plan: Plan, sizes: Mapping[str, int], apart: bool) -> None:
         self.sizes = sizes
         self.alone = ALONE if apart else ""
-        self.counted = {count.duration: k for k, count in enumerate(plan.counts)}
+        self.dt = plan.dt
+        self.counted: dict[Formula, int] = {}
         self.columns: dict[tuple[str, int | None], int] = {}
         self.steps: dict[Step, int] = {}
 
@@ -82,6 +89,25 @@ class _Builder:
 
     def column(self, name: str, index: int | None = None) -> int:
         return self.step("column", number=self.number_of(name, index))
+
+    def number(self, value: float) -> int:
+        return self.step("number", number=value)
+
+    def apply(self, name: str, *values: int) -> int:
+        return self.step(name, *values)
+
+    def before(self, x: int, n: int, held: bool = False) -> int:
+        return self.step("lag" if held else "delay", x, number=n) if n else x
+
+    def latest(self, event: int, x: int) -> int:
+        return self.step("latest", event, x)
+
+    def holds(self, f: Formula) -> int:
+        """Return the number of the result that is 1 where a formula holds and 0 where not."""
+        return self.step("count", number=self.counted.setdefault(f, len(self.counted)))
+
+    def sampled(self, e: Sampled) -> int:
+        return e.computed(self, self.holds, self.expression, lambda w: span_of(w, self.dt))
 
     def leaf(self, f: Formula, sign: int, boolean: bool) -> int:
         left, comparison, right = f.compared or (*f.terms(), ">", None)
@@ -107,8 +133,8 @@ class _Builder:
         results: dict[int, int] = {}
 
         def result(part: Term) -> int:
-            if isinstance(part, Duration):
-                return self.step("count", number=self.counted[part])
+            if isinstance(part, Sampled):
+                return self.sampled(part)
             # A signal is a number here, and a vector within its component or norm.
             return self.column(part.name) if isinstance(part, Signal) else results[id(part)]
 

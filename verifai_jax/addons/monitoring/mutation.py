@@ -11,7 +11,7 @@ shows that such a mistake in the formula would go unnoticed.
 import functools
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, TypeAlias
 
 from verifai_jax.addons.monitoring.distinguishing import free_difference
@@ -23,15 +23,14 @@ from verifai_jax.mtl import formula as ast
 from verifai_jax.mtl.evaluate import End, IntervalError
 from verifai_jax.mtl.expression import (
     Arithmetic,
-    Duration,
     Expression,
     Number,
-    duration,
     expression,
 )
 from verifai_jax.mtl.formula import EVERYTHING, Formula, Interval, surface
 from verifai_jax.mtl.host_values import HostValues
 from verifai_jax.mtl.rewriting import nnf, simplify
+from verifai_jax.mtl.sampled import Sampled
 from verifai_jax.mtl.setting import as_formula
 from verifai_jax.mtl.words import OPERATORS
 
@@ -213,7 +212,7 @@ def _windows(interval: Interval, dt: float) -> Iterator[Interval]:
     for new in (start, middle), (start, 2 * end), (start, math.inf), (0.0, end), (middle, end):
         ends = tuple(round(t, 9) for t in new)
         if ends != (start, end) and ends[0] <= ends[1]:
-            yield Interval(*ends)
+            yield Interval(ends[0], ends[1])
 
 
 def _changed_leaf(leaf: Formula) -> Iterator[Change]:
@@ -237,14 +236,22 @@ def _changed_terms(*terms: Expression) -> Iterator[tuple[Expression, ...]]:
 
 
 def _changed_term(term: Expression) -> Iterator[Expression]:
-    if isinstance(term, Number):
+    if isinstance(term, Number) and term.opened:
+        yield from (Arithmetic("*", (Number(share), term)) for share in (1 - MOVED, 1 + MOVED))
+    elif isinstance(term, Number):
         for share in (1 - MOVED, 1 + MOVED) if term.value else ():
             yield Number(float(f"{term.value * share:z.12g}"))
         if not term.value:
             yield from (Number(-MOVED), Number(MOVED))
-    elif isinstance(term, Duration):
-        for part, window in ((term.operand, 2 * term.window), (~term.operand, term.window)):
-            yield duration(part, window)
+    elif isinstance(term, Sampled):
+        if term.window is not None:
+            end = 2 * term.window.end
+            yield term.changed(lambda part: part, replace(term.window, end=end))
+        for index, part in enumerate(term.operands):
+            others = [~part] if isinstance(part, Formula) else _changed_term(expression(part))
+            for other in others:
+                own = (*term.operands[:index], other, *term.operands[index + 1 :])
+                yield term.of(own, term.window)
     elif isinstance(term, Arithmetic):
         if term.name == "abs":
             yield term.arguments[0]

@@ -14,12 +14,11 @@ from jaxtyping import Array, Float, Real
 from verifai_jax.core.messages.errors import check_names
 from verifai_jax.core.values.trace import Trace
 from verifai_jax.mtl import formula as ast
-from verifai_jax.mtl.evaluate import Evaluator
 from verifai_jax.mtl.expression import Expression, Number, expression
 from verifai_jax.mtl.formula import Formula, Term
 from verifai_jax.mtl.rewriting import rebuild
 from verifai_jax.mtl.semantics import hard
-from verifai_jax.mtl.setting import prepare
+from verifai_jax.mtl.setting import evaluator_of, prepare
 
 
 def normalize(formula: Formula, scales: Mapping[str, float] | Trace) -> Formula:
@@ -69,7 +68,7 @@ def anneal(
 
 def _spreads(formula: Formula, trace: Trace) -> dict[Formula, float]:
     setting, arrays, _, _ = prepare(formula, trace.trim(), hard, "hold", None)
-    evaluator = Evaluator(arrays, setting.length, setting.dt, truths=setting.truths)
+    evaluator = evaluator_of(setting, arrays, None, None, 0)
     spreads = {}
     for leaf in formula.subformulas():
         if leaf.is_predicate:
@@ -90,4 +89,5 @@ def _mapped(f: Formula, scales: Mapping[Formula, float]) -> Formula:
 
 
 def _over(e: Term, scale: float) -> Expression:
-    return Number(e.value / scale) if isinstance(e, Number) else expression(e) / scale
+    plain = isinstance(e, Number) and not e.opened
+    return Number(e.value / scale) if plain else expression(e) / scale  # pyright: ignore

@@ -19,7 +19,7 @@ import math
 import re
 import tomllib
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from importlib import resources
 from typing import Any
 
@@ -28,18 +28,19 @@ from verifai_jax.mtl import formula as ast
 from verifai_jax.mtl._parse import parse
 from verifai_jax.mtl.expression import (
     Arithmetic,
-    Duration,
+    Expression,
     Number,
     Signal,
     constant_value,
-    duration,
     expression,
 )
+from verifai_jax.mtl.fitting import rebuilt
 from verifai_jax.mtl.formula import Formula, Interval, Term
 from verifai_jax.mtl.requirements import Requirement
+from verifai_jax.mtl.sampled import Sampled, sampled_in
 from verifai_jax.mtl.tree import postorder
 
-_WORDS = re.compile(r'"[^"\n]*"|[\[\],:]|\?([A-Za-z_]\w*)')
+_WORDS = re.compile(r'"[^"\n]*"|[\[\]),:]|\?([A-Za-z_]\w*)')
 _START, _END = 1e-300, 1e300
 """Times of parameters while their values are unknown: multiples of these, below and above any that
 a person writes, so that an interval with one of them and another number ends after it starts."""
@@ -86,10 +87,9 @@ class Parametric:
         """
         match f:
             case ast.Predicate(comparison, left, right):
-                if not any(name in self.names for name in _parameters(left, right)):
-                    return f
-                equal = {True: _CLOSED, False: _OPEN, None: {}}[positive]
-                comparison = equal.get(comparison, comparison)
+                if _parameters(left, right):
+                    equal = {True: _CLOSED, False: _OPEN, None: {}}[positive]
+                    comparison = equal.get(comparison, comparison)
                 left, right = (self._with_numbers(e, values) for e in (left, right))
                 return ast.Predicate(comparison, left, right)
             case ast.Atom(e):
@@ -104,20 +104,30 @@ class Parametric:
         operands = [self._filled(part, values, positive) for part in f.operands()]
         if not f.operator.timed:
             return ast.build(f.operator.word, operands)
-        ends = (f.interval.start, f.interval.end)
-        ends = (values[self.slots[t]] if t in self.slots else t for t in ends)
-        return ast.build(f.operator.word, operands, Interval(*ends))
+        return ast.build(f.operator.word, operands, self._interval(f.interval, values))
 
-    def _with_numbers(self, e: Term, values: Mapping[str, float]) -> Term:
-        match e:
-            case Duration():
-                return duration(self._filled(e.operand, values, None), e.window)
-            case Signal(name) if name.startswith("?"):
-                return Number(values[name[1:]])
-            case Arithmetic(name, arguments):
-                filled = tuple(expression(self._with_numbers(a, values)) for a in arguments)
-                return Arithmetic(name, filled)
-        return e
+    def _interval(self, span: Interval, values: Mapping[str, float]) -> Interval:
+        start, end = (
+            values[self.slots[t]] if t in self.slots else t for t in (span.start, span.end)
+        )
+        return replace(span, start=start, end=end)
+
+    def _with_numbers(self, e: Term, values: Mapping[str, float]) -> Expression:
+        def change(part: Term) -> Term | None:
+            if isinstance(part, Sampled):
+                window = None if part.window is None else self._interval(part.window, values)
+                return part.changed(
+                    lambda a: (
+                        self._filled(a, values, None)
+                        if isinstance(a, Formula)
+                        else rebuilt(a, change)
+                    ),
+                    window,
+                )
+            known = isinstance(part, Signal) and part.name.startswith("?")
+            return Number(values[part.name[1:]]) if known else None  # pyright: ignore
+
+        return rebuilt(e, change)
 
     def direction(self, name: str) -> int:
         """Return how the robustness changes as a parameter grows, judging from the formula.
@@ -184,7 +194,7 @@ def read_parametric(
     def put(match: re.Match[str]) -> str:
         nonlocal inside
         word, name = match[0], match[1]
-        inside = (inside or word == "[") and word != "]"
+        inside = (inside or word == "[") and word not in ("]", ")")
         if name is None:
             return word
         if names.setdefault(name, inside) != inside:
@@ -206,7 +216,15 @@ def read_parametric(
             f"{text!r} has no parameter: write ?name for a number or a time that is to be found, "
             "as in always[0, ?T] (distance > ?d)"
         )
-    return Parametric(text, parse(plain, known, definitions), tuple(names), slots)
+    tree = parse(plain, known, definitions)
+    spans = [part.interval for part in tree.subformulas() if part.side and part.operator.timed]
+    for span in [*spans, *(each.window for each in sampled_in(tree))]:
+        if span and not span.closed and {span.start, span.end} & slots.keys():
+            raise ValueError(
+                f"a time that is to be found is an end that belongs to its interval, as in "
+                f"[0, ?T]; got {text!r}"
+            )
+    return Parametric(text, tree, tuple(names), slots)
 
 
 def _parameters(*terms: Term) -> list[str]:
@@ -218,7 +236,7 @@ def _term_signs(e: Term, name: str) -> set[int]:
     if name not in e.signals():
         return set()
     match e:
-        case Duration():
+        case Sampled():
             return {0}
         case Signal():
             return {1}

@@ -11,6 +11,7 @@ from verifai_jax.addons.monitoring.mining import Mined
 from verifai_jax.core.display.figure import Axes, Figure
 from verifai_jax.core.values.trace import Trace
 from verifai_jax.mtl.bounds import signal_bounds
+from verifai_jax.mtl.fitting import fitted, sizes_of
 from verifai_jax.mtl.formula import Formula
 from verifai_jax.mtl.host_values import HostValues
 from verifai_jax.pictures import style
@@ -80,7 +81,8 @@ def _plot_traces(
         column[-1].set_xlabel("time (s)")
         for axes, name in zip(column, names, strict=False):
             axes.plot(clock, values.signals[name], color=style.INPUT, drawstyle="steps-post")
-            _draw_bounds(axes, formulas, name)
+            sizes = sizes_of(trace.signals)
+            _draw_bounds(axes, [fitted(f, trace.units, sizes) for f in formulas], name)
             style.tidy(axes)
         for axes, formula in zip(column[len(names) :], formulas, strict=True):
             fails = np.broadcast_to(values.truth(formula) <= 0, len(clock))

@@ -17,10 +17,9 @@ from verifai_jax.core.display.figure import Axes, Figure, new_figure
 from verifai_jax.core.messages.text import format_seconds
 from verifai_jax.core.store.atomic_files import replacing
 from verifai_jax.mtl._explain import Explanation, Node, heading
-from verifai_jax.mtl.evaluate import Evaluator
 from verifai_jax.mtl.formula import Term
 from verifai_jax.mtl.semantics import hard
-from verifai_jax.mtl.setting import prepare
+from verifai_jax.mtl.setting import evaluator_of, prepare
 
 HOLDS, FAILS, PATH, QUIET = "#0a8f6a", "#cf3f21", "#1b2a41", "#7b8794"
 _MAX_ROWS = 14
@@ -180,7 +179,7 @@ def _strip(axis: Axes, node: Node, clock: np.ndarray) -> float:
 def _predicate(axis: Axes, explanation: Explanation, node: Node, clock: np.ndarray) -> float:
     """Draw the two sides of a predicate; return the height at the deciding instant."""
     setting, signals, _, _ = prepare(node.formula, explanation.trace, hard, "hold", None)
-    evaluator = Evaluator(signals, setting.length, setting.dt, truths=setting.truths)
+    evaluator = evaluator_of(setting, signals, None, None, 0)
     last = setting.length - 1
 
     def side(e: Term) -> np.ndarray:

@@ -18,7 +18,7 @@ import numpy as np
 from verifai_jax.addons.monitoring.margins import Margins, Step
 from verifai_jax.mtl.expression import CONSTANT
 from verifai_jax.mtl.host_values import FUNCTIONS
-from verifai_jax.mtl.streams import Count, Op, Plan
+from verifai_jax.mtl.streams import Op, Plan
 
 Memory = list[float]
 Join = Callable[[float, float], float]
@@ -37,8 +37,7 @@ class PythonMachine:
         # By what unknown margins are taken for; the bounds are there from the first of them on.
         self._streams: dict[float | None, _Stream] = {None: now}
         self._counts = [
-            _counted(count, PythonMachine(count.plan, own), own_columns)
-            for count, (own, own_columns) in zip(plan.counts, front.counts, strict=True)
+            _counted(PythonMachine(inner, own), columns) for inner, own, columns in front.counts
         ]
         # What is counted follows the columns of a sample.
         first = {"column": 0, "count": len(front.columns)}
@@ -160,7 +159,7 @@ def _begun(op: Op, memory: Memory, index: int, x: float) -> float:
     return x if index >= 0 else op.number
 
 
-def _delay(op: Op, memory: Memory, index: int, x: float) -> float:
+def _delayed(op: Op, memory: Memory, index: int, x: float) -> float:
     k = int(memory[-1])
     before, memory[k] = memory[k], x
     memory[-1] = k + 1 if k + 1 < op.n else 0
@@ -237,7 +236,7 @@ def _reach(op: Op, memory: Memory, index: int, f: float, g: float) -> float:
 
 
 _STEPS: dict[str, Callable[..., float]] = {
-    "leaf": _number, "number": _number, "join": _join, "begun": _begun, "delay": _delay,
+    "leaf": _number, "number": _number, "join": _join, "begun": _begun, "delay": _delayed,
     "window": _window, "until": _pairs, "since": _pairs, "running": _running, "recur": _recur,
     "accumulate": _accumulate, "reach": _reach,
 }  # fmt: skip
@@ -246,23 +245,41 @@ _STEPS: dict[str, Callable[..., float]] = {
 # Margins
 
 
-def _counted(
-    count: Count, machine: PythonMachine, columns: Sequence[int]
-) -> Callable[[Sequence[float]], float]:
-    """Return the function that counts the seconds in which a formula held, sample by sample."""
-    last = deque([-1.0] * count.n, maxlen=count.n)
-    held = unknown = 0
+def _counted(machine: PythonMachine, columns: Sequence[int]) -> Callable[[Sequence[float]], float]:
+    """Return the function that tells, sample by sample, whether a formula holds: 1, 0 or NaN."""
 
-    def seconds(x: Sequence[float]) -> float:
-        nonlocal held, unknown
+    def holds(x: Sequence[float]) -> float:
         machine.step([x[k] for k in columns])
-        (now,), before = machine.out, last[0]
-        last.append(now)
-        held += (now > 0) - (before > 0)
-        unknown += (now != now) - (before != before)
-        return math.nan if unknown else held * count.dt
+        (now,) = machine.out
+        return now if now != now else float(now > 0)
 
-    return seconds
+    return holds
+
+
+def _delay(n: int, held: bool) -> Callable[[float], float]:
+    """Return the function that gives what it was given `n` samples ago."""
+    last: deque[float] = deque(maxlen=n)
+
+    def before(x: float) -> float:
+        if not last:
+            last.extend([x if held else 0.0] * n)
+        ago = last[0]
+        last.append(x)
+        return ago
+
+    return before
+
+
+def _latest() -> Callable[[float, float], float]:
+    """Return the function that keeps a value from one event to the next."""
+    kept: list[float] = []
+
+    def latest(event: float, x: float) -> float:
+        if event != event or event > 0 or not kept:
+            kept[:] = [event if event != event else x]
+        return kept[0]
+
+    return latest
 
 
 def _operation(step: Step) -> Callable[..., float]:
@@ -278,6 +295,10 @@ def _operation(step: Step) -> Callable[..., float]:
             return lambda x: x if x != x else 1.0 if x > 0 or (at_zero and x == 0) else -1.0
         case "norm":
             return _norm
+        case "delay" | "lag":
+            return _delay(int(step.number), step.kind == "lag")
+        case "latest":
+            return _latest()
     return _safe(step.kind)
 
 

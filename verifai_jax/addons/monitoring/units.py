@@ -7,8 +7,9 @@ unit_of(term, units, faults)                            # 'm', and what does not
 import re
 from collections.abc import Iterable, Mapping
 
-from verifai_jax.mtl.expression import Arithmetic, Component, Duration, Signal
-from verifai_jax.mtl.formula import Term
+from verifai_jax.mtl.expression import Arithmetic, Component, Signal
+from verifai_jax.mtl.formula import Formula, Term
+from verifai_jax.mtl.sampled import Sampled
 
 IN_NAME = re.compile(r"[(\[]\s*([^()\[\]\d][^()\[\]]*?)\s*[)\]]\s*$")
 """A unit in brackets at the end of a signal's name."""
@@ -56,8 +57,8 @@ def unit_of(e: Term, units: Mapping[str, str], faults: list[str]) -> str | None:
     - `faults`: a list that receives a sentence on each sum of two units, and on a sine of degrees.
     """
     match e:
-        case Duration():
-            return "s"
+        case Sampled():
+            return _unit_of_sampled(e, units, faults)
         case Signal(name):
             return units.get(name)
         case Component(vector, _):
@@ -72,3 +73,12 @@ def unit_of(e: Term, units: Mapping[str, str], faults: list[str]) -> str | None:
                     faults.append(f"{e} computes with {' and '.join(known)} together")
                 return known[0] if len(known) == 1 else None
     return None
+
+
+def _unit_of_sampled(e: Sampled, units: Mapping[str, str], faults: list[str]) -> str | None:
+    if e.function == "duration":
+        return "s"
+    inner = [unit_of(each, units, faults) for each in e.operands if not isinstance(each, Formula)]
+    if e.function == "rate" and inner[0]:
+        return f"{inner[0]}^2" if inner[0].endswith("/s") else f"{inner[0]}/s"
+    return inner[-1] if inner else None

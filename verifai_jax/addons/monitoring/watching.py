@@ -22,6 +22,7 @@ from jaxtyping import Float
 from verifai_jax.addons.monitoring.c_monitor import HEAD, HELPERS, monitor_code
 from verifai_jax.addons.monitoring.margins import ALONE, Margins, margins
 from verifai_jax.addons.monitoring.python_machine import PythonMachine
+from verifai_jax.addons.monitoring.quantities import completed
 from verifai_jax.addons.native.native_code.machine_code import Unavailable, compiler, load_library
 from verifai_jax.core.messages.errors import missing_name
 from verifai_jax.core.values.gaps import has_truths, with_gaps
@@ -229,16 +230,18 @@ def _number(column: str, sample: Mapping[str, Any], index: int | None) -> float:
 @overload
 def watch(
     formulas: Formula | str, dt: float, *, semantics: Semantics = ..., every: bool = ...,
-    sizes: Mapping[str, int] | None = ...,
+    sizes: Mapping[str, int] | None = ..., units: Mapping[str, str] | None = ...,
 ) -> Watch[float]: ...  # fmt: skip
 @overload
 def watch(
     formulas: Mapping[str, Formula | str], dt: float, *, semantics: Semantics = ...,
     every: bool = ..., sizes: Mapping[str, int] | None = ...,
+    units: Mapping[str, str] | None = ...,
 ) -> Watch[dict[str, float]]: ...  # fmt: skip
 def watch(
     formulas: Formula | str | Mapping[str, Formula | str], dt: float, *,
     semantics: Semantics = hard, every: bool = False, sizes: Mapping[str, int] | None = None,
+    units: Mapping[str, str] | None = None,
 ) -> "Watch[float] | Watch[dict[str, float]]":  # fmt: skip
     """Monitor one formula, or several by name, on samples `dt` seconds apart.
 
@@ -249,13 +252,15 @@ def watch(
     - `semantics`: `hard`, or `boolean`: 1 if a formula holds and -1 if not.
     - `every`: whether each formula is evaluated at every instant, not only at time 0. No formula
       may then look ahead without bound.
-    - `sizes`: number of components of each signal whose norm the formulas use.
+    - `sizes`: number of components of each signal whose norm, or all of whose elements, the
+      formulas use.
+    - `units`: units of signals that are compared with quantities such as `130 km/h`.
     **Returns:** a monitor; its results are numbers, or dictionaries for several formulas.
     **Raises:** `IntervalError` for an interval that is not a multiple of `dt`; `ValueError` for
     smooth semantics, for an unbounded future operator inside another temporal operator, and for a
-    norm without a size.
+    norm without a size, and for a signal without a unit that is compared with a quantity.
     """
-    plan = streams(formulas, dt, semantics, every)
+    plan = streams(completed(formulas, units, sizes), dt, semantics, every)
     front = margins(plan, sizes or {}, apart=True)
     if not isinstance(formulas, Mapping):
         return Watch(plan, front, lambda out: out[0])

@@ -24,8 +24,8 @@ from verifai_jax.addons.native.native_code.machine_code import Unavailable, comp
 from verifai_jax.core.compute.compilation import Slot
 from verifai_jax.evaluation.engine import FIRST, Engine, Wanted
 from verifai_jax.evaluation.verdicts import Verdicts
-from verifai_jax.mtl.expression import durations_in
 from verifai_jax.mtl.formula import Formula
+from verifai_jax.mtl.sampled import sampled_in
 from verifai_jax.mtl.tree import Term, postorder
 
 if TYPE_CHECKING:
@@ -236,7 +236,7 @@ def _greatest(formula: Formula) -> float:
     Rounding is relative to what is compared, and adds up over time. It is infinite where samples
     are counted: whether one counts may be decided by rounding.
     """
-    if durations_in(formula):
+    if sampled_in(formula):
         return math.inf
     numbers = [node.number or 0.0 for node in postorder(formula) if isinstance(node, Term)]
     reach = filter(math.isfinite, (formula.horizon(), formula.history()))

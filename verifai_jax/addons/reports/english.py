@@ -9,8 +9,9 @@ import math
 
 from verifai_jax.core.messages.text import format_seconds
 from verifai_jax.mtl import formula as ast
-from verifai_jax.mtl.expression import Duration
 from verifai_jax.mtl.formula import Formula, Interval, Term, surface
+from verifai_jax.mtl.sampled import Sampled, window_text
+from verifai_jax.mtl.tree import postorder
 from verifai_jax.mtl.words import COMPARISONS, OPERATORS
 
 
@@ -40,15 +41,31 @@ def _words(formula: Formula, inner: bool) -> str:
 
 
 def _term(e: Term) -> str:
-    if not isinstance(e, Duration):
-        return str(e)
-    counted = _words(e.operand, inner=True)
-    return f"the number of seconds of the last {format_seconds(e.window)} in which {counted}"
+    if not isinstance(e, Sampled):
+        text = str(e)
+        for part in postorder(e):
+            text = (
+                text.replace(str(part), f"({_term(part)})") if isinstance(part, Sampled) else text
+            )
+        return text
+    parts = (
+        _words(part, inner=True) if isinstance(part, Formula) else _term(part)
+        for part in e.operands
+    )
+    window = e.window
+    if window is not None and window_text(window)[0].isdigit():
+        span = f"the last {format_seconds(window.end)}"
+    else:
+        span = "" if window is None else f"the time{_when(window, 'back').removeprefix(',')}"
+    return e.english.format(*parts, window=span)
 
 
 def _when(interval: Interval, side: str) -> str:
     start, endless = format_seconds(interval.start), interval.end == math.inf
     end = "" if endless else f"to {format_seconds(interval.end)}"
+    ends = ((start, interval.open_start), (format_seconds(interval.end), interval.open_end))
+    without = " and ".join(text for text, is_open in ends if is_open)
+    without = f" (without {without})" if without else ""
     if side == "back":
-        return f", {start} {'ago or earlier' if endless else f'{end} ago'}"
-    return f" from {start} {'on' if endless else end}"
+        return f", {start} {'ago or earlier' if endless else f'{end} ago'}{without}"
+    return f" from {start} {'on' if endless else end}{without}"

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 from jaxtyping import PyTree
 
 from verifai_jax.addons.verification.sets import flow
-from verifai_jax.mtl.expression import about_single_samples
+from verifai_jax.mtl.sampled import about_single_samples
 from verifai_jax.problem.problem import Problem, ProblemError
 from verifai_jax.systems.ode.closed_loop import Ode, substep
 from verifai_jax.systems.pytree_checks import default_signals

@@ -6,9 +6,9 @@
     with SimulationProgress("cartpole", budget, show=None) as progress:
         progress.update(simulations, counterexamples, best)
 
-Rich draws a line on the error stream, on a terminal or in a notebook that has ipywidgets.
-Elsewhere, such as in a pipe, a line is written once a minute. A call inside another one takes over
-its line while it runs.
+Rich draws a line on the error stream, on a terminal or in a notebook that has ipywidgets. In
+another notebook a line is written over every second; elsewhere, such as in a pipe, one is written a
+minute. A call inside another one takes over its line while it runs.
 """
 
 import contextlib
@@ -154,10 +154,16 @@ class ProgressBar:
         self._display.start()
 
     def _write_lines(self) -> None:
-        stream = _Stream()
-        while not self._over.wait(EVERY):
+        stream, width = _Stream(), 0
+        within = "ipykernel" in sys.modules  # A notebook has one line, which is written over.
+        while not self._over.wait(1.0 if within else EVERY):
             for stage in self._stages[-1:]:
-                write_line(stage.line(_compiling()), stream)
+                line = printable(stage.line(_compiling()))
+                width = max(width, len(line))
+                stream.write(f"\r{line:{width}}" if within else f"{line}\n")
+                stream.flush()
+        if within and width:
+            stream.write(f"\r{'':{width}}\r")
 
     def begin(self, name: str, total: float | None, unit: str) -> None:
         """Begin a stage of `total` units of work, None if unknown; stages may be nested."""

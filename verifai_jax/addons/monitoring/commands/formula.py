@@ -1,7 +1,8 @@
-"""`verifai-jax formula lint "always speed < 30" logs/`: checks for mistakes in a formula."""
+"""`verifai-jax lint requirements.toml brakes.toml logs/`: checks for mistakes in formulas."""
 
+import dataclasses
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import click
 
@@ -12,6 +13,8 @@ from verifai_jax.cli.arguments import PATH, option
 from verifai_jax.cli.gates import Gate, check_gate, fail_on
 from verifai_jax.cli.json_output import command, give_result, say, show_result
 
+if TYPE_CHECKING:
+    from verifai_jax.addons.monitoring import Requirement
 End = Literal["hold", "truncate"]
 FILES = click.argument("recordings", metavar="[RECORDING]...", nargs=-1, type=PATH)
 """Recordings: files, or folders of them."""
@@ -34,24 +37,49 @@ def formula() -> None:
 
 
 @command()
-@click.argument("formula")
-@FILES
+@click.argument("files", metavar="FILE...", nargs=-1, required=True)
+@option("--on", "recordings", multiple=True, type=PATH, help="A recording, or a folder of them.")
 @option("--unit", "units", multiple=True, metavar="SIGNAL=UNIT", help="Unit of a signal.")
 @ASKED
 @fail_on(finding="if anything is suspicious")
 def lint(
-    formula: str, recordings: tuple[Path, ...], units: tuple[str, ...], problem: str | None,
-    end: End, constants: tuple[str, ...], definitions: tuple[str, ...], fail_on: Gate | None,
+    files: tuple[str, ...], recordings: tuple[Path, ...], units: tuple[str, ...],
+    problem: str | None, end: End, constants: tuple[str, ...], definitions: tuple[str, ...],
+    fail_on: Gate | None,
 ) -> None:  # fmt: skip
-    """Find what is suspicious about FORMULA, or a file of requirements: parts that never hold, are
-    never near, or have no effect, units that do not go together, windows beyond the recordings.
+    """Find requirements of all FILEs (or formulas) that contradict, repeat or imply each other, and
+    what is suspicious about each: parts that never hold, are never near, or have no effect, units
+    that do not go together, windows beyond the recordings. What is neither a formula nor a file of
+    requirements is a recording, as after --on.
     """
-    requirements = load_requirements(formula, *arguments.read_names(constants, definitions))
+    names = arguments.read_names(constants, definitions)
+    found: dict[str, Requirement] = {}
+    for file in files:
+        path = Path(file)
+        if path.exists() and not _has_requirements(path):
+            recordings = (*recordings, path)
+            continue
+        for each in load_requirements(file, *names):
+            name = each.id if each.id not in found else f"{each.id} ({file})"
+            while name in found:
+                name += "'"
+            found[name] = dataclasses.replace(each, id=name)
     named = dict(arguments.split_pairs("--unit", units))
-    found = vj.mtl.lint(requirements, _signals(recordings, problem), units=named, end=end)
-    show_result(found, None, "recordings", "unread")
-    give_result(findings=[finding._asdict() for finding in found])
-    check_gate(fail_on, {"finding": bool(found)})
+    signals = _signals(recordings, problem)
+    result = vj.mtl.lint(list(found.values()), signals, units=named, end=end)
+    show_result(result, None, "recordings", "unread", "not_searched")
+    give_result(findings=[finding._asdict() for finding in result])
+    check_gate(fail_on, {"finding": bool(result)})
+
+
+def _has_requirements(path: Path) -> bool:
+    """Return whether a file has requirements; a table has, if one of its columns has formulas."""
+    from verifai_jax.addons.monitoring.requirement_files import ENDINGS
+
+    if path.suffix.lower() != ".csv":
+        return path.suffix.lower() in ENDINGS
+    with path.open(encoding="utf-8", errors="replace") as file:
+        return "formula" in file.readline().lower()
 
 
 @command()
