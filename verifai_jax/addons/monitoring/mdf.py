@@ -1,0 +1,183 @@
+"""MDF, the recordings of cars, by the package `asammdf`; frames of a CAN bus by a DBC file.
+
+A channel with a table of texts has its words (`Gear == "DRIVE"`) and, where it has no text, its
+number. No formula of a file is evaluated unless it is plain arithmetic, since the package would
+hand it to Python's interpreter.
+"""
+
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from verifai_jax.addons.monitoring.columns import LeftOut
+from verifai_jax.addons.monitoring.containers import EXTRA, Table, table_of_arrays
+from verifai_jax.addons.monitoring.enumerations import word_columns
+from verifai_jax.addons.monitoring.readers import Asked
+from verifai_jax.core.messages.errors import require
+from verifai_jax.core.messages.text import format_error, one_line
+from verifai_jax.core.store.foreign_archives import check_values
+from verifai_jax.core.store.foreign_files import MAX_BYTES, decoded, open_file, read_bytes
+
+FRAMES = "CAN_DataFrame"
+"""The channel of the frames of a CAN bus."""
+PLAIN = re.compile(
+    r"(?:X1?\b|\d+(?:\.\d*)?(?:[eE][-+]?\d{1,3})?|[-+/() ]|\*(?!\*)|sqrt|sin|cos|tan|exp|log)+"
+)
+"""Formulas that are plain arithmetic; a power of powers would never end."""
+LINEAR, FORMULA, TEXTS = (0, 1, 2, 4, 5, 6), 3, (7, 8)
+"""Conversions of MDF 4: by numbers alone, by a formula, and by a table of texts."""
+MAX_RATIO = 2000
+"""Maximum ratio by which a block of data unpacks."""
+Unread = (ValueError, TypeError, KeyError, IndexError, ArithmeticError, AttributeError, OSError)
+
+
+class Channel(NamedTuple):
+    """A channel of a group: its samples, their times, and what they mean."""
+
+    group: str
+    name: str
+    samples: np.ndarray
+    times: np.ndarray
+    unit: str
+    conversion: Any
+
+
+def read_mdf(path: Path, asked: Asked) -> list[Table]:
+    """Read the channels of an MDF file, each group with its own clock."""
+    asammdf, channels, busy = require("asammdf", EXTRA), list[Channel](), False
+    with open_file(path, MAX_BYTES) as file:
+        opened = asammdf.MDF(file)
+        try:
+            if opened.version < "4":
+                raise ValueError(f"it has version {opened.version}; versions from 4.0 are read")
+            busy = any(each.name == FRAMES for g in opened.groups for each in g.channels)
+            channels += _channels(opened, asked.notes)
+            for database in asked.databases if busy else ():
+                channels += _decoded_frames(opened, database, asked.notes)
+        finally:
+            opened.close()
+    if busy and not asked.databases:
+        said = f"{FRAMES}: frames of a CAN bus are read with their database, as in dbc='car.dbc'"
+        asked.notes[LeftOut(said, FRAMES)] = 1
+    names = [channel.name for channel in channels]
+    groups: dict[tuple[str, bytes], list[tuple[str, Channel]]] = {}
+    for channel in channels:
+        alone = names.count(channel.name) == 1
+        name = channel.name if alone else f"{channel.group}.{channel.name}"
+        key = channel.group, channel.times.tobytes()
+        groups.setdefault(key, []).append((name, channel))
+    return [_table(members, asked) for members in groups.values()]
+
+
+def _table(members: list[tuple[str, Channel]], asked: Asked) -> Table:
+    columns, units = {asked.time: members[0][1].times}, {asked.time: "s"}
+    for name, channel in members:
+        try:
+            found = _converted(name, channel)
+        except Unread as error:
+            asked.notes[LeftOut(f"channel {name!r} is left out: {error}", name)] = 1
+            continue
+        columns |= found
+        units[name] = channel.unit
+    return table_of_arrays(columns, asked.time, asked.notes, units)
+
+
+def _channels(opened: Any, notes: dict[str, int], frames: bool = False) -> Iterator[Channel]:
+    """Yield the channels of all groups, unconverted."""
+    for index, group in enumerate(opened.groups):
+        about, master = group.channel_group, opened.masters_db.get(index)
+        check_values(about.cycles_nr * max(1, len(group.channels)), f"group {index}")
+        for block in group.get_data_blocks():
+            if block.original_size > MAX_RATIO * max(block.compressed_size or 0, 1):
+                raise ValueError(f"a block of group {index} unpacks to {block.original_size} bytes")
+        for at, each in enumerate(group.channels):
+            if at == master or each.name.partition(".")[0] == FRAMES:
+                continue
+            try:
+                found = opened.get(group=index, index=at, raw=True)
+            except Exception as error:  # The package raises what it likes.
+                why = one_line(format_error(error))
+                notes[LeftOut(f"channel {each.name!r} cannot be read: {why}", each.name)] = 1
+                continue
+            name = about.acq_name or f"group_{index}"
+            if frames and (message := re.search(r"message (\S+) 0x", about.comment or "")):
+                name = message[1]
+            own = found.samples, found.timestamps, found.unit or "", found.conversion
+            yield Channel(name, each.name, *own)
+
+
+def _decoded_frames(opened: Any, database: Path, notes: dict[str, int]) -> list[Channel]:
+    """Return the signals of frames as a DBC file describes them."""
+    if database.suffix.lower() != ".dbc":
+        raise ValueError(f"a database of a CAN bus is a .dbc file; got {database.name}")
+    text, note = decoded(database, read_bytes(database))
+    notes |= {note: 1} if note else {}
+    formats = require("canmatrix.formats", EXTRA)
+    try:
+        # The import type is fixed: formats of spreadsheets would run code of their cells.
+        loaded = formats.loads(text.encode(), import_type="dbc", dbcImportEncoding="utf-8")
+        (matrix,) = loaded.values()
+        if not matrix.frames:
+            raise ValueError("it describes no message")
+    except Exception as error:
+        raise ValueError(f"{database} is no DBC file: {one_line(format_error(error))}") from None
+    buses = {"CAN": [(matrix, 0)]}
+    found = opened.extract_bus_logging(buses, ignore_value2text_conversion=True)
+    try:
+        channels = list(_channels(found, notes, frames=True))
+    finally:
+        found.close()
+    if not channels:
+        notes[f"no message of {database} was recorded"] = 1
+    return channels
+
+
+def _converted(name: str, channel: Channel) -> dict[str, np.ndarray]:
+    """Return the columns of a channel: its numbers, and whether it has each of its words."""
+    raw, conversion = channel.samples, channel.conversion
+    kind = None if conversion is None else conversion.conversion_type
+    if raw.dtype.names:
+        raise ValueError("it is a structure")
+    if raw.dtype.kind in "SUO":
+        words = [_text(each) for each in raw.tolist()]
+        return word_columns(name, words)
+    if conversion is None or kind not in TEXTS:
+        return {name: _numbers(raw, conversion)}
+    texts = conversion.referenced_blocks
+    rest: Any = texts.get("default_addr")
+    known: set[Any] = {v for k, v in texts.items() if k != "default_addr"}
+    if any(not isinstance(text, bytes) for text in known):
+        raise ValueError("its table of texts refers to other conversions")
+    if not hasattr(rest, "conversion_type"):
+        known, rest = {*known, *([rest] if isinstance(rest, bytes) and rest else [])}, None
+    else:
+        _numbers(raw[:1], rest)  # Refused before the package would evaluate it.
+    given = [each if each in known else None for each in conversion.convert(raw).tolist()]
+    gaps = np.array([each is not None for each in given])
+    numbers = np.asarray(_numbers(raw, rest), float)
+    numbers = numbers if gaps.all() else np.where(gaps, np.nan, numbers)
+    if not gaps.any():
+        return {name: numbers}
+    words = [None if each is None else _text(each) for each in given]
+    return {name: numbers, **word_columns(name, words, (~gaps).tolist())}
+
+
+def _numbers(raw: np.ndarray, conversion: Any) -> np.ndarray:
+    """Convert by numbers alone, or by a formula that is plain arithmetic."""
+    if conversion is None:
+        return raw
+    kind = conversion.conversion_type
+    if kind == FORMULA and not (
+        len(conversion.formula) < 200 and PLAIN.fullmatch(conversion.formula)
+    ):
+        raise ValueError(f"its formula {one_line(conversion.formula, 40)!r} is not evaluated")
+    if kind not in (*LINEAR, FORMULA):
+        raise ValueError("its conversion is not one of numbers")
+    return np.asarray(conversion.convert(raw))
+
+
+def _text(cell: Any) -> str:
+    return (cell.decode("utf-8", "replace") if isinstance(cell, bytes) else str(cell)).strip("\0 ")
