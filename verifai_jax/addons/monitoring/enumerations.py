@@ -28,7 +28,7 @@ def word_columns(
     Words such as `ON` and `OFF` alone are the truth values of the column itself.
 
     **Arguments:**
-    - `other`: the cells that have a value, which is no word; all others without one are gaps.
+    - `other`: for a column whose words are known to be values, which cells have another value.
     **Raises:** `ValueError` for a column that has numbers, too many or too long words, or none.
     """
     words = np.array([(cell or "").strip() for cell in cells], object)
@@ -37,7 +37,7 @@ def word_columns(
     distinct = sorted(set(words[given].tolist()))
     fits = 0 < len(distinct) <= MAX_WORDS and max(map(len, distinct)) <= MAX_LENGTH
     # Words of which none comes twice are remarks.
-    fits = fits and len(distinct) < given.sum()
+    fits = fits and (other is not None or len(distinct) < given.sum())
     if not fits or any(reads_as_number(word) for word in distinct):
         raise ValueError(f"column {name!r} has no words that can be values")
 

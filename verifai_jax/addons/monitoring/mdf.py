@@ -27,7 +27,7 @@ PLAIN = re.compile(
     r"(?:X1?\b|\d+(?:\.\d*)?(?:[eE][-+]?\d{1,3})?|[-+/() ]|\*(?!\*)|sqrt|sin|cos|tan|exp|log)+"
 )
 """Formulas that are plain arithmetic; a power of powers would never end."""
-LINEAR, FORMULA, TEXTS = (0, 1, 2, 4, 5, 6), 3, (7, 8)
+LINEAR, FORMULA, TEXTS, RANGES = (0, 1, 2, 4, 5, 6), 3, (7, 8), 8
 """Conversions of MDF 4: by numbers alone, by a formula, and by a table of texts."""
 MAX_RATIO = 2000
 """Maximum ratio by which a block of data unpacks."""
@@ -146,23 +146,35 @@ def _converted(name: str, channel: Channel) -> dict[str, np.ndarray]:
         return word_columns(name, words)
     if conversion is None or kind not in TEXTS:
         return {name: _numbers(raw, conversion)}
-    texts = conversion.referenced_blocks
-    rest: Any = texts.get("default_addr")
-    known: set[Any] = {v for k, v in texts.items() if k != "default_addr"}
-    if any(not isinstance(text, bytes) for text in known):
-        raise ValueError("its table of texts refers to other conversions")
-    if not hasattr(rest, "conversion_type"):
-        known, rest = {*known, *([rest] if isinstance(rest, bytes) and rest else [])}, None
-    else:
-        _numbers(raw[:1], rest)  # Refused before the package would evaluate it.
-    given = [each if each in known else None for each in conversion.convert(raw).tolist()]
-    gaps = np.array([each is not None for each in given])
-    numbers = np.asarray(_numbers(raw, rest), float)
-    numbers = numbers if gaps.all() else np.where(gaps, np.nan, numbers)
-    if not gaps.any():
+    words = _looked_up(raw, conversion)
+    rest = conversion.referenced_blocks.get("default_addr")
+    if isinstance(rest, bytes | None):
+        words[words == ""] = _text(rest or b"")
+        rest = None
+    numbers, worded = np.asarray(_numbers(raw, rest), float), words != ""
+    if not worded.any():
         return {name: numbers}
-    words = [None if each is None else _text(each) for each in given]
-    return {name: numbers, **word_columns(name, words, (~gaps).tolist())}
+    numbers = numbers if worded.all() else np.where(worded, np.nan, numbers)
+    return {name: numbers, **word_columns(name, words.tolist(), (~worded).tolist())}
+
+
+def _looked_up(raw: np.ndarray, conversion: Any) -> np.ndarray:
+    """Return the text of each number by a table of texts, empty where there is none."""
+    words, ranges = np.full(len(raw), "", object), conversion.conversion_type == RANGES
+    blocks = conversion.referenced_blocks
+    for index in range(len(blocks) - 1):
+        text = blocks[f"text_{index}"]
+        if not isinstance(text, bytes):
+            raise ValueError("its table of texts refers to other conversions")
+        low, high = (
+            (conversion[f"{end}_{index}"] for end in ("lower", "upper"))
+            if ranges
+            else (conversion[f"val_{index}"],) * 2
+        )
+        below = raw < high if ranges and raw.dtype.kind == "f" else raw <= high
+        hit = (raw >= low) & (below | (raw == low))
+        words[hit & (words == "")] = _text(text)
+    return words
 
 
 def _numbers(raw: np.ndarray, conversion: Any) -> np.ndarray:

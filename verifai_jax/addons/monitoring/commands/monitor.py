@@ -86,6 +86,7 @@ def monitor(
     import jax
 
     from verifai_jax.addons.monitoring.columns import LeftOut
+    from verifai_jax.addons.monitoring.enumerations import with_words
     from verifai_jax.addons.monitoring.judging import Reading, finder
     from verifai_jax.mtl.setting import check_signals
 
@@ -138,7 +139,7 @@ def monitor(
         give_result(formula=str(parsed), holds=holds)
         check_gate(fail_on, {"violation": not holds, "incomplete": not holds})
         return
-    trace = _read(file, reading)
+    (parsed,), trace = with_words([parsed], _read(file, reading))
     check_signals(parsed, trace, str(file))
     period, method = reading.resample_to, reading.method
     even = vj.mtl.resample(trace, period, method) if period and method else trace
