@@ -141,7 +141,9 @@ def test_channels_and_frames_of_mdf(tmp_path):
     np.testing.assert_allclose(trace["Speed"][::2], speed)  # "not available" is a gap
     np.testing.assert_allclose(trace["Angle"][1::2], 2.0 * k[1::2] - 5, atol=1e-9)
     np.testing.assert_array_equal(trace["Motion.Gear=REVERSE"][::2], k[::2] // 2 % 3 == 2)
-    assert verdict('eventually Motion.Gear == "DRIVE"', path, dbc=tmp_path / "car.dbc")
+    row = verdict('always[1, 2] Motion.Gear != "DRIVE"', path, dbc=tmp_path / "car.dbc",
+                  method="hold")  # fmt: skip
+    assert (row.verdict, row.robustness) == ("fails", -1.0)
     (tmp_path / "car.dbc").write_text("no database")
     with pytest.raises(ValueError, match=r"car\.dbc is no DBC file"):
         read(path, dbc=tmp_path / "car.dbc")
@@ -238,7 +240,7 @@ def test_words_sentinels_and_stamps_on_request(tmp_path):
                  "hold", "--sort-times", "--repeated", "last", "--time-unit", "s"]  # fmt: skip
     said = CliRunner().invoke(main, arguments)
     assert "fails with robustness -1" in said.output, said.output
-    with unchecked(), pytest.raises(ValueError, match="unknown kind of stamps .logs."):
+    with unchecked(), pytest.raises(ValueError, match=r"unknown kind of stamps .logs."):
         read(path, stamps="logs")
 
 
