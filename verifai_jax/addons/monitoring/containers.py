@@ -6,21 +6,18 @@ names its column of times. Nothing in a file is unpickled.
 
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from verifai_jax.addons.monitoring.columns import LeftOut
+from verifai_jax.addons.monitoring.readers import Asked, Table
 from verifai_jax.addons.monitoring.stamps import find_clock, unit_in_name
 from verifai_jax.core.messages.errors import require
 from verifai_jax.core.store.foreign_archives import check_values
 from verifai_jax.core.store.foreign_archives import read_parquet as read_parquet_file
 from verifai_jax.core.store.foreign_files import open_file
 
-if TYPE_CHECKING:
-    from verifai_jax.addons.monitoring.readers import Asked
-Table: TypeAlias = Any
-"""An Arrow table, whose package has no types."""
 EXTRA = "recordings"
 UNIT = b"unit"
 """Key of Arrow's metadata of a field under which its unit stands."""
@@ -85,7 +82,7 @@ def table_of_arrays(
     return table_of(columns, units)
 
 
-def read_dataset(path: Path, asked: "Asked") -> list[Table]:
+def read_dataset(path: Path, asked: Asked) -> list[Table]:
     """Read the variables of a NetCDF file or a Zarr store as one table for each first dimension.
 
     **Raises:** `MissingExtra`; `ValueError` for a file that cannot be read.
@@ -122,7 +119,7 @@ def _dimensions(dataset: Any, time: str, notes: dict[str, int]) -> Iterator[Tabl
         yield table_of_arrays({**clock, **own}, time if clock else None, notes, {**units, **said})
 
 
-def read_hdf5(path: Path, asked: "Asked") -> list[Table]:
+def read_hdf5(path: Path, asked: Asked) -> list[Table]:
     """Read the data sets of an HDF5 file, each with the times of the nearest enclosing group.
 
     MATLAB stores the transposes of its arrays.
@@ -155,7 +152,7 @@ def read_hdf5(path: Path, asked: "Asked") -> list[Table]:
 
 
 def tables_of_groups(
-    found: Mapping[str, np.ndarray], units: Mapping[str, str], asked: "Asked"
+    found: Mapping[str, np.ndarray], units: Mapping[str, str], asked: Asked
 ) -> list[Table]:
     """Return arrays by name as tables, each with the times of the nearest enclosing group.
 
@@ -195,7 +192,7 @@ def episodes_of(files: Sequence[Path]) -> Iterator[Episode]:
         yield from (Episode(file, number) for number in sorted(numbers.to_pylist()))
 
 
-def read_columns(path: Path, asked: "Asked") -> list[Table]:
+def read_columns(path: Path, asked: Asked) -> list[Table]:
     """Read a Parquet file; for a LeRobot data set one episode, with its own time stamps.
 
     **Raises:** `ValueError` for a file of several episodes if none is named, and for an episode

@@ -13,19 +13,20 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from importlib import import_module
 from pathlib import Path
-from typing import Literal, TypeAlias
+from typing import Any, Literal, TypeAlias
 
-from verifai_jax.addons.monitoring.containers import Table
 from verifai_jax.core.display.extensions import extension, extensions
 from verifai_jax.core.messages.errors import MissingExtra
 from verifai_jax.core.messages.text import format_error
 
+Table: TypeAlias = Any
+"""An Arrow table, whose package has no types."""
 Stamps: TypeAlias = Literal["log", "header"]
 
 
 @dataclass(frozen=True)
 class Asked:
-    """What a reader is asked for.
+    """Options of a reader of recordings.
 
     **Arguments:**
     - `time`: the name of the column of sample times, which `find_clock` looks for; a table whose
@@ -79,8 +80,8 @@ def read_tables(path: Path, asked: Asked) -> list[Table]:
     """
     ending = ending_of(path)
     if ending is None:
-        *most, last = endings()
-        raise ValueError(f"a recording is a {', '.join(most)} or {last} file; got {path.name}")
+        *others, last = endings()
+        raise ValueError(f"a recording is a {', '.join(others)} or {last} file; got {path.name}")
     if asked.episode is not None and ending != ".parquet":
         raise ValueError(f"episodes are those of a LeRobot data set; {path.name} has none")
     module, _, name = OURS.get(ending, "").partition(":")

@@ -224,7 +224,7 @@ def treated(trace: Trace, max_gap: float | None, missing: Treatment) -> Trace:
                 gone = array == way
                 if gone.any():
                     signals[name] = np.where(gone, np.nan, array)
-                    notes[f"signal {name!r} has {gone.sum()} of {way:g}: no value there"] = 1
+                    notes[f"signal {name!r} has {gone.sum()} of {way:zg}: no value there"] = 1
             elif way is not None and not is_number(way):
                 raise ValueError(f"missing is a way to treat a gap or a number; got {way!r}")
     if notes.keys() != trace.notes.keys():

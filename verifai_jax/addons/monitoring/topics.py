@@ -200,9 +200,9 @@ def _by_header(
 
 def _header_stamp(topic: str, row: Mapping[str, Any]) -> int:
     """Return when a message was measured, in ns since 1970; 0 for one that does not say it."""
-    for place in STAMPS:
+    for stamp in STAMPS:
         parts = [
-            next((row[n] for each in names if (n := f"{topic}.{place}.{each}") in row), None)
+            next((row[n] for each in names if (n := f"{topic}.{stamp}.{each}") in row), None)
             for names in (SECONDS, NANOSECONDS)
         ]
         if parts[0] is not None:
