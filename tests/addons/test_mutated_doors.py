@@ -157,6 +157,8 @@ def write_claims(path):
 DOORS = {
     "ppo.zip": (None, load),
     "mlp.onnx": (None, load),
+    "forest.onnx": (None, load),
+    "quantised_dynamic.onnx": (None, load),
     "mlp.pt": (None, load),
     "mlp.safetensors": (None, load),
     "drive.csv": (lambda path: pd.DataFrame(columns()).to_csv(path, index=False), read),
