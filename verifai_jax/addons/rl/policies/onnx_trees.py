@@ -84,12 +84,12 @@ def _leaves(node: Node, x: Array, kind: str) -> tuple[Array, np.ndarray]:
                     "has a branch to a node that is not there")  # fmt: skip
         after.append(np.where(leaf, own, [n or 0 for n in to]))
     roots = np.setdiff1d(own, np.concatenate([a[~leaf] for a in after]))
-    depth, front, trees = 0, roots, len({tree for tree, _ in keys})
-    while not leaf[front].all() or len(roots) != trees:
-        depth += 1
-        odd = depth > count or len(roots) != trees
-        node.refuse(odd, "has a tree that leads back to itself, or is in parts")
-        front = np.unique(np.concatenate([a[front] for a in after]))
+    depth, front, reached = 0, roots, np.isin(own, roots)
+    while not leaf[front].all() and depth <= count:
+        depth, front = depth + 1, np.unique(np.concatenate([a[front] for a in after]))
+        reached[front] = True
+    odd = depth > count or not reached.all() or len(roots) != len({tree for tree, _ in keys})
+    node.refuse(odd, "has a tree that leads back to itself, or is in parts")
     values = jnp.asarray(np.asarray(get("values"), np.float32))
     at = jnp.broadcast_to(jnp.asarray(roots), (len(x), len(roots)))
     kinds = {mode: jnp.asarray([each == mode for each in modes]) for mode in {*modes} & {*_GOES}}
