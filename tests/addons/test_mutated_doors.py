@@ -167,7 +167,7 @@ DOORS = {
     "drive.h5": (write_hdf5, read),
     "drive.nc": (write_netcdf, read),
     "drive.mcap": (write_mcap, read),
-    **{name: (write, read) for name, write in WRITERS.items()},
+    **{name: (write, read) for name, write in WRITERS.items() if name != "drive.mf4"},
     "watch.fmu": (lambda path: vj.mtl.export_fmu("x > 0", 0.1, path), read_description),
     "streets.yaml": (write_domain, read_odd),
     "estimate.json": (write_estimate, lambda path: str(read_result(path))),

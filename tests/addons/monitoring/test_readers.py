@@ -12,9 +12,10 @@ import pytest
 import recorded_files
 from checked_types import unchecked
 from click.testing import CliRunner
+from mutated import flipped, wrong_answers
 from recorded_files import START, columns, write_bag, write_mat, write_mdf, write_ulog
 
-from verifai_jax.addons.monitoring import readers, ros_bags
+from verifai_jax.addons.monitoring import mdf, readers, ros_bags
 from verifai_jax.addons.monitoring.containers import table_of
 from verifai_jax.addons.monitoring.recorded import named_recordings
 from verifai_jax.cli.main import main
@@ -156,6 +157,28 @@ def test_a_formula_of_mdf_is_not_evaluated(tmp_path, formula):
     trace = read(path)
     assert "root" not in trace.signals
     assert any("is not evaluated" in note for note in trace.notes)
+
+
+@pytest.mark.slow
+def test_mutated_mdf(tmp_path):
+    """A crash of the package's C code is an error that names the file."""
+    path = tmp_path / "car.mf4"
+    write_mdf(path)
+    content = path.read_bytes()
+    for seed in range(30):
+        path.write_bytes(flipped(content, np.random.default_rng(seed)))
+        assert not wrong_answers(lambda: read(path, dbc=tmp_path / "car.dbc")), seed
+
+
+def test_a_reader_of_mdf_that_dies_is_an_error(tmp_path, monkeypatch):
+    path = tmp_path / "car.mf4"
+    write_mdf(path)
+    monkeypatch.setattr(mdf, "__name__", "nothing")
+    with pytest.raises(ValueError, match=r"car\.mf4 is damaged, its reader died \(1\): .*nothing"):
+        read(path)
+    path.write_bytes(path.read_bytes()[:100])
+    with pytest.raises(ValueError, match=r"car\.mf4 is no file of MDF 4, or is cut"):
+        read(path)
 
 
 def test_variables_of_matlab(tmp_path):

@@ -5,7 +5,12 @@ number. No formula of a file is evaluated unless it is plain arithmetic, since t
 hand it to Python's interpreter.
 """
 
+import json
+import os
 import re
+import subprocess
+import sys
+import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -15,11 +20,18 @@ import numpy as np
 from verifai_jax.addons.monitoring.columns import LeftOut
 from verifai_jax.addons.monitoring.containers import EXTRA, Table, table_of_arrays
 from verifai_jax.addons.monitoring.enumerations import word_columns
+from verifai_jax.addons.monitoring.flat_files import read_feather
 from verifai_jax.addons.monitoring.readers import Asked
-from verifai_jax.core.messages.errors import require
+from verifai_jax.core.messages.errors import MissingExtra, require
 from verifai_jax.core.messages.text import format_error, one_line
 from verifai_jax.core.store.foreign_archives import check_values
-from verifai_jax.core.store.foreign_files import MAX_BYTES, decoded, open_file, read_bytes
+from verifai_jax.core.store.foreign_files import (
+    MAX_BYTES,
+    decoded,
+    open_file,
+    read_bytes,
+    read_json,
+)
 
 FRAMES = "CAN_DataFrame"
 """The channel of the frames of a CAN bus."""
@@ -29,8 +41,8 @@ PLAIN = re.compile(
 """Formulas that are plain arithmetic; a power of powers would never end."""
 LINEAR, FORMULA, TEXTS, RANGES = (0, 1, 2, 4, 5, 6), 3, (7, 8), 8
 """Conversions of MDF 4: by numbers alone, by a formula, and by a table of texts."""
-MAX_RATIO = 2000
-"""Maximum ratio by which a block of data unpacks."""
+MAX_MEMORY = 8 << 30
+"""Maximum bytes of memory of the process that reads, beside eight times the size of the file."""
 Unread = (ValueError, TypeError, KeyError, IndexError, ArithmeticError, AttributeError, OSError)
 
 
@@ -46,19 +58,66 @@ class Channel(NamedTuple):
 
 
 def read_mdf(path: Path, asked: Asked) -> list[Table]:
-    """Read the channels of an MDF file, each group with its own clock."""
-    asammdf, channels, busy = require("asammdf", EXTRA), list[Channel](), False
+    """Read the channels of an MDF file, each group with its own clock.
+
+    The package reads in a process of its own, since a damaged file may make its C code crash.
+    """
     with open_file(path, MAX_BYTES) as file:
-        opened = asammdf.MDF(file)
-        try:
-            if opened.version < "4":
-                raise ValueError(f"it has version {opened.version}; versions from 4.0 are read")
-            busy = any(each.name == FRAMES for g in opened.groups for each in g.channels)
-            channels += _channels(opened, asked.notes)
-            for database in asked.databases if busy else ():
-                channels += _decoded_frames(opened, database, asked.notes)
-        finally:
-            opened.close()
+        head = file.read(168)
+    if not head.startswith((b"MDF ", b"UnFinMF ")) or head[64:68] != b"##HD" or len(head) < 168:
+        raise ValueError(f"{path} is no file of MDF 4, or is cut")
+    paths = os.pathsep.join(each or os.getcwd() for each in sys.path)
+    command = [sys.executable, "-P", "-c", f"from {__name__} import main; main()", str(path)]
+    with tempfile.TemporaryDirectory(prefix="vj-mdf-") as made:
+        command += [made, asked.time, *map(str, asked.databases)]
+        environment = {**os.environ, "PYTHONPATH": paths}
+        done = subprocess.run(command, capture_output=True, env=environment, check=False)
+        about = Path(made, "about.json")
+        if not about.is_file():
+            said = one_line(done.stderr.decode("utf-8", "replace")[-300:])
+            raise ValueError(f"{path} is damaged, its reader died ({done.returncode}): {said}")
+        result = read_json(about)
+        if result["missing"]:
+            require("asammdf", EXTRA)
+        if result["error"]:
+            raise ValueError(result["error"])
+        for text, column in result["notes"]:
+            asked.notes[text if column is None else LeftOut(text, column)] = 1
+        files = [Path(made, f"{index}.feather") for index in range(result["tables"])]
+        return [table for file in files for table in read_feather(file, asked)]
+
+
+def main() -> None:
+    """Read a file in this process: its path, a folder for the tables, the name of times, DBCs."""
+    from pyarrow import feather
+
+    path, made, time, *databases = sys.argv[1:]
+    asked = Asked(time, databases=tuple(map(Path, databases)))
+    result: dict[str, Any] = {"error": "", "missing": False, "tables": 0}
+    if os.name == "posix":
+        import resource
+
+        most = MAX_MEMORY + 8 * os.path.getsize(path)
+        resource.setrlimit(resource.RLIMIT_AS, (most, most))
+    try:
+        for table in _tables(Path(path), asked):
+            feather.write_feather(table, Path(made, f"{result['tables']}.feather"), "uncompressed")
+            result["tables"] += 1
+    except MissingExtra:
+        result["missing"] = True
+    except BaseException as error:  # The package raises what it likes.
+        result["error"] = str(error) if path in str(error) else f"{path} cannot be read: {error!r}"
+    result["notes"] = [(note, getattr(note, "column", None)) for note in asked.notes]
+    Path(made, "about.json").write_text(json.dumps(result), encoding="utf-8")
+
+
+def _tables(path: Path, asked: Asked) -> list[Table]:
+    asammdf, channels = require("asammdf", EXTRA), list[Channel]()
+    opened = asammdf.MDF(path)
+    busy = any(each.name == FRAMES for group in opened.groups for each in group.channels)
+    channels += _channels(opened, asked.notes)
+    for database in asked.databases if busy else ():
+        channels += _decoded_frames(opened, database, asked.notes)
     if busy and not asked.databases:
         said = f"{FRAMES}: frames of a CAN bus are read with their database, as in dbc='car.dbc'"
         asked.notes[LeftOut(said, FRAMES)] = 1
@@ -90,9 +149,6 @@ def _channels(opened: Any, notes: dict[str, int], frames: bool = False) -> Itera
     for index, group in enumerate(opened.groups):
         about, master = group.channel_group, opened.masters_db.get(index)
         check_values(about.cycles_nr * max(1, len(group.channels)), f"group {index}")
-        for block in group.get_data_blocks():
-            if block.original_size > MAX_RATIO * max(block.compressed_size or 0, 1):
-                raise ValueError(f"a block of group {index} unpacks to {block.original_size} bytes")
         for at, each in enumerate(group.channels):
             if at == master or each.name.partition(".")[0] == FRAMES:
                 continue
@@ -126,10 +182,7 @@ def _decoded_frames(opened: Any, database: Path, notes: dict[str, int]) -> list[
         raise ValueError(f"{database} is no DBC file: {one_line(format_error(error))}") from None
     buses = {"CAN": [(matrix, 0)]}
     found = opened.extract_bus_logging(buses, ignore_value2text_conversion=True)
-    try:
-        channels = list(_channels(found, notes, frames=True))
-    finally:
-        found.close()
+    channels = list(_channels(found, notes, frames=True))
     if not channels:
         notes[f"no message of {database} was recorded"] = 1
     return channels

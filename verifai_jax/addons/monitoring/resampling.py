@@ -201,7 +201,8 @@ def joined(
             shape = (len(union), *column.shape[1:])
             truths = np.ma.masked_all(shape, bool)
             values[name] = truths if has_truths(column) else np.full(shape, np.nan)
-            values[name][rows] = column
+            with np.errstate(invalid="ignore"):  # A NaN of a damaged file may be a signalling one.
+                values[name][rows] = column
     return union, values
 
 

@@ -140,7 +140,7 @@ class Program(System):
                 process.wait()
         code = process.returncode
         if not ended:
-            after = f"the program was ended after {self.timeout:g} s"
+            after = f"the program was ended after {self.timeout:zg} s"
             return Outcome(None, Status.TIMEOUT, f"{after}{_said(folder)}")
         if code:
             how = f"died by signal {-code}" if code < 0 else f"ended with exit status {code}"

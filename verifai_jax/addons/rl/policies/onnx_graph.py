@@ -127,9 +127,9 @@ class Graph:
             none = jnp.nan if real else extreme(outputs, "min")
             outputs = jnp.where(values[SPILLED], none, outputs)
         # A label, as of a classifier or an argmax, is a single number.
-        least = 0 if jnp.issubdtype(outputs.dtype, jnp.integer) else 1
+        lowest = 0 if jnp.issubdtype(outputs.dtype, jnp.integer) else 1
         for _ in range(added):
-            outputs = outputs[0] if outputs.ndim > least and outputs.shape[0] == 1 else outputs
+            outputs = outputs[0] if outputs.ndim > lowest and outputs.shape[0] == 1 else outputs
         after = tuple(values[name] for _, name in self.memory) or None
         return outputs, after
 
@@ -353,7 +353,7 @@ class _Reader:
             name = node.name or (node.output[0] if node.output else "")
             wide = any(types.get(output) in (7, 13) for output in node.output[:1])
             ports = tuple(node.input), tuple(node.output)
-            found.append(Node(node.op_type, name, *ports, attributes, self.opset, wide))
+            found.append(Node(_decoded(node.op_type), name, *ports, attributes, self.opset, wide))
             inner.update(node.output)
         check_nodes(found, known, [o.name for o in graph.output], self.what)
         for node in found:

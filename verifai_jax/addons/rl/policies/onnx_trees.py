@@ -68,18 +68,18 @@ def _leaves(node: Node, x: Array, kind: str) -> tuple[Array, np.ndarray]:
         return list(node.get(f"nodes_{name}", ()) or [0] * count)
 
     keys = list(zip(get("treeids"), get("nodeids"), strict=True))
-    place: dict[Any, int] = {key: index for index, key in enumerate(keys)}
+    rows: dict[Any, int] = {key: index for index, key in enumerate(keys)}
     modes, own = get("modes"), np.arange(count)
     leaf = np.array([mode == "LEAF" for mode in modes])
     odd = sorted({*modes} - {*_GOES, "LEAF"})
     node.refuse(bool(odd), f"has nodes of the kind {odd[:1]}, which is not supported")
     features, missing = np.asarray(get("featureids")), np.asarray(get("missing_value_tracks_true"))
-    node.refuse(len(place) != count, "has two nodes of one number in a tree")
+    node.refuse(len(rows) != count, "has two nodes of one number in a tree")
     node.refuse(np.any((features < 0) | (features >= x.shape[-1]) & ~leaf),
                 f"has a feature beyond the {x.shape[-1]} of an observation")  # fmt: skip
     after = []
     for name in ("falsenodeids", "truenodeids"):
-        to = [place.get((t, n)) for (t, _), n in zip(keys, get(name), strict=True)]
+        to = [rows.get((t, n)) for (t, _), n in zip(keys, get(name), strict=True)]
         node.refuse(any(n is None and not e for n, e in zip(to, leaf, strict=True)),
                     "has a branch to a node that is not there")  # fmt: skip
         after.append(np.where(leaf, own, [n or 0 for n in to]))
@@ -101,7 +101,7 @@ def _leaves(node: Node, x: Array, kind: str) -> tuple[Array, np.ndarray]:
             goes |= which[at] & _GOES[mode](seen, limit)
         at = jnp.where(goes, jnp.asarray(after[1])[at], jnp.asarray(after[0])[at])
     ids = zip(node.attributes[f"{kind}_treeids"], node.attributes[f"{kind}_nodeids"], strict=True)
-    where = [place.get(key) for key in ids]
+    where = [rows.get(key) for key in ids]
     node.refuse(any(index is None for index in where), "has a weight of a node that is not there")
     return at, np.asarray(where)
 
