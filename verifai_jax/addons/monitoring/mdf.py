@@ -97,8 +97,8 @@ def main() -> None:
     if os.name == "posix":
         import resource
 
-        most = MAX_MEMORY + 8 * os.path.getsize(path)
-        resource.setrlimit(resource.RLIMIT_AS, (most, most))
+        limit = MAX_MEMORY + 8 * os.path.getsize(path)
+        resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
     try:
         for table in _tables(Path(path), asked):
             feather.write_feather(table, Path(made, f"{result['tables']}.feather"), "uncompressed")
