@@ -67,6 +67,7 @@ if TYPE_CHECKING:
     from verifai_jax.addons.simulators.mujoco import mjx as mjx
     from verifai_jax.addons.simulators.mujoco import mujoco as mujoco
     from verifai_jax.addons.simulators.mujoco import native as native
+    from verifai_jax.addons.simulators.program import program as program
     from verifai_jax.addons.simulators.remote import remote as remote
     from verifai_jax.addons.synthesis import Aim as Aim
     from verifai_jax.addons.synthesis import Repair as Repair

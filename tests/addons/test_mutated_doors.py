@@ -15,6 +15,7 @@ import pandas as pd
 import pytest
 from mutated import ODD as ODD_VALUES
 from mutated import altered, flipped, wrong_answers
+from recorded_files import WRITERS
 
 import verifai_jax as vj
 from verifai_jax.addons.assurance.odd_files import read_odd
@@ -156,6 +157,8 @@ def write_claims(path):
 DOORS = {
     "ppo.zip": (None, load),
     "mlp.onnx": (None, load),
+    "forest.onnx": (None, load),
+    "quantised_dynamic.onnx": (None, load),
     "mlp.pt": (None, load),
     "mlp.safetensors": (None, load),
     "drive.csv": (lambda path: pd.DataFrame(columns()).to_csv(path, index=False), read),
@@ -164,6 +167,7 @@ DOORS = {
     "drive.h5": (write_hdf5, read),
     "drive.nc": (write_netcdf, read),
     "drive.mcap": (write_mcap, read),
+    **{name: (write, read) for name, write in WRITERS.items() if name != "drive.mf4"},
     "watch.fmu": (lambda path: vj.mtl.export_fmu("x > 0", 0.1, path), read_description),
     "streets.yaml": (write_domain, read_odd),
     "estimate.json": (write_estimate, lambda path: str(read_result(path))),

@@ -82,7 +82,8 @@ def test_topics_of_mcap_have_clocks_of_their_own(tmp_path, double):
     path.write_bytes(b"")
     trace = read(path)
     assert list(trace.signals) == [
-        "odom.twist.x", "odom.p", "imu.data.covariance", "imu.data.x", "imu.data.y",
+        "odom.twist.x", "odom.p", "imu.data.covariance", "imu.data.label=imu", "imu.data.x",
+        "imu.data.y",
     ]  # fmt: skip
     np.testing.assert_allclose(trace.times, [0, 0.05, 0.1, 0.15])
     np.testing.assert_array_equal(trace["odom.twist.x"], [1, np.nan, 2.5, np.nan])

@@ -198,7 +198,7 @@ def test_bad_recordings(tmp_path, flight):
 
     with pytest.raises(FileNotFoundError, match="there is no recording"):
         read(tmp_path / "none.csv")
-    with pytest.raises(ValueError, match=r"\.csv, \.parquet, .*\.h5 or \.hdf5 file; got bad\.txt"):
+    with pytest.raises(ValueError, match=r"\.csv, \.tsv, .*\.h5 or \.hdf5 file; got bad\.txt"):
         read(file("x\n1\n", "bad.txt"))
     with pytest.raises(ValueError, match="has no rows"):
         read(file("time,x\n"))

@@ -5,15 +5,17 @@ table = read_csv(Path("drive.csv"), notes)          # notes receives what was le
 
 import io
 import re
+import zlib
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from verifai_jax.addons.monitoring.columns import GAPS, TRUTHS, is_numeric
 from verifai_jax.addons.monitoring.containers import UNIT, Table
+from verifai_jax.addons.monitoring.readers import Asked
 from verifai_jax.addons.monitoring.units import NONE
 from verifai_jax.core.messages.text import counted, shorten
-from verifai_jax.core.store.foreign_files import decoded, read_bytes
+from verifai_jax.core.store.foreign_files import MAX_BYTES, ForeignFileError, decoded, read_bytes
 
 NUMBER = re.compile(r'^\s*"?[-+]?[.,]?\d')
 """The beginning of a number, or of a date."""
@@ -23,11 +25,42 @@ THOUSANDS = r"^\s*[-+]?(\d{1,3}|[1-9]\d{0,2},\d{3})\s*$"
 """Numbers in which a comma, where there is one, may stand between thousands, `1,500`."""
 
 
+def read_delimited(path: Path, asked: Asked) -> list[Table]:
+    """Read a CSV file, which may be compressed by gzip."""
+    return [read_csv(path, asked.notes)]
+
+
+def _unzipped(path: Path, data: bytes, notes: dict[str, int]) -> bytes:
+    """Return the content of a gzip file; of one that is cut or damaged, what is before."""
+    whole, rest, damage = [], data, ""
+    while rest and not damage:
+        unpacking = zlib.decompressobj(31)  # One member after the other, as gzip appends them.
+        while not unpacking.eof and not damage:
+            try:
+                part = unpacking.decompress(rest, 1 << 24)
+            except zlib.error as error:
+                damage = str(error)
+                break
+            whole.append(part)
+            if sum(map(len, whole)) > MAX_BYTES:
+                raise ForeignFileError(f"{path} unpacks to more than {MAX_BYTES:,} bytes")
+            rest = unpacking.unconsumed_tail
+            damage = "it ends too early" if not (rest or part or unpacking.eof) else ""
+        rest = unpacking.unused_data.lstrip(b"\0")
+    if damage and not any(whole):
+        raise ValueError(f"{path} is no gzip file, or is damaged: {damage}")
+    if damage:
+        notes[f"{path} is damaged or was cut ({damage}): what is before is read"] = 1
+    return b"".join(whole)
+
+
 def read_csv(path: Path, notes: dict[str, int]) -> Table:
     """Read a CSV file as an Arrow table with any separator of columns and decimals."""
     from pyarrow import csv
 
     data = read_bytes(path)
+    if path.suffix.lower() == ".gz":
+        data = _unzipped(path, data, notes)
     if not data.isascii() or b"\0" in data[:2]:
         text, note = decoded(path, data, cut=True)
         data = text.encode()

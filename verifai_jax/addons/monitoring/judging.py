@@ -23,11 +23,14 @@ from verifai_jax.addons.monitoring import resampling
 from verifai_jax.addons.monitoring.columns import LeftOut
 from verifai_jax.addons.monitoring.containers import Episode
 from verifai_jax.addons.monitoring.dense import DenseValues, NotDense
+from verifai_jax.addons.monitoring.enumerations import with_words
 from verifai_jax.addons.monitoring.judgement import Judgement, Row
+from verifai_jax.addons.monitoring.readers import Stamps
 from verifai_jax.addons.monitoring.recorded import Recording, Recordings, named_recordings
 from verifai_jax.addons.monitoring.recording import read
 from verifai_jax.addons.monitoring.requirement_files import Requirements, requirements_of
-from verifai_jax.addons.monitoring.resampling import Method, Missing
+from verifai_jax.addons.monitoring.resampling import Method, Treatment
+from verifai_jax.addons.monitoring.stamps import Repeated
 from verifai_jax.addons.monitoring.units import plain_unit, unit_of, units_of
 from verifai_jax.core.display.progress import count_done, shows_progress
 from verifai_jax.core.messages.checks import options_of
@@ -57,10 +60,14 @@ class Reading(NamedTuple):
     time_unit: str | None
     resample_to: float | None
     method: Method | None
-    missing: Missing | Mapping[str, Missing] | None
+    missing: Treatment
     max_gap: float | None
     end: End
     explain: bool
+    stamps: Stamps = "log"
+    sort_times: bool = False
+    repeated: Repeated = "both"
+    dbc: str | Path | Sequence[str | Path] = ()
 
 
 class Found(NamedTuple):
@@ -82,8 +89,12 @@ def judge(
     dt: float | None = None,
     resample_to: float | None = None,
     method: Method | None = None,
-    missing: Missing | Mapping[str, Missing] | None = None,
+    missing: Treatment = None,
     max_gap: float | None = None,
+    stamps: Stamps = "log",
+    sort_times: bool = False,
+    repeated: Repeated = "both",
+    dbc: str | Path | Sequence[str | Path] = (),
     end: End = "hold",
     explain: bool = True,
     run_on: RunOn | None = None,
@@ -106,8 +117,8 @@ def judge(
       `read_requirements` reads them from a file.
     - `recordings`: paths of files, of folders (all recordings in them and their subfolders), traces
       or data frames: one, a sequence, or a dictionary by name; or a problem, which is simulated.
-    - `time`, `time_unit`, `dt`, `missing`, `max_gap`: as in `read`; the gaps of given traces are
-      treated as well.
+    - `time`, `time_unit`, `dt`, `missing`, `max_gap`, `stamps`, `sort_times`, `repeated`, `dbc`: as
+      in `read`; the gaps of given traces are treated as well.
     - `resample_to`, `method`: the even clock for formulas that need one, and what is between
       samples, `"hold"` or `"linear"`.
     - `end`: as in `robustness`.
@@ -126,7 +137,10 @@ def judge(
         raise ValueError(f"method is 'hold' or 'linear'; got {method!r}")
     if end not in ("hold", "truncate", "strict"):
         raise ValueError(f"end is 'hold', 'truncate' or 'strict'; got {end!r}")
-    reading = Reading(time, dt, time_unit, resample_to, method, missing, max_gap, end, explain)
+    reading = Reading(
+        time, dt, time_unit, resample_to, method, missing, max_gap, end, explain, stamps,
+        sort_times, repeated, dbc,
+    )  # fmt: skip
     rows: dict[int, Sequence[Row]] = {}
 
     def keep(index: int, found: Sequence[Row]) -> None:
@@ -185,28 +199,29 @@ def read_recording(source: Recording, reading: Reading) -> Trace:
     if not isinstance(source, Trace):
         return read(
             source, time=reading.time, time_unit=reading.time_unit, dt=reading.dt,
-            missing=reading.missing, max_gap=reading.max_gap,
+            missing=reading.missing, max_gap=reading.max_gap, stamps=reading.stamps,
+            sort_times=reading.sort_times, repeated=reading.repeated, dbc=reading.dbc,
         )  # fmt: skip
-    trace = resampling.check_holes(source.trim(), reading.max_gap)
-    return trace if reading.missing is None else resampling.without_gaps(trace, reading.missing)
+    return resampling.treated(source.trim(), reading.max_gap, reading.missing)
 
 
 def _judged(
     requirements: Sequence[Requirement], name: str, trace: Trace, reading: Reading
 ) -> list[Row]:
-    trace, units = trace.trim(), units_of(trace.signals, trace.units)
+    formulas, trace = with_words([each.formalized for each in requirements], trace.trim())
+    units = units_of(trace.signals, trace.units)
     said = [note for note in trace.notes if not isinstance(note, LeftOut)]
     find = finder(trace, reading)
     clock, dt = np.asarray(trace.clock()), _even_step(trace)
     signals = {name: np.asarray(value) for name, value in trace.signals.items()}
     rows = []
-    for each in requirements:
+    for each, formula in zip(requirements, formulas, strict=True):
         try:
-            check_signals(each.formalized, trace, "the recording")
-            found, note = find(each.formalized)
+            check_signals(formula, trace, "the recording")
+            found, note = find(formula)
             unit, other = _unit(each, units)
             lasts = float(clock[-1] - clock[0])
-            falls = shortfalls_in(signals, each.formalized, dt, lasts, reading.end)
+            falls = shortfalls_in(signals, formula, dt, lasts, reading.end)
             notes = "; ".join(filter(None, [*map(str, falls), *said, note, other]))
             verdict = "holds" if found.holds else "fails"
             decided = (found.robustness, found.instant, found.explanation)

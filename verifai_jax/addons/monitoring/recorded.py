@@ -9,8 +9,10 @@ from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Protocol, TypeAlias, Union, runtime_checkable
 
-from verifai_jax.addons.monitoring.containers import Episode, bag_files, episodes_of, lerobot_files
-from verifai_jax.addons.monitoring.recording import ENDINGS, read
+from verifai_jax.addons.monitoring.containers import Episode, episodes_of, lerobot_files
+from verifai_jax.addons.monitoring.readers import ending_of, endings
+from verifai_jax.addons.monitoring.recording import read
+from verifai_jax.addons.monitoring.topics import bag_files
 from verifai_jax.core.display.lazy import lazy_import
 from verifai_jax.core.values.trace import Trace
 from verifai_jax.mtl.formula import Formula
@@ -62,12 +64,12 @@ def named_recordings(source: Recordings) -> Iterator[tuple[str, Recording]]:
             for each in episodes_of(lerobot):
                 yield f"{path} episode {each.number}", each
             continue
-        if not path.is_dir() or path.suffix.lower() in ENDINGS:
+        if not path.is_dir() or ending_of(path):
             yield str(path), path
             continue
-        files = [each for each in sorted(path.rglob("*")) if each.suffix.lower() in ENDINGS]
+        files = [each for each in sorted(path.rglob("*")) if ending_of(each)]
         if not files:
-            raise ValueError(f"there is no recording ({', '.join(ENDINGS)}) in {path}")
+            raise ValueError(f"there is no recording ({', '.join(endings())}) in {path}")
         bags = {folder: set(bag_files(folder)) for folder in {each.parent for each in files}}
         whole = dict.fromkeys(f.parent if f in bags[f.parent] else f for f in files)
         yield from ((str(file), file) for file in whole)

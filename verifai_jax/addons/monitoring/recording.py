@@ -8,6 +8,7 @@ read(["imu.csv", "gps.csv"], missing={"speed": "hold"}, resample_to=0.1, method=
 
 import re
 from collections.abc import Collection, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,17 +17,23 @@ import numpy as np
 from verifai_jax.addons.monitoring import containers, resampling
 from verifai_jax.addons.monitoring.columns import LeftOut, numbers_of
 from verifai_jax.addons.monitoring.containers import UNIT, Episode, Table
-from verifai_jax.addons.monitoring.csv_tables import read_csv
-from verifai_jax.addons.monitoring.stamps import apart, find_clock, in_order, seconds_of
-from verifai_jax.core.messages.errors import MissingExtra, missing_name
-from verifai_jax.core.messages.text import format_error
-from verifai_jax.core.store.foreign_archives import read_arrays
+from verifai_jax.addons.monitoring.enumerations import word_columns
+from verifai_jax.addons.monitoring.readers import Asked, Stamps, read_tables
+from verifai_jax.addons.monitoring.stamps import (
+    Repeated,
+    apart,
+    find_clock,
+    in_order,
+    last_of_each,
+    seconds_of,
+    sorted_rows,
+)
+from verifai_jax.addons.monitoring.topics import bag_files, read_bag_files
+from verifai_jax.core.messages.errors import check_names, missing_name
 from verifai_jax.core.values.trace import Trace
 
 if TYPE_CHECKING:
     import pandas as pd
-ENDINGS = (".csv", ".parquet", ".npz", ".mcap", ".nc", ".zarr", ".h5", ".hdf5")
-"""Endings of files that are recordings."""
 
 
 class TimeColumnError(ValueError):
@@ -52,15 +59,21 @@ def read(
     columns: Sequence[str] | None = None,
     resample_to: float | None = None,
     method: resampling.Method | None = None,
-    missing: resampling.Missing | Mapping[str, resampling.Missing] | None = None,
+    missing: resampling.Treatment = None,
     max_gap: float | None = None,
     episode: int | None = None,
+    stamps: Stamps = "log",
+    sort_times: bool = False,
+    repeated: Repeated = "both",
+    dbc: str | Path | Sequence[str | Path] = (),
 ) -> Trace:
     """Read a trace from a file or a table: its columns, topics or variables are signals.
 
     Columns `p[0]`, `p[1]`, ... become one vector signal `p`, and so does a column of lists of equal
-    length. Columns without numbers are left out, with a note, unless named in `columns`. An empty
-    cell, `-` or `n/a` is a gap (NaN), and words such as `true` or `ON` are truth values. In a CSV
+    length. A column `mode` of at most 64 different words becomes truth values, `"mode=AUTO"` and so
+    on, which `judge` takes for `mode == "AUTO"`. Other columns without numbers are left out, with a
+    note, unless named in `columns`. An empty cell, `-` or `n/a` is a gap (NaN), and words such as
+    `true` or `ON` are truth values. In a CSV
     file commas, semicolons or tabs separate the columns, as the first line shows; numbers may have
     a decimal comma if all of them do. Comment lines (`#`) before the names are skipped, and a row
     of units may follow the names. Left out, with a note, are a last line that was cut, rows with
@@ -74,9 +87,10 @@ def read(
     both count, and a time without a value that is far longer than the period is a note.
 
     **Arguments:**
-    - `source`: the path of a `.csv` (first line: names), `.parquet`, `.npz` (each array is a
-      column), `.mcap`, `.nc`, `.h5` or `.hdf5` file, of a `.zarr` store, of the folder of a LeRobot
-      data set, or of a bag in several `.mcap` files; a `pandas.DataFrame`, whose index is a column
+    - `source`: the path of a `.csv` or `.tsv` (first line: names, also with `.gz`), `.parquet`,
+      `.feather`, `.jsonl`, `.npz` (each array is a column), `.mat`, `.mcap`, `.db3` (ROS 2), `.bag`
+      (ROS 1), `.ulg`, `.mf4`, `.nc`, `.h5` or `.hdf5` file, of a `.zarr` store, of the folder of a
+      LeRobot data set, or of a bag in several files; a `pandas.DataFrame`, whose index is a column
       if it has a name; or several paths.
     - `time`: the column of sample times: numbers, dates (ISO 8601 as text) or durations. Their unit
       may follow its name (`time [ms]`, `time_ms`), or stand in a row of units or an attribute.
@@ -90,9 +104,14 @@ def read(
     - `resample_to`, `method`: a period to resample to, and the method (`"hold"` or `"linear"`).
     - `missing`: how to fill gaps, for all signals or by name: `"hold"`, with the signal's own last
       value; `"interpolate"`, linearly between its neighbours; `"drop"` removes the instants. By
-      default gaps remain.
+      default gaps remain. A number stands for a gap, `missing=-9999`, also in a list:
+      `missing=[-9999, "hold"]`.
     - `max_gap`: the longest time in seconds that a signal may be without a value.
     - `episode`: number of an episode of a LeRobot data set.
+    - `stamps`: `"header"` for the times in the headers of a bag's messages, instead of the log's.
+    - `sort_times`: whether rows whose times go back are put in order, instead of left out.
+    - `repeated`: `"last"` if of samples at one time the last counts, instead of both.
+    - `dbc`: `.dbc` files that describe the CAN frames of an MDF file.
     **Raises:** `FileNotFoundError`; `MissingExtra` for a kind of file whose package is not
     installed; `ValueError` for another kind of file, no rows, a column that does not exist or
     contains no numbers, a text among numbers, times that do not increase or are hardly in seconds
@@ -100,13 +119,17 @@ def read(
     """
     if (resample_to is None) != (method is None):
         raise ValueError('resampling needs both: resample_to=PERIOD, method="hold" or "linear"')
+    check_names("kind of stamps", [stamps], ("log", "header"))
+    check_names("choice of repeated samples", [repeated], ("both", "last"))
     notes: dict[str, int] = {}
-    name, tables = _tables(source, "time" if isinstance(time, Mapping) else time, episode, notes)
+    databases = tuple(map(Path, [dbc] if isinstance(dbc, str | Path) else dbc))
+    clock = "time" if isinstance(time, Mapping) else time
+    name, tables = _tables(source, Asked(clock, stamps, episode, databases, notes))
     wanted = [time] * len(tables) if isinstance(time, str) else list(time)
     if isinstance(time, Mapping):
         tables = [_of_clock(name, tables, clock, own) for clock, own in time.items()]
     units = _units(tables)
-    parts, stamps, unclocked = [], [], []
+    parts, clocks, unclocked = [], [], []
     for (table, said), each in zip(tables, wanted, strict=True):
         clock = find_clock(table, each)
         if clock is None and dt is None:
@@ -121,9 +144,11 @@ def read(
             unit = said.get(clock, "")
             seconds, origin, note = seconds_of(name, clock, column, unit, time_unit)
             notes |= {note: 1} if note else {}
-            rows = in_order(seconds, notes)
+            rows = sorted_rows(seconds, notes) if sort_times else in_order(seconds, notes)
+            if repeated == "last":
+                rows = last_of_each(seconds, rows, notes)
             values = {each: cells[rows] for each, cells in values.items()}
-            stamps.append((apart(seconds[rows], notes), origin))
+            clocks.append((apart(seconds[rows], notes), origin))
         parts.append(values)
     for fault in unclocked:
         if not parts:
@@ -136,18 +161,16 @@ def read(
     if dt is not None and len(parts) > 1:
         raise ValueError(f"{name} has {len(parts)} clocks, so one period dt is not enough")
     try:
-        for seconds, _ in stamps:
+        for seconds, _ in clocks:
             resampling.check_increasing(seconds)
     except ValueError as error:
         raise ValueError(f"{name}: {error}") from None
-    times = stamps[0][0] if stamps else None
-    times, values = resampling.joined(stamps, parts) if len(parts) > 1 else (times, parts[0])
+    times = clocks[0][0] if clocks else None
+    times, values = resampling.joined(clocks, parts) if len(parts) > 1 else (times, parts[0])
     signals = _signals(name, values, columns)
     units = {each: unit for each in signals if (unit := units.get(each) or units.get(f"{each}[0]"))}
     trace = Trace(signals, dt=dt, times=times, notes=notes, units=units)
-    trace = resampling.check_holes(trace, max_gap)
-    if missing is not None:
-        trace = resampling.without_gaps(trace, missing)
+    trace = resampling.treated(trace, max_gap, missing)
     if resample_to is not None and method is not None:
         return resampling.resample(trace, resample_to, method)
     return trace
@@ -157,26 +180,26 @@ Columns = dict[str, Any]
 
 
 def _tables(
-    source: "str | Path | Episode | pd.DataFrame | Sequence[str | Path]", time: str,
-    episode: int | None, notes: dict[str, int],
-) -> tuple[str, list[tuple[Columns, dict[str, str]]]]:  # fmt: skip
+    source: "str | Path | Episode | pd.DataFrame | Sequence[str | Path]", asked: Asked
+) -> tuple[str, list[tuple[Columns, dict[str, str]]]]:
     """Return how a recording is called, and the columns of each of its clocks with their units."""
     if isinstance(source, Episode):
-        source, episode = source.path, source.number
+        source, asked = source.path, replace(asked, episode=source.number)
     if isinstance(source, str | Path):
         path = Path(source)
         if not path.exists():
             raise FileNotFoundError(f"there is no recording {path}")
         if files := containers.lerobot_files(path):
-            path = _file_of_episode(path, files, episode)
-        tables = _file_tables(path, time, episode, notes)
+            path = _file_of_episode(path, files, asked.episode)
+        bag = bag_files(path)
+        tables = read_bag_files(bag, asked) if bag else read_tables(path, asked)
         return str(path), [_columns(path, table) for table in tables]
     if isinstance(source, Sequence) and all(isinstance(each, str | Path) for each in source):
-        found = [_tables(each, time, episode, notes) for each in source]
+        found = [_tables(each, asked) for each in source]
         if not found:
             raise ValueError("there is no recording: the list of files is empty")
         tables = [table for _, several in found for table in several]
-        names = [name for own, _ in tables for name in own if name != find_clock(own, time)]
+        names = [name for own, _ in tables for name in own if name != find_clock(own, asked.time)]
         _refuse_repeated("the files", names)
         return " and ".join(name for name, _ in found), tables
     return "the data frame", [(_frame_columns(source), {})]  # pyright: ignore[reportArgumentType]
@@ -256,43 +279,6 @@ def _refuse_repeated(source: str, names: Sequence[str]) -> None:
         raise ValueError(f"{source} has more than one column {', '.join(map(repr, repeated))}")
 
 
-def _file_tables(path: Path, time: str, episode: int | None, notes: dict[str, int]) -> list[Table]:
-    """Read the Arrow tables of a file, one for each of its clocks."""
-    readers = {
-        ".csv": lambda: [read_csv(path, notes)],
-        ".parquet": lambda: containers.read_parquet(path, time, episode),
-        ".npz": lambda: [_read_arrays(path, time, notes)],
-        ".mcap": lambda: containers.read_mcap([path], time, notes),
-        **dict.fromkeys((".nc", ".zarr"), lambda: containers.read_dataset(path, time, notes)),
-        **dict.fromkeys((".h5", ".hdf5"), lambda: containers.read_hdf5(path, time, notes)),
-    }
-    ending = path.suffix.lower()
-    if bag := containers.bag_files(path):
-        return containers.read_mcap(bag, time, notes)
-    if ending not in readers:
-        known = f"{', '.join(ENDINGS[:-1])} or {ENDINGS[-1]}"
-        raise ValueError(f"a recording is a {known} file; got {path.name}")
-    if episode is not None and ending != ".parquet":
-        raise ValueError(f"episodes are those of a LeRobot data set; {path.name} has none")
-    try:
-        return readers[ending]()
-    except (MissingExtra, FileNotFoundError):
-        raise
-    except Exception as error:  # The readers of other packages raise what they like.
-        if isinstance(error, ValueError) and str(path) in str(error):
-            raise
-        raise ValueError(f"{path} cannot be read: {format_error(error)}") from None
-
-
-def _read_arrays(path: Path, time: str, notes: dict[str, int]) -> Table:
-    """Read the arrays of an `.npz` file as an Arrow table; nothing in it is unpickled."""
-    left_out: dict[str, str] = {}
-    arrays = read_arrays(path, str(path), left_out=left_out)
-    for name, why in left_out.items():
-        notes[LeftOut(f"column {name!r}: {why}: left out", name)] = 1
-    return containers.table_of_arrays(arrays, find_clock(arrays, time), notes)
-
-
 def _values(
     source: str, table: Columns, columns: Sequence[str] | None, notes: dict[str, int]
 ) -> dict[str, np.ndarray]:
@@ -302,11 +288,27 @@ def _values(
         try:
             values[name] = numbers_of(source, name, column)
         except ValueError as error:
+            if words := _words(name, column):
+                values |= words
+                continue
             if columns is not None and name in columns:
                 raise
             why = str(error).replace(f" of {source}", "", 1)
             notes[LeftOut(f"{why}: it is left out", name)] = 1
     return values
+
+
+def _words(name: str, column: Any) -> dict[str, np.ndarray]:
+    """Return a column of words as truth values; nothing for other columns."""
+    from pyarrow import types
+
+    kind = column.type.value_type if types.is_dictionary(column.type) else column.type
+    if not (types.is_string(kind) or types.is_large_string(kind)):
+        return {}
+    try:
+        return word_columns(name, column.to_pylist())
+    except ValueError:
+        return {}
 
 
 def _signals(
@@ -316,7 +318,10 @@ def _signals(
     vectors = vector_columns([name for name in values if values[name].ndim == 1])
     in_vectors = {name for parts in vectors.values() for name in parts}
     scalars = [name for name in values if name not in in_vectors]
-    wanted = [*scalars, *vectors] if columns is None else list(columns)
+    of_words = {n: [each for each in scalars if each.startswith(f"{n}=")] for n in columns or ()}
+    wanted = [*scalars, *vectors]
+    if columns is not None:
+        wanted = [n for each in columns for n in of_words[each] or [each]]
     signals = {}
     for name in wanted:
         if name in vectors:

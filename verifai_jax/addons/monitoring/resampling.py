@@ -9,13 +9,14 @@ verdicts, so a spike between two samples is not lost.
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from fractions import Fraction
-from typing import Literal
+from typing import Any, Literal, TypeAlias
 
 import numpy as np
 from jax.core import Tracer
 from jaxtyping import Float, Int
 
 from verifai_jax.addons.monitoring.stamps import merged
+from verifai_jax.core.messages.checks import is_number
 from verifai_jax.core.messages.errors import check_names
 from verifai_jax.core.messages.text import format_seconds, format_time
 from verifai_jax.core.values.gaps import has_truths
@@ -24,6 +25,9 @@ from verifai_jax.mtl.setting import resolution_of, since_first
 
 Method = Literal["hold", "linear"]
 Missing = Literal["hold", "drop", "interpolate"]
+Ways: TypeAlias = Missing | float | Sequence[Missing | float]
+"""How to treat gaps, and numbers that stand for one."""
+Treatment: TypeAlias = Ways | Mapping[str, Ways] | None
 MAX_SAMPLES = 100_000_000
 """Samples that a resampled trace may have: a signal of so many takes 800 MB in double precision."""
 
@@ -197,8 +201,37 @@ def joined(
             shape = (len(union), *column.shape[1:])
             truths = np.ma.masked_all(shape, bool)
             values[name] = truths if has_truths(column) else np.full(shape, np.nan)
-            values[name][rows] = column
+            with np.errstate(invalid="ignore"):  # A NaN of a damaged file may be a signalling one.
+                values[name][rows] = column
     return union, values
+
+
+def treated(trace: Trace, max_gap: float | None, missing: Treatment) -> Trace:
+    """Return a recording with its sentinels as gaps, notes on holes, and gaps filled or left out.
+
+    **Raises:** `ValueError` for a hole longer than `max_gap` seconds; see `without_gaps`.
+    """
+    given = missing if isinstance(missing, Mapping) else dict.fromkeys(trace.signals, missing)
+    check_names("signal", given, trace.signals)
+    signals, notes = dict(trace.signals), dict(trace.notes)
+    ways: dict[str, Any] = {}
+    for name, several in given.items():
+        listed: Any = several if isinstance(several, list | tuple) else [several]
+        for way in listed:
+            if isinstance(way, str):
+                ways[name] = way
+            elif way is not None and is_number(way) and not trace.is_truth(name):
+                array = np.asarray(signals[name])
+                gone = array == way
+                if gone.any():
+                    signals[name] = np.where(gone, np.nan, array)
+                    notes[f"signal {name!r} has {gone.sum()} of {way:zg}: no value there"] = 1
+            elif way is not None and not is_number(way):
+                raise ValueError(f"missing is a way to treat a gap or a number; got {way!r}")
+    if notes.keys() != trace.notes.keys():
+        trace = replace(trace, signals=signals, notes=notes)
+    trace = check_holes(trace, max_gap)
+    return without_gaps(trace, ways) if ways else trace
 
 
 def without_gaps(trace: Trace, missing: Missing | Mapping[str, Missing]) -> Trace:

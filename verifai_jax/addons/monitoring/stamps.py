@@ -10,7 +10,7 @@ import datetime
 import re
 from collections.abc import Iterable, Sequence
 from fractions import Fraction
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -19,6 +19,7 @@ from verifai_jax.addons.monitoring.units import NONE
 from verifai_jax.core.messages.text import counted, format_seconds
 from verifai_jax.mtl.setting import resolution_of
 
+Repeated: TypeAlias = Literal["both", "last"]
 WORDS = {
     word: seconds
     for seconds, spellings in (
@@ -264,6 +265,25 @@ def in_order(times: np.ndarray, notes: dict[str, int]) -> np.ndarray:
         said = "left out: their times are missing, or go back"
         notes[f"{counted(len(out), 'row')} (row {which}): {said}"] = len(out)
     return known
+
+
+def sorted_rows(times: np.ndarray, notes: dict[str, int]) -> np.ndarray:
+    """Return the rows that have a sample time in the order of their times, with a note."""
+    known = np.flatnonzero(np.isfinite(times))
+    rows = known[np.argsort(times[known], kind="stable")]
+    moved = int(np.sum(rows != known))
+    notes |= {"rows whose times went back are put in order": moved} if moved else {}
+    gone = len(times) - len(known)
+    notes |= {"rows without a sample time are left out": gone} if gone else {}
+    return rows
+
+
+def last_of_each(times: np.ndarray, rows: np.ndarray, notes: dict[str, int]) -> np.ndarray:
+    """Return rows in order of time without those at whose time another one follows."""
+    last = np.append(np.diff(times[rows]) != 0, True)[: len(rows)]
+    gone = int(np.sum(~last))
+    notes |= {"of samples at one time the last counts: others are left out": gone} if gone else {}
+    return rows[last]
 
 
 def apart(times: np.ndarray, notes: dict[str, int]) -> np.ndarray:

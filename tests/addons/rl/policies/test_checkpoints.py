@@ -191,7 +191,7 @@ def test_classes_that_compute_otherwise_are_refused(tmp_path):
         name = pickle.dumps({"features_extractor_class": Path})
         settings["policy_kwargs"] = {":serialized:": base64.b64encode(name).decode()}
 
-    with pytest.raises(PolicyError, match="RecurrentActorCriticPolicy, which remembers: export"):
+    with pytest.raises(PolicyError, match="RecurrentActorCriticPolicy, but other tensors"):
         policy(rewritten(tmp_path, "ppo.zip", recurrent))
     with pytest.raises(PolicyError, match="a features extractor of the class Path: export"):
         policy(rewritten(tmp_path, "ppo.zip", custom))

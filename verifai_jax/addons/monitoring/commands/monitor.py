@@ -23,6 +23,8 @@ from verifai_jax.addons.monitoring.commands.monitor_fleet import (
     fleet_options,
     is_fleet,
     monitor_fleet,
+    read_missing,
+    reading_options,
 )
 from verifai_jax.cli.arguments import NAMES, PATH, PLOT, option, read_names
 from verifai_jax.cli.exit_codes import BROKEN, CommandError
@@ -46,9 +48,11 @@ if TYPE_CHECKING:
 @option("--resample", "resample_to", type=float, help="Period in seconds to resample to.")
 @option("--method", type=click.Choice(["hold", "linear"]), help="Interpolation to resample.")
 @option(
-    "--missing", type=click.Choice(["hold", "drop", "interpolate"]),
-    help="Treatment of gaps  [default: no verdict where they matter]",
+    "--missing", multiple=True, callback=read_missing,
+    help="Treatment of gaps (hold, drop, interpolate), and numbers that stand for one "
+    "[default: no verdict where they matter]",
 )  # fmt: skip
+@reading_options
 @option(
     "--end", type=click.Choice(["hold", "truncate", "strict"]), default="hold",
     help="How a trace continues after the last sample.",
@@ -82,6 +86,7 @@ def monitor(
     import jax
 
     from verifai_jax.addons.monitoring.columns import LeftOut
+    from verifai_jax.addons.monitoring.enumerations import with_words
     from verifai_jax.addons.monitoring.judging import Reading, finder
     from verifai_jax.mtl.setting import check_signals
 
@@ -124,15 +129,17 @@ def monitor(
         why = {
             "drop": "leaves instants out, and samples of a stream are evenly spaced",
             "interpolate": "needs the value after a gap, which a stream has not had yet",
-        }.get(str(reading.missing))
-        if why:
-            raise click.UsageError(f"--missing {reading.missing} {why}: use --missing hold")
-        held, unit = reading.missing == "hold", reading.time_unit
+        }
+        ways = given["missing"] or ["hold"]
+        for way in [] if ways == ["hold"] else ways:
+            said = why.get(way, "goes with a whole recording")
+            raise click.UsageError(f"--missing {way} {said}: use --missing hold")
+        held, unit = reading.missing is not None, reading.time_unit
         holds = monitor_stream(parsed, sys.stdin, reading.time, dt, hold=held, time_unit=unit)
         give_result(formula=str(parsed), holds=holds)
         check_gate(fail_on, {"violation": not holds, "incomplete": not holds})
         return
-    trace = _read(file, reading)
+    (parsed,), trace = with_words([parsed], _read(file, reading))
     check_signals(parsed, trace, str(file))
     period, method = reading.resample_to, reading.method
     even = vj.mtl.resample(trace, period, method) if period and method else trace

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import click
 
 import verifai_jax as vj
-from verifai_jax.cli.arguments import option
+from verifai_jax.cli.arguments import PATH, option
 from verifai_jax.cli.exit_codes import BROKEN, CommandError
 from verifai_jax.cli.json_output import give_result, say
 
@@ -29,6 +29,40 @@ def fleet_options(command: Command) -> Command:
     ):
         command = each(command)
     return command
+
+
+def reading_options(command: Command) -> Command:
+    """Add the options for the stamps of recordings, and for frames of a bus."""
+    for each in (
+        option("--dbc", multiple=True, type=PATH, help="DBC file for the CAN frames of MDF files."),
+        option(
+            "--repeated", type=click.Choice(["both", "last"]), default="both",
+            help="Which of the samples at one time count.",
+        ),
+        option("--sort-times", is_flag=True, help="Put rows whose times go back in order."),
+        option(
+            "--stamps", type=click.Choice(["log", "header"]), default="log",
+            help="Times of a bag's messages: the log's, or those in their headers.",
+        ),
+    ):  # fmt: skip
+        command = each(command)
+    return command
+
+
+def read_missing(context: object, option: object, texts: Sequence[str]) -> list[Any] | None:
+    """Return the ways to treat gaps and the numbers that stand for one; None for none."""
+    found: list[Any] = []
+    for text in texts:
+        try:
+            found.append(text if text in WAYS else float(text))
+        except ValueError:
+            raise click.BadParameter(
+                f"{text!r} is none of {', '.join(WAYS)}, and no number"
+            ) from None
+    return found or None
+
+
+WAYS = ("hold", "drop", "interpolate")
 
 
 def is_fleet(

@@ -77,8 +77,8 @@ def policy(
 
     **Arguments:**
     - `source`: a file or a model:
-      - `.zip`: a model of Stable-Baselines3 (PPO, A2C, SAC, TD3, DDPG, DQN), with its spaces,
-        squashing and bounds;
+      - `.zip`: a model of Stable-Baselines3 (PPO, A2C, SAC, TD3, DDPG, DQN,
+        RecurrentPPO), with its spaces, squashing and bounds;
       - `.onnx`: a graph; outputs that are fed back to inputs become the memory of a recurrent one;
       - `.safetensors`, or `.pt` and `.pth` of `torch.save(module.state_dict())`: weights of an MLP
         with `activation=`, or of your own `network=`; the normaliser that rsl_rl, rl_games and skrl

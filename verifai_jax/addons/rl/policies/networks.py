@@ -54,22 +54,52 @@ class Mlp:
         if self.pixels:
             convolutions, layers = weights
             x = _nature(convolutions, jnp.asarray(x, float) / 255)
-        elif self.categories:
+        return self.dense(layers, self.flat(x, layers[0][0].shape[0])), None
+
+    def flat(self, x: Array, size: int) -> Array:
+        """Return an observation as the numbers that the first layer takes.
+
+        **Raises:** `PolicyError` for another count of numbers.
+        """
+        if self.categories:
             parts = zip(jnp.reshape(x, len(self.categories)), self.categories, strict=True)
             x = jnp.concatenate([(one == jnp.arange(n)).astype(float) for one, n in parts])
-        elif x.ndim and x.shape[-1] != layers[0][0].shape[0]:
+        elif x.ndim and x.shape[-1] != size:
             x = jnp.reshape(x, -1)
-        size, between = layers[0][0].shape[0], ACTIVATIONS[self.activation]
         if not x.ndim or x.shape[-1] != size:
             raise PolicyError(
                 f"the network takes observations of {size} numbers; got shape {list(x.shape)}"
             )
+        return x
+
+    def dense(self, layers: Layers, x: Array) -> Array:
+        """Return the outputs of the layers."""
         for i, (weight, bias) in enumerate(layers):
             # The linear layer after convolutions has the activation of those.
-            f = jax.nn.relu if self.pixels and i == 0 else between
+            f = jax.nn.relu if self.pixels and i == 0 else ACTIVATIONS[self.activation]
             x = x @ weight + bias
             x = x if i == len(layers) - 1 else f(x)
-        return x, None
+        return x
+
+
+@dataclass(frozen=True)
+class LstmMlp(Mlp):
+    """Layers of LSTM as PyTorch has them, and a perceptron on the state of the last one."""
+
+    def example(self, weights: PyTree) -> np.ndarray:
+        """Return zeros in the form of an observation."""
+        return np.zeros(len(self.categories) or weights[0][0][0].shape[0])
+
+    def __call__(self, weights: PyTree, observation: Array, memory: PyTree) -> tuple[Array, PyTree]:
+        """Return the outputs, and the states `(h, c)` of all layers of LSTM."""
+        cells, layers = weights
+        x, after = self.flat(observation, cells[0][0].shape[0]), []
+        for (kernel, recurrent, bias), (h, c) in zip(cells, memory, strict=True):
+            i, f, new, o = jnp.split(x @ kernel + h @ recurrent + bias, 4, axis=-1)
+            c = jax.nn.sigmoid(f) * c + jax.nn.sigmoid(i) * jnp.tanh(new)
+            x = jax.nn.sigmoid(o) * jnp.tanh(c)
+            after.append((x, c))
+        return self.dense(layers, x), tuple(after)
 
 
 def _nature(convolutions: Layers, image: Float[Array, "c h w"]) -> Float[Array, " k"]:

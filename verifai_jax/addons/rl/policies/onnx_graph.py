@@ -21,6 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, PyTree
 
+from verifai_jax.addons.rl.policies import onnx_trees
 from verifai_jax.addons.rl.policies.errors import (
     MAX_BYTES,
     MAX_NUMBERS,
@@ -32,6 +33,7 @@ from verifai_jax.addons.rl.policies.onnx_layers import extreme
 from verifai_jax.addons.rl.policies.onnx_memory import Stated, memory_of
 from verifai_jax.addons.rl.policies.onnx_node import TYPES, Node, cast, fitting, known
 from verifai_jax.addons.rl.policies.onnx_operators import GROWING, OPERATORS, output_size
+from verifai_jax.addons.rl.policies.onnx_trees import DOMAIN
 from verifai_jax.core.messages.errors import check_names, require
 from verifai_jax.core.messages.text import one_line
 from verifai_jax.core.store.foreign_files import open_file
@@ -45,6 +47,8 @@ OPSETS = 7, 26
 """The first and the last operator set that is read."""
 _WEIGHTED = {"Gemm", "MatMul", "Conv", "LSTM", "GRU", "RNN"}
 """Operators whose constant inputs are weights."""
+_ACTIONS = "action", "mu", "mean", "logit", "label", "output_label"
+"""Names of outputs that are the action, where there are several; the last ones of classifiers."""
 _DOMAINS = "", "ai.onnx"
 """Names of ONNX's own operators."""
 
@@ -122,8 +126,10 @@ class Graph:
             real = jnp.issubdtype(outputs.dtype, jnp.floating)
             none = jnp.nan if real else extreme(outputs, "min")
             outputs = jnp.where(values[SPILLED], none, outputs)
+        # A label, as of a classifier or an argmax, is a single number.
+        lowest = 0 if jnp.issubdtype(outputs.dtype, jnp.integer) else 1
         for _ in range(added):
-            outputs = outputs[0] if outputs.ndim > 1 and outputs.shape[0] == 1 else outputs
+            outputs = outputs[0] if outputs.ndim > lowest and outputs.shape[0] == 1 else outputs
         after = tuple(values[name] for _, name in self.memory) or None
         return outputs, after
 
@@ -217,15 +223,11 @@ def read_onnx(
         model = package.load_from_string(data)
         graph = model.graph
         opset = max([0, *(o.version for o in model.opset_import if o.domain in _DOMAINS)])
-    others = sorted({o.domain for o in model.opset_import} - {*_DOMAINS})
-    if graph.output and others and not opset:
-        raise PolicyError(
-            f"{what} uses only operators of {', '.join(others)}, such as those of trees, which are "
-            "not supported: give the policy as a Python function, such as one of its ONNX runtime"
-        )
+        trees = max([0, *(o.version for o in model.opset_import if o.domain == DOMAIN)])
+    opset = opset or (OPSET if trees else 0)
     if not graph.output or not opset:
         raise PolicyError(f"{what} is not an ONNX model: it has no outputs, or names no operators")
-    reader = _Reader(package, path, what, opset)
+    reader = _Reader(package, path, what, opset, trees)
     arrays = reader.tensors(graph)
     fed = [i for i in graph.input if i.name not in arrays]
     first, last = OPSETS
@@ -332,6 +334,7 @@ class _Reader:
     path: Path | None
     what: str
     opset: int
+    trees: int
 
     def nodes(self, graph: Any, known: set[str], types: Mapping[str, int]) -> tuple[Node, ...]:
         """Return the nodes of a graph, checked."""
@@ -340,21 +343,25 @@ class _Reader:
             types[each.name] = each.type.tensor_type.elem_type
         types |= {each.name: each.data_type for each in graph.initializer}
         for node in graph.node:
-            if node.domain not in _DOMAINS:
+            of_trees = node.op_type in onnx_trees.OPERATORS
+            if node.domain not in ((DOMAIN,) if of_trees else _DOMAINS):
                 raise PolicyError(
-                    f"{self.what} uses {node.op_type} of {node.domain}, which is not ONNX's own"
+                    f"{self.what} uses {node.op_type} of {node.domain or 'ai.onnx'}, which is not "
+                    "supported: give the policy as a Python function, such as one of its runtime"
                 )
             attributes = {a.name: self._attribute(a, inner, types) for a in node.attribute}
             name = node.name or (node.output[0] if node.output else "")
             wide = any(types.get(output) in (7, 13) for output in node.output[:1])
             ports = tuple(node.input), tuple(node.output)
-            found.append(Node(node.op_type, name, *ports, attributes, self.opset, wide))
+            found.append(Node(_decoded(node.op_type), name, *ports, attributes, self.opset, wide))
             inner.update(node.output)
         check_nodes(found, known, [o.name for o in graph.output], self.what)
         for node in found:
-            version = f"in operator set {self.opset}"
+            of_trees = node.operator in onnx_trees.OPERATORS
+            opset, domain = (self.trees, DOMAIN) if of_trees else (self.opset, "")
+            version = f"in operator set {opset}"
             try:
-                page = self.package.defs.get_schema(node.operator, self.opset, "").attributes
+                page = self.package.defs.get_schema(node.operator, opset, domain).attributes
             except self.package.defs.SchemaError:
                 raise PolicyError(f"{node} of {self.what} is not {version}") from None
             more = [name for name in node.attributes if name not in page]
@@ -436,7 +443,7 @@ def _output(left: list[str], chosen: str | None, made: list[str], what: str) -> 
         return chosen
     if len(left) == 1:
         return left[0]
-    named = [n for n in left if n.lower().rstrip("s") in ("action", "mu", "mean", "logit")]
+    named = [n for n in left if n.lower().rstrip("s") in _ACTIONS]
     if len(named) != 1:
         raise PolicyError(
             f"{what} has outputs {', '.join(left)}: say which is the action by output="

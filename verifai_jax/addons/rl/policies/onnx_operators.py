@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from verifai_jax.addons.rl.policies import onnx_layers as layers
+from verifai_jax.addons.rl.policies import onnx_quantized, onnx_trees
 from verifai_jax.addons.rl.policies.onnx_node import (
     TYPES,
     Node,
@@ -292,10 +293,15 @@ def output_size(node: Node, *inputs: Any) -> int:
         case "Gather", 2:
             rows = max(1, shapes[0][node.get("axis", 0)])
             return math.prod(shapes[0]) // rows * math.prod(shapes[1])
-        case "MatMul", 2:
-            a, b = shapes
+        case "MatMul" | "MatMulInteger" | "QLinearMatMul", _:
+            a, b = shapes[0], shapes[3 if node.operator == "QLinearMatMul" else 1]
             batch = math.prod(np.broadcast_shapes(a[:-2], b[:-2]))
             return batch * math.prod(a[-2:-1]) * math.prod(b[-1:] if len(b) > 1 else ())
+        case "TreeEnsembleRegressor" | "TreeEnsembleClassifier", _:
+            # Of each node a threshold, and of each tree as many steps as the deepest one has.
+            nodes, trees = len(node.get("nodes_nodeids", ())), len({*node.get("nodes_treeids", ())})
+            targets = max(1, node.get("n_targets", 1), *node.get("class_ids", (0,)))
+            return nodes * targets + math.prod(shapes[0][:1]) * trees * targets
         case "Concat", _:
             return sum(map(math.prod, shapes))
         case "BatchNormalization" | "InstanceNormalization", _:
@@ -363,5 +369,6 @@ OPERATORS: dict[str, Callable[..., Any]] = {
     "GlobalAveragePool": lambda node, x: x.mean(tuple(range(2, x.ndim)), keepdims=True),
     "GlobalMaxPool": lambda node, x: x.max(tuple(range(2, x.ndim)), keepdims=True),
     **dict.fromkeys(("LSTM", "GRU", "RNN"), layers.recurrent),
+    **onnx_quantized.OPERATORS, **onnx_trees.OPERATORS,
 }  # fmt: skip
 """The operators that policies use, by name."""

@@ -18,7 +18,7 @@ import numpy as np
 
 from verifai_jax.addons.rl.policies.base import Actions, Normaliser, Policy
 from verifai_jax.addons.rl.policies.errors import MAX_BYTES, PolicyError, refused
-from verifai_jax.addons.rl.policies.networks import Mlp, activation_name
+from verifai_jax.addons.rl.policies.networks import LstmMlp, Mlp, activation_name
 from verifai_jax.addons.rl.policies.pickled import Name, Record, array_of, read_pickle
 from verifai_jax.addons.rl.policies.tensors import Tensors, linear_layers, natural
 from verifai_jax.addons.rl.policies.torch_archive import read_state
@@ -34,7 +34,9 @@ _KINDS = (
     ("q_net.q_net.0.weight", "q_net.q_net.", None, "q_net."),
 )
 """PPO and A2C; SAC, with and without hidden layers; TD3 and DDPG; DQN."""
-_POLICIES = re.compile(r"(ActorCritic|MaskableActorCritic|SAC|TD3|TQC|DQN|)(Mlp|Cnn|)Policy")
+_POLICIES = re.compile(
+    r"((?:Recurrent)?ActorCritic|MaskableActorCritic|SAC|TD3|TQC|DQN|)(Mlp|Cnn|)Policy"
+)
 _EXTRACTORS = re.compile("FlattenExtractor|NatureCNN")
 Space = tuple[str, dict[str, Any]]
 """The kind of a space of Gymnasium, and its attributes."""
@@ -64,6 +66,9 @@ def read_sb3(data: bytes, what: str) -> Policy:
         extractor = options.get("features_extractor_class")
         _check_class(extractor, _EXTRACTORS, "a features extractor", what)
         loaded = _policy(weights, observed, acts, options, what)
+        remembers = loaded.initial_memory is not None
+        if isinstance(kind, Name) and remembers != kind.name.startswith("Recurrent"):
+            raise PolicyError(f"{what} has a policy of the class {kind.name}, but other tensors")
         weights.settle(EXPORT, logging.INFO)
         return loaded
 
@@ -94,8 +99,7 @@ def _check_class(given: object, known: re.Pattern[str], role: str, what: str) ->
     """Refuse a class whose computation is not that of the library's own."""
     name = given.name if isinstance(given, Name) else ""
     if name and not known.fullmatch(name):
-        remembers = ", which remembers" if name.startswith("Recurrent") else ""
-        raise PolicyError(f"{what} has {role} of the class {name}{remembers}: {EXPORT}")
+        raise PolicyError(f"{what} has {role} of the class {name}: {EXPORT}")
 
 
 def _number(value: object, name: str, what: str) -> float:
@@ -141,8 +145,32 @@ def _policy(
     usual = "tanh" if on_policy else "relu"
     activation = activation_name(function.name if isinstance(function, Name) else usual)
     network, arrays = _network(weights, names, features, observed, activation, options, what)
+    cells, memory = _lstm(weights, what), None
+    if cells:
+        if network.pixels or cells[-1][1].shape[0] != arrays[0][0].shape[0]:
+            raise PolicyError(f"{what} remembers in an LSTM of a form that is unknown: {EXPORT}")
+        network, arrays = LstmMlp(activation, network.categories), (cells, arrays)
+        memory = tuple((jnp.zeros(r.shape[0]), jnp.zeros(r.shape[0])) for _, r, _ in cells)
     squashed = not on_policy or bool(options.get("squash_output", False))
-    return Policy(arrays, network, actions=_actions(acts, squashed, what))
+    return Policy(arrays, network, memory, actions=_actions(acts, squashed, what))
+
+
+def _lstm(weights: Tensors, what: str) -> tuple[tuple[Any, Any, Any], ...]:
+    """Return the layers of the actor's LSTM of RecurrentPPO: kernels, and the sum of biases."""
+    cells, before = [], None
+    while (at := f"l{len(cells)}") and f"lstm_actor.weight_ih_{at}" in weights:
+        names = [f"lstm_actor.{part}_{at}" for part in ("weight_ih", "weight_hh", "bias_ih")]
+        kernel, recurrent = (np.asarray(weights[name], np.float32).T for name in names[:2])
+        bias = np.zeros(kernel.shape[-1], np.float32)
+        for name in (names[2], names[2].replace("_ih", "_hh")):
+            bias = bias + (np.asarray(weights[name], np.float32) if name in weights else 0)
+        size = recurrent.shape[0]
+        odd = recurrent.shape != (size, 4 * size) or kernel.shape[1:] != (4 * size,)
+        if odd or before not in (None, kernel.shape[0]) or bias.shape != (4 * size,):
+            raise PolicyError(f"layer {at} of the LSTM of {what} has tensors that do not fit")
+        cells.append(tuple(map(jnp.asarray, (kernel, recurrent, bias))))
+        before = size
+    return tuple(cells)
 
 
 def _numbered(weights: Tensors, prefix: str) -> list[str]:
