@@ -41,7 +41,7 @@ KINDS = {
     "slow": faults.RateLimit("x", rate=vj.Box(0.5, 50), **WINDOW),
     "gain": faults.Gain("x", factor=vj.Box(1, 3), **WINDOW),
 }
-NO_KINDS = {"AtMost", "Fault", "on_host"}
+NO_KINDS = {"AtMost", "Fault", "Scale", "on_host"}
 assert {type(fault).__name__ for fault in KINDS.values()} == {*faults.__all__} - NO_KINDS
 
 

@@ -13,7 +13,7 @@ from verifai_jax.addons.simulators.remote_client import serve
 from verifai_jax.core.messages.errors import UnknownNameError
 
 KEY = jax.random.key(3)
-NO_KINDS = ("AtMost", "Fault", "on_host")
+NO_KINDS = ("AtMost", "Fault", "Scale", "on_host")
 KINDS = [getattr(faults, name) for name in faults.__all__ if name not in NO_KINDS]
 WINDOW = {"onset": vj.Box(0, 0.2), "duration": vj.Box(0, 5)}
 OPTIONS = {

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 from verifai_jax.core.display.lazy import attach
 
 if TYPE_CHECKING:
+    from verifai_jax.addons.faults.failure_table.sheet import Scale as Scale
     from verifai_jax.addons.faults.fault import AtMost as AtMost
     from verifai_jax.addons.faults.fault import Fault as Fault
     from verifai_jax.addons.faults.injection import on_host as on_host
