@@ -22,6 +22,7 @@ from verifai_jax.addons.monitoring import resampling
 from verifai_jax.addons.monitoring.columns import LeftOut
 from verifai_jax.addons.monitoring.containers import Episode
 from verifai_jax.addons.monitoring.dense import DenseValues, NotDense
+from verifai_jax.addons.monitoring.error_bars import ErrorBars, check_bars, with_bars
 from verifai_jax.addons.monitoring.judgement import Judgement, Row
 from verifai_jax.addons.monitoring.recorded import Recording, Recordings, named_recordings
 from verifai_jax.addons.monitoring.recording import read
@@ -58,6 +59,7 @@ class Reading(NamedTuple):
     max_gap: float | None
     end: End
     explain: bool
+    error_bars: ErrorBars | None = None
 
 
 class Found(NamedTuple):
@@ -83,6 +85,7 @@ def judge(
     max_gap: float | None = None,
     end: End = "hold",
     explain: bool = True,
+    error_bars: ErrorBars | None = None,
     run_on: RunOn | None = None,
     ended: Callable[[int, Sequence[Row]], None] | None = None,
     progress: bool | None = None,
@@ -109,6 +112,10 @@ def judge(
       samples, `"hold"` or `"linear"`.
     - `end`: as in `robustness`.
     - `explain`: whether to find the deciding predicate and instant.
+    - `error_bars`: by the name of a signal half the width of its error bar (a number, or an
+      expression of signals such as `"x_error"` or `"0.02 * abs(x)"`), or a pair of its ends. A
+      verdict is then `"holds"` or `"fails"` for all values within the bars, otherwise
+      `"depends"`; `robustness` and `highest` are the bounds of the robustness.
     - `run_on`: the workers of an executor, to read and judge in parallel.
     - `ended`: a function called with the index and the rows of each recording when it is done.
     - `progress`: whether to show one line of progress; see `core.display.progress` for the default.
@@ -123,7 +130,13 @@ def judge(
         raise ValueError(f"method is 'hold' or 'linear'; got {method!r}")
     if end not in ("hold", "truncate", "strict"):
         raise ValueError(f"end is 'hold', 'truncate' or 'strict'; got {end!r}")
-    reading = Reading(time, dt, time_unit, resample_to, method, missing, max_gap, end, explain)
+    if error_bars is not None:
+        check_bars([each.formalized for each in requirements], error_bars)
+        for each in requirements:
+            with_bars(each.formalized, error_bars)
+    reading = Reading(
+        time, dt, time_unit, resample_to, method, missing, max_gap, end, explain, error_bars
+    )
     rows: dict[int, Sequence[Row]] = {}
 
     def keep(index: int, found: Sequence[Row]) -> None:
@@ -199,15 +212,20 @@ def _judged(
     rows = []
     for each in requirements:
         try:
-            check_signals(each.formalized, trace, "the recording")
-            found, note = find(each.formalized)
+            asked, best = each.formalized, None
+            if reading.error_bars is not None:
+                asked, best = with_bars(asked, reading.error_bars)
+            check_signals(asked, trace, "the recording")
+            found, note = find(asked)
+            most = found if best is None else find(best)[0]
             unit, other = _unit(each, units)
             lasts = float(clock[-1] - clock[0])
             falls = shortfalls_in(signals, each.formalized, dt, lasts, reading.end)
             notes = "; ".join(filter(None, [*map(str, falls), *said, note, other]))
-            verdict = "holds" if found.holds else "fails"
+            verdict = "holds" if found.holds else "depends" if most.holds else "fails"
             decided = (found.robustness, found.instant, found.explanation)
-            rows.append(Row(name, each.id, verdict, *decided, note=notes, unit=unit))
+            about = {"note": notes, "unit": unit, "highest": most.robustness}
+            rows.append(Row(name, each.id, verdict, *decided, **about))
         except (ValueError, TypeError) as error:
             rows.append(Row(name, each.id, error=one_line(str(error))))
     return rows

@@ -20,6 +20,7 @@ import numpy as np
 from jaxtyping import Float
 
 from verifai_jax.addons.monitoring.c_monitor import HEAD, HELPERS, monitor_code
+from verifai_jax.addons.monitoring.error_bars import Bounds, ErrorBars, bounded
 from verifai_jax.addons.monitoring.margins import ALONE, Margins, margins
 from verifai_jax.addons.monitoring.python_machine import PythonMachine
 from verifai_jax.addons.native.native_code.machine_code import Unavailable, compiler, load_library
@@ -229,8 +230,18 @@ def _number(column: str, sample: Mapping[str, Any], index: int | None) -> float:
 @overload
 def watch(
     formulas: Formula | str, dt: float, *, semantics: Semantics = ..., every: bool = ...,
-    sizes: Mapping[str, int] | None = ...,
+    sizes: Mapping[str, int] | None = ..., error_bars: None = ...,
 ) -> Watch[float]: ...  # fmt: skip
+@overload
+def watch(
+    formulas: Formula | str, dt: float, *, semantics: Semantics = ..., every: bool = ...,
+    sizes: Mapping[str, int] | None = ..., error_bars: ErrorBars,
+) -> Watch[Bounds]: ...  # fmt: skip
+@overload
+def watch(
+    formulas: Mapping[str, Formula | str], dt: float, *, semantics: Semantics = ...,
+    every: bool = ..., sizes: Mapping[str, int] | None = ..., error_bars: ErrorBars,
+) -> Watch[dict[str, Bounds]]: ...  # fmt: skip
 @overload
 def watch(
     formulas: Mapping[str, Formula | str], dt: float, *, semantics: Semantics = ...,
@@ -239,7 +250,8 @@ def watch(
 def watch(
     formulas: Formula | str | Mapping[str, Formula | str], dt: float, *,
     semantics: Semantics = hard, every: bool = False, sizes: Mapping[str, int] | None = None,
-) -> "Watch[float] | Watch[dict[str, float]]":  # fmt: skip
+    error_bars: ErrorBars | None = None,
+) -> Watch[Any]:  # fmt: skip
     """Monitor one formula, or several by name, on samples `dt` seconds apart.
 
     Values are those of `robustness` in double precision, bit for bit, except for the last digit of
@@ -250,14 +262,21 @@ def watch(
     - `every`: whether each formula is evaluated at every instant, not only at time 0. No formula
       may then look ahead without bound.
     - `sizes`: number of components of each signal whose norm the formulas use.
+    - `error_bars`: how uncertain signals are, as in `judge`. Each result is then a pair `low`,
+      `high` with its `verdict`: for all values within the bars, for none, or it depends.
     **Returns:** a monitor; its results are numbers, or dictionaries for several formulas.
     **Raises:** `IntervalError` for an interval that is not a multiple of `dt`; `ValueError` for
     smooth semantics, for an unbounded future operator inside another temporal operator, and for a
     norm without a size.
     """
-    plan = streams(formulas, dt, semantics, every)
+    wanted = formulas if error_bars is None else bounded(formulas, error_bars)
+    plan = streams(wanted, dt, semantics, every)
     front = margins(plan, sizes or {}, apart=True)
     if not isinstance(formulas, Mapping):
-        return Watch(plan, front, lambda out: out[0])
+        first = lambda out: out[0]  # noqa: E731
+        return Watch(plan, front, first if error_bars is None else lambda out: Bounds(*out))
     names = tuple(formulas)
+    if error_bars is not None:
+        pairs = [(name, slice(2 * k, 2 * k + 2)) for k, name in enumerate(names)]
+        return Watch(plan, front, lambda out: {name: Bounds(*out[k]) for name, k in pairs})
     return Watch(plan, front, lambda out: dict(zip(names, out, strict=True)))
