@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from verifai_jax.addons.assurance.odd_files import odd_of as odd_of
     from verifai_jax.addons.assurance.odd_files import read_odd as read_odd
     from verifai_jax.addons.assurance.qualification import qualify as qualify
+    from verifai_jax.addons.assurance.signing import sign_report as sign_report
     from verifai_jax.addons.assurance.traceability import TraceMatrix as TraceMatrix
     from verifai_jax.addons.assurance.traceability import trace_matrix as trace_matrix
     from verifai_jax.addons.checking import replay_counterexamples as replay_counterexamples
