@@ -55,6 +55,7 @@ if TYPE_CHECKING:
     from verifai_jax.addons.scenic import ProgramError as ProgramError
     from verifai_jax.addons.scenic import ScenicProgram as ScenicProgram
     from verifai_jax.addons.scenic import scenic as scenic
+    from verifai_jax.addons.scenic import scenic_sampler as scenic_sampler
     from verifai_jax.addons.simulators import blocks as blocks
     from verifai_jax.addons.simulators.environments import brax as brax
     from verifai_jax.addons.simulators.environments import gymnasium as gymnasium

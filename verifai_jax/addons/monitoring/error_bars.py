@@ -50,7 +50,7 @@ class Ends(NamedTuple):
 
     @property
     def certain(self) -> bool:
-        """Whether both ends are one expression."""
+        """True if both ends are one expression."""
         return self.low is self.high
 
 

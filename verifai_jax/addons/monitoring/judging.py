@@ -217,14 +217,14 @@ def _judged(
                 asked, best = with_bars(asked, reading.error_bars)
             check_signals(asked, trace, "the recording")
             found, note = find(asked)
-            most = found if best is None else find(best)[0]
+            highest = found if best is None else find(best)[0]
             unit, other = _unit(each, units)
             lasts = float(clock[-1] - clock[0])
             falls = shortfalls_in(signals, each.formalized, dt, lasts, reading.end)
             notes = "; ".join(filter(None, [*map(str, falls), *said, note, other]))
-            verdict = "holds" if found.holds else "depends" if most.holds else "fails"
+            verdict = "holds" if found.holds else "depends" if highest.holds else "fails"
             decided = (found.robustness, found.instant, found.explanation)
-            about = {"note": notes, "unit": unit, "highest": most.robustness}
+            about = {"note": notes, "unit": unit, "highest": highest.robustness}
             rows.append(Row(name, each.id, verdict, *decided, **about))
         except (ValueError, TypeError) as error:
             rows.append(Row(name, each.id, error=one_line(str(error))))

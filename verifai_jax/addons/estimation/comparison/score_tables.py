@@ -6,16 +6,16 @@ read_scores("successes.csv")                        # success or score, by seed 
 read_scores(np.array([[0.8, 0.4], [0.7, 0.6]]))     # scores of runs [runs, tasks]
 """
 
+import io
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias, TypeGuard
 
 import numpy as np
 
-from verifai_jax.addons.estimation.trials.reading import table_of
 from verifai_jax.core.messages.errors import missing_name
-from verifai_jax.core.store.foreign_archives import check_values, read_arrays
-from verifai_jax.core.store.foreign_files import read_json
+from verifai_jax.core.store.foreign_archives import check_values, read_arrays, read_parquet
+from verifai_jax.core.store.foreign_files import read_json, read_text
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -63,8 +63,11 @@ def read_scores(given: Any) -> "pd.DataFrame":
         table = _of_matrix(next(iter(arrays.values())), name)
     elif isinstance(given, np.ndarray):
         table = _of_matrix(given, name)
+    elif suffix == ".parquet":
+        table = _of_table(read_parquet(Path(given)).to_pandas(), name)
     else:
-        table = _of_table(table_of(given)[0], name)
+        read = pd.read_csv(io.StringIO(read_text(given))) if suffix else given
+        table = _of_table(read, name)
     scores = table["score"].to_numpy(float)
     if not len(scores) or not np.isfinite(scores).all():
         what = f"row {int(np.argmin(np.isfinite(scores)))} is not finite" if len(scores) else "none"
@@ -118,8 +121,8 @@ def _of_table(table: Any, name: str) -> "pd.DataFrame":
             raise ValueError(f"successes of {name} must be whole numbers from 0 to episodes")
         check_values(int(count.sum()), name)
         rows = np.repeat(np.arange(len(table)), count)
-        place = np.arange(len(rows)) - np.repeat(np.cumsum(count) - count, count)
-        return table[keys].iloc[rows].assign(episode=place, score=place < won[rows])
+        episode = np.arange(len(rows)) - np.repeat(np.cumsum(count) - count, count)
+        return table[keys].iloc[rows].assign(episode=episode, score=episode < won[rows])
     column = next((each for each in SCORES if each in table.columns), None)
     if column is None:
         raise missing_name(name, "column", "success", list(table.columns))

@@ -1,4 +1,4 @@
-"""How well a detector on board finds faults: false alarms, misses and delays, by simulation.
+"""False alarms, misses and delays of a detector on board, measured by simulation.
 
 detector = as_detector("once[0, 0.1] abs(control - expected) > 0.4")
 detector(trace)                             # at which samples it gives an alarm

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Detection:
-    """What a detector on board finds of a fault, or of a pair.
+    """The misses and the delay of a detector on board, for a fault or a pair.
 
     - `missed`: the share of simulations without an alarm from the onset until the property is
       broken, or until the end if it is not, with its interval.
