@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import verifai_jax as vj
-from verifai_jax.addons.scenic.compilation import _without_verifai
+from verifai_jax.addons.scenic.compilation import without_verifai
 
 PROGRAM = """
 ego = new Object at Range(-10, 10) @ Range(-10, 10), with speed Range(0, 30)
@@ -65,7 +65,7 @@ class TestWithScenic:
     def test_an_external_sampler_of_scenic(self):
         import scenic
 
-        with _without_verifai():
+        with without_verifai():
             sampler = vj.scenic_sampler("cross_entropy", seed=3)
             scenario = scenic.scenarioFromString(
                 EXTERNAL, mode2D=True, params={"externalSampler": sampler}
