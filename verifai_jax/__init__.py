@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from verifai_jax.addons.estimation.certification import Certification as Certification
     from verifai_jax.addons.estimation.certification import certify as certify
     from verifai_jax.addons.estimation.comparison import Comparison as Comparison
+    from verifai_jax.addons.estimation.comparison import ScoreComparison as ScoreComparison
     from verifai_jax.addons.estimation.comparison import compare as compare
     from verifai_jax.addons.estimation.comparison import transfer as transfer
     from verifai_jax.addons.estimation.error_budgets import ErrorBudget as ErrorBudget

@@ -224,6 +224,8 @@ def test_what_cannot_be_compared():
         vj.compare(one.drop(columns="seed"), other.drop(columns="seed"), in_order=True)
     with pytest.raises(ValueError, match="margin must be a difference of scores, 0 or more"):
         vj.compare(one, other, margin=-1)
+    with pytest.raises(ValueError, match="cluster and in_order are for tables of scores on both"):
+        vj.compare(one, "spec.py:balance", in_order=True)
     with pytest.raises(FileNotFoundError, match=r"there is no file gone.csv of scores"):
         vj.compare("gone.csv", one)
 

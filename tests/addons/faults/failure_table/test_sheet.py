@@ -141,6 +141,7 @@ def test_a_formula_that_looks_ahead_gives_its_alarm_later():
     assert as_detector("x > 1")(trace).tolist() == [False, *[True] * 2, False, *[True] * 4]
     assert np.argmax(as_detector("historically[0, 0.2] x > 1")(trace)) == 6
     assert np.argmax(as_detector("always[0, 0.2] x > 1")(trace)) == 6
+    assert np.argmax(as_detector(vj.parse("historically[0, 0.2] x > 1"))(trace)) == 6
     assert as_detector(lambda trace: np.asarray(trace["x"]) > 1)(trace).sum() == 6
     with pytest.raises(ValueError, match="looks ahead without end, and so never gives an alarm"):
         as_detector("always x > 1")

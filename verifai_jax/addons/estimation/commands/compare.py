@@ -60,6 +60,8 @@ def compare(
         say(scores)
         give_result(**as_plain(scores), verdict=scores.verdict, regression=scores.regression)
         return check_gate(fail_on, {"regression": scores.regression})
+    if options.pop("in_order"):
+        raise click.UsageError("--in-order goes with tables of scores")
     with kept_until_done() as kept, arguments.on_cluster(cluster) as executor:
         named = {name: name for name in candidates}
         result = run_compare(target, named, **arguments.values_of(options, executor=executor))

@@ -113,6 +113,8 @@ def compare(
         one, other = (each if isinstance(each, str) else "" for each in (baseline, candidates))
         named = one or "the baseline", other or "the candidate"
         return compare_scores((baseline, candidates), named, margin, confidence, cluster, in_order)
+    if cluster is not None or in_order:
+        raise ValueError("cluster and in_order are for tables of scores on both sides")
     seconds = options_of("compare", Stop, stop, "seconds").seconds
     executor = options_of("compare", RunOn, run_on, "executor").executor
     with ExitStack() as loaded:

@@ -128,8 +128,11 @@ def fmea(
                 own = {row: verdicts[row] for row in range(first, last) if row in verdicts}
                 effect = with_counterexample(effect, run, own, known)
             bounds = {"probability": probability, "low": low, "high": high}
-            seen = detector and detection(rows, effect.faults, detector, samples, confidence)
-            effects.append(replace(effect, occurrence=chance, **bounds, detection=seen))
+            effect = replace(effect, occurrence=chance, **bounds)
+            if detector is not None:
+                seen = detection(rows, effect.faults, detector, samples, confidence)
+                effect = replace(effect, detection=seen)
+            effects.append(effect)
         if detector is not None:
             alarms = false_alarms(rows, detector, samples, confidence)
     effects.sort(key=lambda effect: (-effect.fails, -effect.probability, effect.faults))
