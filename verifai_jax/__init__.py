@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from verifai_jax.addons.assurance.odd_files import odd_of as odd_of
     from verifai_jax.addons.assurance.odd_files import read_odd as read_odd
     from verifai_jax.addons.assurance.qualification import qualify as qualify
+    from verifai_jax.addons.assurance.signing import sign_report as sign_report
     from verifai_jax.addons.assurance.traceability import TraceMatrix as TraceMatrix
     from verifai_jax.addons.assurance.traceability import trace_matrix as trace_matrix
     from verifai_jax.addons.checking import replay_counterexamples as replay_counterexamples
@@ -31,6 +32,7 @@ if TYPE_CHECKING:
     from verifai_jax.addons.estimation.certification import Certification as Certification
     from verifai_jax.addons.estimation.certification import certify as certify
     from verifai_jax.addons.estimation.comparison import Comparison as Comparison
+    from verifai_jax.addons.estimation.comparison import ScoreComparison as ScoreComparison
     from verifai_jax.addons.estimation.comparison import compare as compare
     from verifai_jax.addons.estimation.comparison import transfer as transfer
     from verifai_jax.addons.estimation.error_budgets import ErrorBudget as ErrorBudget
@@ -55,6 +57,7 @@ if TYPE_CHECKING:
     from verifai_jax.addons.scenic import ProgramError as ProgramError
     from verifai_jax.addons.scenic import ScenicProgram as ScenicProgram
     from verifai_jax.addons.scenic import scenic as scenic
+    from verifai_jax.addons.scenic import scenic_sampler as scenic_sampler
     from verifai_jax.addons.simulators import blocks as blocks
     from verifai_jax.addons.simulators.environments import brax as brax
     from verifai_jax.addons.simulators.environments import gymnasium as gymnasium

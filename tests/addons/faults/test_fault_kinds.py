@@ -33,8 +33,15 @@ KINDS = {
     "jitter": faults.ClockJitter("x", jitter=vj.Box(0, 0.5), **WINDOW),
     "flip": faults.SignFlip("x", **WINDOW),
     "wrong": faults.WrongChannel("x", source="clock", **WINDOW),
+    "lopsided": faults.Saturation(
+        "x", limit=vj.Box(1.5, 50), lower=vj.Box(-50, 1.4), name="x_lopsided", **WINDOW
+    ),
+    "band": faults.DeadBand("x", width=vj.Box(0, 2), **WINDOW),
+    "backlash": faults.Backlash("x", gap=vj.Box(0, 3), **WINDOW),
+    "slow": faults.RateLimit("x", rate=vj.Box(0.5, 50), **WINDOW),
+    "gain": faults.Gain("x", factor=vj.Box(1, 3), **WINDOW),
 }
-NO_KINDS = {"AtMost", "Fault", "on_host"}
+NO_KINDS = {"AtMost", "Fault", "Scale", "on_host"}
 assert {type(fault).__name__ for fault in KINDS.values()} == {*faults.__all__} - NO_KINDS
 
 
@@ -143,7 +150,7 @@ def test_severity_zero_and_onset_after_the_end_are_no_fault(simulate, healthy, n
 
 def by_hand(name, good, begin, end):
     """What is seen, sample by sample, of the kinds that draw nothing."""
-    seen, before = [], None
+    seen, before, last = [], None, good[0]
     for k, x in enumerate(good):
         inside = begin <= k < end
         bad = {
@@ -159,8 +166,16 @@ def by_hand(name, good, begin, end):
             "held": lambda k=k: good[begin + (k - begin) // 4 * 4],
             "flip": lambda x=x: -x,
             "wrong": lambda k=k: k * DT,
+            "lopsided": lambda x=x: 1.6 if x > 1.6 else -0.2 if x < -0.2 else x,
+            "band": lambda x=x: x - 1.2 if x > 1.2 else x + 1.2 if x < -1.2 else 0.0,
+            "backlash": lambda x=x, last=last: (
+                x - 0.6 if x - last > 0.6 else x + 0.6 if last - x > 0.6 else last
+            ),
+            "slow": lambda x=x, last=last: last + math.copysign(min(abs(x - last), 0.09), x - last),
+            "gain": lambda x=x: 2.5 * x,
         }[name]
-        seen.append(bad() if inside else x)
+        last = bad() if inside else x
+        seen.append(last)
         before = before if inside else x
     return seen
 
@@ -168,7 +183,8 @@ def by_hand(name, good, begin, end):
 NUMBERS = {
     "delay": {"seconds": 0.31}, "bias": {"offset": 0.7}, "drift": {"rate": 0.8},
     "quantisation": {"step": 0.5}, "saturation": {"limit": 1.3}, "loss": {"loss": 0.4},
-    "held": {"hold": 0.4},
+    "held": {"hold": 0.4}, "lopsided": {"limit": 1.6, "lower": -0.2}, "band": {"width": 1.2},
+    "backlash": {"gap": 1.2}, "slow": {"rate": 0.9}, "gain": {"factor": 2.5},
 }  # fmt: skip
 
 
@@ -180,6 +196,44 @@ def test_against_a_loop_by_hand(simulate, name):
     expected = by_hand(name, good, 7, 18)
     np.testing.assert_allclose(trace["seen"], expected, atol=1e-5)
     np.testing.assert_allclose(trace["x"], good, atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("kind", "number"),
+    [("lopsided", {"limit": 2.0, "lower": -0.25}), ("band", {"width": 1.1}),
+     ("backlash", {"gap": 1.7}), ("slow", {"rate": 6.0}), ("gain", {"factor": 1.8})],
+)  # fmt: skip
+def test_faults_of_mechanics_on_random_values_against_a_loop_in_numpy(kind, number):
+    """With values of both signs that turn often, and two entries."""
+    rng = np.random.default_rng(5)
+    good = np.cumsum(rng.normal(size=(200, 2)), axis=0)
+    good[:, 1] *= -0.5
+    made = {
+        "lopsided": faults.Saturation, "band": faults.DeadBand, "backlash": faults.Backlash,
+        "slow": faults.RateLimit, "gain": faults.Gain,
+    }[kind]("observation", **number, onset=3.0, duration=12.0)  # fmt: skip
+    loop, expected, last = faults.on_host([made], {}, period=0.1), [], None
+    read = [loop.observation(0.1 * k, value) for k, value in enumerate(good)]
+    for k, value in enumerate(good):
+        if 30 <= k < 150 and kind == "lopsided":
+            last = np.minimum(np.maximum(value, -0.25), 2.0)
+        elif 30 <= k < 150 and kind == "band":
+            last = np.sign(value) * np.maximum(np.abs(value) - 1.1, 0)
+        elif 30 <= k < 150 and kind == "backlash":
+            last = np.minimum(np.maximum(last, value - 0.85), value + 0.85)
+        elif 30 <= k < 150 and kind == "slow":
+            last = last + np.minimum(np.maximum(value - last, -0.6), 0.6)
+        elif 30 <= k < 150:
+            last = 1.8 * value
+        else:
+            last = value
+        expected.append(last)
+    np.testing.assert_allclose(read, expected, atol=1e-9)
+
+
+def test_a_lower_limit_above_the_upper_one_is_refused():
+    with pytest.raises(ValueError, match=r"lower of Saturation must not exceed limit, 1.0; got 2"):
+        faults.Saturation("x", limit=1.0, lower=2.0)
 
 
 @pytest.mark.thorough

@@ -13,7 +13,7 @@ from verifai_jax.addons.simulators.remote_client import serve
 from verifai_jax.core.messages.errors import UnknownNameError
 
 KEY = jax.random.key(3)
-NO_KINDS = ("AtMost", "Fault", "on_host")
+NO_KINDS = ("AtMost", "Fault", "Scale", "on_host")
 KINDS = [getattr(faults, name) for name in faults.__all__ if name not in NO_KINDS]
 WINDOW = {"onset": vj.Box(0, 0.2), "duration": vj.Box(0, 5)}
 OPTIONS = {
@@ -23,6 +23,8 @@ OPTIONS = {
     "Saturation": {"limit": vj.Box(0.1, 1e6)}, "Stuck": {"value": 1.0},
     "LossOfAuthority": {"loss": vj.Box(0, 1)}, "HeldAction": {"hold": vj.Box(0, 0.2)},
     "PacketLoss": {"loss": vj.Box(0, 1)}, "ClockJitter": {"jitter": vj.Box(0, 0.2)},
+    "DeadBand": {"width": vj.Box(0, 1)}, "Backlash": {"gap": vj.Box(0, 1)},
+    "RateLimit": {"rate": vj.Box(1e-3, 1e6)}, "Gain": {"factor": vj.Box(1, 3)},
 }  # fmt: skip
 
 

@@ -18,11 +18,17 @@ from verifai_jax.cli.json_output import command, draw, give_result, say
 )
 @option("--pairs/--no-pairs", default=True, help="Try pairs of faults.")
 @option("--confidence", default=0.95)
+@option("--detector", help="Formula that is true while a detector on board gives an alarm.")
+@option("--words", type=PATH, help="CSV file: fault, component, cause, effect, severity, ...")
+@option("--xlsx", type=PATH, help="Write the sheet of an FMEA.")
 @arguments.SEED
 @option("--folder", type=PATH, help="Folder to write, or to continue  [default: runs/fmea-NAME]")
 @arguments.PLOT
 @arguments.PROGRESS
-def fmea(target: str, folder: Path | None, plot: Path | None, **options: Any) -> None:
+def fmea(
+    target: str, folder: Path | None, plot: Path | None, words: Path | None, xlsx: Path | None,
+    **options: Any,
+) -> None:  # fmt: skip
     """Tabulate the effect and the probability of each fault of TARGET (FILE.py:NAME)."""
     from verifai_jax import fmea as run
 
@@ -35,6 +41,14 @@ def fmea(target: str, folder: Path | None, plot: Path | None, **options: Any) ->
     for effect in found:
         if effect.row is not None:
             say(f"  {effect.name}: {effect.command}")
-    give_result(name=found.name, effects=found.effects, healthy=found.healthy)
+    if xlsx is not None or words is not None:
+        sheet = found.sheet(words)
+        say(f"  sheet        {sheet.to_csv(into / 'sheet.csv')}")
+        if xlsx is not None:
+            say(f"  sheet        {sheet.to_xlsx(xlsx)}")
+    give_result(
+        name=found.name, effects=found.effects, healthy=found.healthy,
+        false_alarms=found.false_alarms,
+    )  # fmt: skip
     if plot is not None:
         draw(found, plot)

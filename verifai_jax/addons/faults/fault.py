@@ -136,11 +136,11 @@ class Fault:
 
     @property
     def numbers(self) -> dict[str, Number]:
-        """All numbers by name, those of the kind first; `duration` only if the fault ends."""
-        timing = ("onset",) if self.duration is None else ("onset", "duration")
-        all_of_them = [each.name for each in fields(self) if each.metadata]
-        own = [name for name in all_of_them if name not in ("onset", "duration")]
-        return {name: getattr(self, name) for name in (*own, *timing)}
+        """All numbers by name, those of the kind first, without those that are None."""
+        timing = ("onset", "duration")
+        own = [each.name for each in fields(self) if each.metadata and each.name not in timing]
+        given = {name: getattr(self, name) for name in (*own, *timing)}
+        return {name: value for name, value in given.items() if value is not None}
 
     @property
     def domains(self) -> dict[str, Domain]:

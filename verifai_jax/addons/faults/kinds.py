@@ -1,4 +1,4 @@
-"""The sixteen kinds of faults."""
+"""The kinds of faults."""
 
 import math
 from dataclasses import field
@@ -9,7 +9,7 @@ import numpy as np
 from jax.lax import erf_inv
 from jaxtyping import PyTree
 
-from verifai_jax.addons.faults.fault import SLACK, Fault, Moment, Number, Vector, number
+from verifai_jax.addons.faults.fault import SLACK, Fault, Moment, Number, Vector, ends, number
 from verifai_jax.core.compute.derivatives import with_derivative_of
 from verifai_jax.systems.delays import entry, moved_up
 
@@ -152,12 +152,70 @@ class Quantisation(Fault, severity="step", choices=False):
 
 
 class Saturation(Fault, severity="limit", off=math.inf, choices=False):
-    """Values are limited to between `-limit` and `limit`."""
+    """Values are limited to between `lower` and `limit`; without `lower`, from `-limit` on."""
 
     limit: Number = number(0)
+    lower: Number | None = number(default=None)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.lower is not None and ends(self.lower)[1] > ends(self.limit)[0]:
+            raise ValueError(
+                f"lower of Saturation must not exceed limit, {self.limit!r}; got {self.lower!r}"
+            )
+
+    def weakest(self, name: str) -> PyTree:
+        return ends(self.domains[name])[0] if name == "lower" else super().weakest(name)
 
     def corrupt(self, good: Vector, memory: PyTree, at: Moment) -> tuple[Vector, PyTree]:
-        return at.xp.clip(good, -at.number["limit"], at.number["limit"]), memory
+        limit = at.number["limit"]
+        return at.xp.clip(good, at.number.get("lower", -limit), limit), memory
+
+
+class DeadBand(Fault, severity="width", choices=False):
+    """Values within `width` of zero read zero, and others are closer to zero by `width`.
+
+    An example is a valve whose spool has an overlap.
+    """
+
+    width: Number = number(0)
+
+    def corrupt(self, good: Vector, memory: PyTree, at: Moment) -> tuple[Vector, PyTree]:
+        width = at.number["width"]
+        return good - at.xp.clip(good, -width, width), memory
+
+
+class Backlash(Fault, severity="gap", choices=False, holds=True):
+    """The channel has a mechanical play of `gap`: it moves only when it is pushed from one end."""
+
+    gap: Number = number(0)
+
+    def corrupt(self, good: Vector, memory: PyTree, at: Moment) -> tuple[Vector, PyTree]:
+        half = at.number["gap"] / 2
+        dragged = at.xp.clip(memory, good - half, good + half)
+        held = at.xp.where(at.live & ~at.first, dragged, good)
+        return held, held
+
+
+class RateLimit(Fault, severity="rate", off=math.inf, choices=False, holds=True):
+    """The channel changes by at most `rate` per second."""
+
+    rate: Number = number(0)
+
+    def corrupt(self, good: Vector, memory: PyTree, at: Moment) -> tuple[Vector, PyTree]:
+        step = at.number["rate"] * at.period
+        followed = at.xp.clip(good, memory - step, memory + step)
+        held = at.xp.where(at.live & ~at.first, followed, good)
+        return held, held
+
+
+class Gain(Fault, severity="factor", off=1.0, choices=False):
+    """Values are multiplied by `factor`, such as 1.5 for an amplifier that is set too high."""
+
+    factor: Number = number()
+
+    def corrupt(self, good: Vector, memory: PyTree, at: Moment) -> tuple[Vector, PyTree]:
+        return good * at.number["factor"], memory
 
 
 class LossOfAuthority(Fault, severity="loss", choices=False):

@@ -10,6 +10,7 @@ import math
 import re
 from collections.abc import Mapping, Sequence
 
+from verifai_jax.addons.monitoring.error_bars import ErrorBars, bounded
 from verifai_jax.addons.monitoring.margins import Margins, Step, margins
 from verifai_jax.addons.monitoring.quantities import completed
 from verifai_jax.core.messages.text import printable
@@ -281,7 +282,7 @@ static inline void @name_finish(const @name *m, @name *scratch, double out[@outp
 def export_c(
     formulas: Formula | str | Mapping[str, Formula | str], dt: float, name: str = "monitor", *,
     semantics: Semantics = hard, every: bool = False, sizes: Mapping[str, int] | None = None,
-    units: Mapping[str, str] | None = None,
+    units: Mapping[str, str] | None = None, error_bars: ErrorBars | None = None,
 ) -> str:  # fmt: skip
     """Return a C99 header with a monitor of one formula, or of several by name.
 
@@ -295,6 +296,7 @@ def export_c(
     - `semantics`: `hard` or `boolean`.
     - `every`: whether each formula is evaluated at every instant, not only at time 0.
     - `sizes`, `units`: as in `watch`.
+    - `error_bars`: as in `watch`; each formula has two results, the least and the greatest value.
     **Returns:** the text of the header.
     **Raises:** the errors of `watch`; `ValueError` for a name that is not a C identifier, or that C
     or the code itself uses.
@@ -308,7 +310,10 @@ def export_c(
             f"the name of a monitor must be free in C, where {name!r} means something else or may; "
             f"such as {name.lower()}_monitor"
         )
-    plan = streams(completed(formulas, units, sizes), dt, semantics, every)
+    wanted = completed(formulas, units, sizes)
+    if error_bars is not None:
+        wanted = bounded(wanted, error_bars)
+    plan = streams(wanted, dt, semantics, every)
     front = margins(plan, sizes or {})
     columns = [
         f"x[{k}] {n}{'' if i is None else f'[{i}]'}" for k, (n, i) in enumerate(front.columns)

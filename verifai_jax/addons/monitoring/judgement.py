@@ -29,13 +29,16 @@ MIN_RECORDINGS = 5
 class Row(NamedTuple):
     """One requirement on one recording.
 
-    - `verdict`: `"holds"`, `"fails"`, or empty without a verdict.
+    - `verdict`: `"holds"`, `"fails"`, `"depends"` on values within error bars, or empty without a
+      verdict.
     - `instant`: time of the deciding sample in seconds; NaN if there is none.
     - `explanation`: the predicate that decides at that time, with its margin.
     - `error`: the reason why there is no verdict.
     - `note`: what to know of the recording and the verdict: a hole, or what the requirement says
       otherwise than it seems to, of a recording this long.
     - `unit`: unit of the robustness as recorded, or else that of the requirement.
+    - `highest`: the greatest robustness of values within the error bars, of which `robustness` is
+      the least; without error bars they are equal.
     """
 
     file: str
@@ -47,6 +50,7 @@ class Row(NamedTuple):
     error: str = ""
     note: str = ""
     unit: str = ""
+    highest: float = math.nan
 
 
 @dataclass(frozen=True)
@@ -82,6 +86,11 @@ class Judgement(Reported, InNotebook):
         return tuple(sorted(rows, key=lambda row: row.robustness))
 
     @property
+    def depending(self) -> tuple[Row, ...]:
+        """The rows whose verdict depends on values within error bars."""
+        return tuple(row for row in self.rows if row.verdict == "depends")
+
+    @property
     def without_verdict(self) -> tuple[Row, ...]:
         """The rows without a verdict."""
         return tuple(row for row in self.rows if not row.verdict)
@@ -89,7 +98,7 @@ class Judgement(Reported, InNotebook):
     @property
     def all_hold(self) -> bool:
         """True if every requirement has a verdict on every recording and holds."""
-        return not self.failing and not self.without_verdict
+        return all(row.verdict == "holds" for row in self.rows)
 
     def of(self, requirement: str) -> list[Row]:
         """Return the rows of a requirement that have a verdict."""
@@ -177,6 +186,8 @@ class Judgement(Reported, InNotebook):
         asked = counted(len(self.requirements), "requirement")
         asked += f" on {counted(len(self.files), 'recording')}"
         lines = [f"{asked}: {len(failing)} of {len(self.rows) - len(missing)} verdicts fail"]
+        open_ones = self.depending
+        lines[0] += f", {len(open_ones)} depend on values within error bars" if open_ones else ""
         lines[0] += f", and {len(missing)} could not be given" if missing else ""
         width = max(len(each.id) for each in self.requirements)
         lines += ["", f"  {'':{width}}  {'failing':<12}{'least':>10}{'median':>12}"]
@@ -188,8 +199,9 @@ class Judgement(Reported, InNotebook):
             unit = self.unit_of(each)
             lines.append(f"  {each.id:{width}}  {share:<10}{numbers} {unit}".rstrip())
         lines += _listed("Failing, the worst first:", failing)
+        lines += _listed("Depending on values within error bars:", open_ones)
         lines += _listed("Without a verdict:", _together(missing))
-        if (tightest := self.tightest) is not None and not failing:
+        if (tightest := self.tightest) is not None and not failing + open_ones:
             lines += ["", f"Tightest: {tightest.requirement} on {tightest.file}"]
             lines += [f"  {tightest.explanation}"] if tightest.explanation else []
         return "\n".join([*lines, *_noted(self.rows)])
@@ -210,7 +222,8 @@ class Judgement(Reported, InNotebook):
         root = ElementTree.Element("testsuites", name="requirements")
         for each in self.requirements:
             rows = [row for row in self.rows if row.requirement == each.id]
-            fails, errors = (sum(row.verdict == kind for row in rows) for kind in ("fails", ""))
+            fails = sum(row.verdict == "fails" for row in rows)
+            errors = sum(row.verdict in ("", "depends") for row in rows)
             numbers = {"tests": len(rows), "failures": fails, "errors": errors}
             about = {"name": printable(each.id)} | {n: str(k) for n, k in numbers.items()}
             suite = ElementTree.SubElement(root, "testsuite", about)
@@ -227,7 +240,8 @@ def _case(suite: ElementTree.Element, requirement: Requirement, row: Row) -> Non
     if row.verdict == "holds":
         return
     said = printable(row.error or f"robustness {row.robustness:z.6g}; {row.explanation}")
-    fault = ElementTree.SubElement(case, "failure" if row.verdict else "error", message=said)
+    kind = "failure" if row.verdict == "fails" else "error"
+    fault = ElementTree.SubElement(case, kind, message=said)
     about = (requirement.text, str(requirement.formula), requirement.source)
     fault.text = printable("\n".join(line for line in about if line))
 

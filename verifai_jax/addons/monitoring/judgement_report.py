@@ -31,7 +31,9 @@ def judgement_page(judgement: Judgement, about: About, problem: object = None) -
     asked = counted(len(judgement.requirements), "requirement")
     headline = f"{len(failing):,} of {verdicts:,} verdicts fail: {asked} on {fleet}."
     headline += f" {len(missing):,} verdicts could not be given." if missing else ""
-    tone = "fails" if failing else "open" if missing or not verdicts else "holds"
+    if judgement.depending:
+        headline += f" {len(judgement.depending):,} verdicts depend on values within error bars."
+    tone = "fails" if failing else "holds" if judgement.all_hold and verdicts else "open"
     claims = []
     for index, each in enumerate(judgement.requirements, 1):
         rows = judgement.of(each.id)
@@ -90,7 +92,7 @@ def _found(judgement: Judgement) -> Section:
         heads = ["requirement", "recording", "robustness", "distance"]
         content.append(table(heads, found[:MAX_ROWS], "Recordings unlike the others"))
     held = [row for row in judgement.rows if row.verdict == "holds"]
-    content.append(_rows(judgement, (*judgement.failing, *held)))
+    content.append(_rows(judgement, (*judgement.failing, *judgement.depending, *held)))
     return Section("found", "What was found", tuple(content))
 
 

@@ -24,6 +24,7 @@ from verifai_jax.addons.monitoring.columns import LeftOut
 from verifai_jax.addons.monitoring.containers import Episode
 from verifai_jax.addons.monitoring.dense import DenseValues, NotDense
 from verifai_jax.addons.monitoring.enumerations import with_words
+from verifai_jax.addons.monitoring.error_bars import ErrorBars, check_bars, with_bars
 from verifai_jax.addons.monitoring.judgement import Judgement, Row
 from verifai_jax.addons.monitoring.readers import Stamps
 from verifai_jax.addons.monitoring.recorded import Recording, Recordings, named_recordings
@@ -68,6 +69,7 @@ class Reading(NamedTuple):
     sort_times: bool = False
     repeated: Repeated = "both"
     dbc: str | Path | Sequence[str | Path] = ()
+    error_bars: ErrorBars | None = None
 
 
 class Found(NamedTuple):
@@ -97,6 +99,7 @@ def judge(
     dbc: str | Path | Sequence[str | Path] = (),
     end: End = "hold",
     explain: bool = True,
+    error_bars: ErrorBars | None = None,
     run_on: RunOn | None = None,
     ended: Callable[[int, Sequence[Row]], None] | None = None,
     progress: bool | None = None,
@@ -123,6 +126,10 @@ def judge(
       samples, `"hold"` or `"linear"`.
     - `end`: as in `robustness`.
     - `explain`: whether to find the deciding predicate and instant.
+    - `error_bars`: by the name of a signal half the width of its error bar (a number, or an
+      expression of signals such as `"x_error"` or `"0.02 * abs(x)"`), or a pair of its ends. A
+      verdict is then `"holds"` or `"fails"` for all values within the bars, otherwise
+      `"depends"`; `robustness` and `highest` are the bounds of the robustness.
     - `run_on`: the workers of an executor, to read and judge in parallel.
     - `ended`: a function called with the index and the rows of each recording when it is done.
     - `progress`: whether to show one line of progress; see `core.display.progress` for the default.
@@ -137,9 +144,13 @@ def judge(
         raise ValueError(f"method is 'hold' or 'linear'; got {method!r}")
     if end not in ("hold", "truncate", "strict"):
         raise ValueError(f"end is 'hold', 'truncate' or 'strict'; got {end!r}")
+    if error_bars is not None:
+        check_bars([each.formalized for each in requirements], error_bars)
+        for each in requirements:
+            with_bars(each.formalized, error_bars)
     reading = Reading(
         time, dt, time_unit, resample_to, method, missing, max_gap, end, explain, stamps,
-        sort_times, repeated, dbc,
+        sort_times, repeated, dbc, error_bars,
     )  # fmt: skip
     rows: dict[int, Sequence[Row]] = {}
 
@@ -217,15 +228,20 @@ def _judged(
     rows = []
     for each, formula in zip(requirements, formulas, strict=True):
         try:
-            check_signals(formula, trace, "the recording")
-            found, note = find(formula)
+            asked, best = formula, None
+            if reading.error_bars is not None:
+                asked, best = with_bars(asked, reading.error_bars)
+            check_signals(asked, trace, "the recording")
+            found, note = find(asked)
+            highest = found if best is None else find(best)[0]
             unit, other = _unit(each, units)
             lasts = float(clock[-1] - clock[0])
             falls = shortfalls_in(signals, formula, dt, lasts, reading.end)
             notes = "; ".join(filter(None, [*map(str, falls), *said, note, other]))
-            verdict = "holds" if found.holds else "fails"
+            verdict = "holds" if found.holds else "depends" if highest.holds else "fails"
             decided = (found.robustness, found.instant, found.explanation)
-            rows.append(Row(name, each.id, verdict, *decided, note=notes, unit=unit))
+            about = {"note": notes, "unit": unit, "highest": highest.robustness}
+            rows.append(Row(name, each.id, verdict, *decided, **about))
         except (ValueError, TypeError) as error:
             rows.append(Row(name, each.id, error=one_line(str(error))))
     return rows

@@ -20,6 +20,7 @@ import numpy as np
 from jaxtyping import Float
 
 from verifai_jax.addons.monitoring.c_monitor import HEAD, HELPERS, monitor_code
+from verifai_jax.addons.monitoring.error_bars import Bounds, ErrorBars, bounded
 from verifai_jax.addons.monitoring.margins import ALONE, Margins, margins
 from verifai_jax.addons.monitoring.python_machine import PythonMachine
 from verifai_jax.addons.monitoring.quantities import completed
@@ -231,7 +232,20 @@ def _number(column: str, sample: Mapping[str, Any], index: int | None) -> float:
 def watch(
     formulas: Formula | str, dt: float, *, semantics: Semantics = ..., every: bool = ...,
     sizes: Mapping[str, int] | None = ..., units: Mapping[str, str] | None = ...,
+    error_bars: None = ...,
 ) -> Watch[float]: ...  # fmt: skip
+@overload
+def watch(
+    formulas: Formula | str, dt: float, *, semantics: Semantics = ..., every: bool = ...,
+    sizes: Mapping[str, int] | None = ..., units: Mapping[str, str] | None = ...,
+    error_bars: ErrorBars,
+) -> Watch[Bounds]: ...  # fmt: skip
+@overload
+def watch(
+    formulas: Mapping[str, Formula | str], dt: float, *, semantics: Semantics = ...,
+    every: bool = ..., sizes: Mapping[str, int] | None = ...,
+    units: Mapping[str, str] | None = ..., error_bars: ErrorBars,
+) -> Watch[dict[str, Bounds]]: ...  # fmt: skip
 @overload
 def watch(
     formulas: Mapping[str, Formula | str], dt: float, *, semantics: Semantics = ...,
@@ -241,8 +255,8 @@ def watch(
 def watch(
     formulas: Formula | str | Mapping[str, Formula | str], dt: float, *,
     semantics: Semantics = hard, every: bool = False, sizes: Mapping[str, int] | None = None,
-    units: Mapping[str, str] | None = None,
-) -> "Watch[float] | Watch[dict[str, float]]":  # fmt: skip
+    units: Mapping[str, str] | None = None, error_bars: ErrorBars | None = None,
+) -> Watch[Any]:  # fmt: skip
     """Monitor one formula, or several by name, on samples `dt` seconds apart.
 
     Values are those of `robustness` in double precision, bit for bit, except for the last digit of
@@ -255,14 +269,23 @@ def watch(
     - `sizes`: number of components of each signal whose norm, or all of whose elements, the
       formulas use.
     - `units`: units of signals that are compared with quantities such as `130 km/h`.
+    - `error_bars`: how uncertain signals are, as in `judge`. Each result is then a pair `low`,
+      `high` with its `verdict`: for all values within the bars, for none, or it depends.
     **Returns:** a monitor; its results are numbers, or dictionaries for several formulas.
     **Raises:** `IntervalError` for an interval that is not a multiple of `dt`; `ValueError` for
     smooth semantics, for an unbounded future operator inside another temporal operator, and for a
     norm without a size, and for a signal without a unit that is compared with a quantity.
     """
-    plan = streams(completed(formulas, units, sizes), dt, semantics, every)
+    wanted = completed(formulas, units, sizes)
+    if error_bars is not None:
+        wanted = bounded(wanted, error_bars)
+    plan = streams(wanted, dt, semantics, every)
     front = margins(plan, sizes or {}, apart=True)
     if not isinstance(formulas, Mapping):
-        return Watch(plan, front, lambda out: out[0])
+        first = lambda out: out[0]  # noqa: E731
+        return Watch(plan, front, first if error_bars is None else lambda out: Bounds(*out))
     names = tuple(formulas)
+    if error_bars is not None:
+        pairs = [(name, slice(2 * k, 2 * k + 2)) for k, name in enumerate(names)]
+        return Watch(plan, front, lambda out: {name: Bounds(*out[k]) for name, k in pairs})
     return Watch(plan, front, lambda out: dict(zip(names, out, strict=True)))

@@ -83,7 +83,7 @@ def compile_program(
     )
     loaded = list(sys.modules)
     try:
-        with _without_verifai():
+        with without_verifai():
             try:
                 file_name = None if path is None else str(path)
                 with translator.topLevelNamespace(file_name) as namespace:
@@ -171,7 +171,7 @@ def _raised_at(error: BaseException) -> str:
 
 
 @contextlib.contextmanager
-def _without_verifai() -> Iterator[None]:
+def without_verifai() -> Iterator[None]:
     """Let Scenic's `VerifaiRange` and its kin work where VerifAI is not installed."""
     try:
         import verifai  # noqa: F401  # pyright: ignore[reportMissingImports]

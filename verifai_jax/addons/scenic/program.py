@@ -17,9 +17,11 @@ from verifai_jax.addons.scenic.recipe import Recipe
 from verifai_jax.addons.scenic.requirements import Constraint
 from verifai_jax.addons.scenic.sampling import LOCK, Refused, Sampling
 from verifai_jax.addons.scenic.simulation import OnScenes, ScenicSimulation, check_simulation
+from verifai_jax.addons.scenic.steering import BATCH, SteeredScenario
 from verifai_jax.core.display.lazy import lazy_import
 from verifai_jax.core.values.trace import Trace
 from verifai_jax.features import FeatureSpace
+from verifai_jax.search import Search
 from verifai_jax.systems.base import Seed, System
 from verifai_jax.systems.blackbox import blackbox
 from verifai_jax.systems.blackbox._blackbox import BlackBox, PooledBlackBox, VectorisedBlackBox
@@ -143,6 +145,19 @@ class ScenicProgram:
         named = check_simulation(steps, records, dt, self.scenario)
         simulation = ScenicSimulation(self._recipe, steps, named, dt)
         return blackbox(simulation, seeded=True, workers=workers, timeout=timeout, **options)
+
+    def steered(
+        self, search: str | Search = "cross_entropy", *, seed: int = 0, batch: int = BATCH
+    ) -> SteeredScenario:
+        """Return a scenario whose scenes a search proposes, for a runner that simulates them.
+
+        Its `generate(feedback=rho)` is like that of Scenic's scenario, and proposes all random
+        values of the program; `rho` is the robustness of the last scene, negative for a failure.
+
+        **Arguments:** those of `scenic_sampler`.
+        **Raises:** `ValueError` for a search that learns from more than the robustness.
+        """
+        return SteeredScenario(self, search, seed, batch)
 
     def scene(self, features: Mapping[str, Any]) -> Any:
         """Return Scenic's `Scene` at these features.

@@ -29,6 +29,7 @@ from verifai_jax.cli.json_output import as_plain, command, give_result, say
     help="Confidence of all verdicts together.",
 )
 @click.option("--budget", type=int, default=100_000, show_default=True, help="Maximum simulations.")
+@click.option("--in-order", is_flag=True, help="Rows of scores are in the order of the trials.")
 @arguments.SEED
 @arguments.MAX_SECONDS
 @arguments.CLUSTER
@@ -42,11 +43,25 @@ def compare(
     """Compare failure rates of CANDIDATES (specs/FILE.py:NAME) with that of TARGET, in pairs.
 
     specs/FILE.py:NAME@REVISION is the problem at a revision of git; the checkout is not touched.
+    TARGET and the one candidate may be tables of scores (eval_info.json, CSV, Parquet, npz).
     """
     from verifai_jax import Problem
     from verifai_jax import compare as run_compare
+    from verifai_jax.addons.estimation.comparison._compare_scores import compare_scores
+    from verifai_jax.addons.estimation.comparison.score_tables import is_scores
     from verifai_jax.addons.estimation.revisions import load_at_revision
 
+    if is_scores(target) and is_scores(candidates):
+        if len(candidates) > 1:
+            raise click.UsageError("a table of scores is compared with one other table")
+        (other,), own = candidates, ("margin", "confidence", "in_order")
+        scores = compare_scores((target, other), (target, other), cluster=None,
+                                **{name: options[name] for name in own})  # fmt: skip
+        say(scores)
+        give_result(**as_plain(scores), verdict=scores.verdict, regression=scores.regression)
+        return check_gate(fail_on, {"regression": scores.regression})
+    if options.pop("in_order"):
+        raise click.UsageError("--in-order goes with tables of scores")
     with kept_until_done() as kept, arguments.on_cluster(cluster) as executor:
         named = {name: name for name in candidates}
         result = run_compare(target, named, **arguments.values_of(options, executor=executor))

@@ -8,17 +8,20 @@ A pair simulates both problems with the same features and random key. The interv
 time, so sampling may stop as soon as they decide (`statistics.paired_rates`).
 """
 
+import functools
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import ExitStack
-from typing import Any
+from typing import Any, overload
 
 import jax
 import numpy as np
 import pandas as pd
 from jaxtyping import Array, Bool, Float, Key
 
+from verifai_jax.addons.estimation.comparison._compare_scores import ScoreComparison, compare_scores
 from verifai_jax.addons.estimation.comparison.result import UNDECIDED, Compared, Comparison, judge
+from verifai_jax.addons.estimation.comparison.score_tables import Scores, is_scores
 from verifai_jax.addons.estimation.paired_rates import PairedRates, paired_rates
 from verifai_jax.addons.estimation.revisions import load_at_revision, split_revision
 from verifai_jax.core.compute.executors import Executor
@@ -44,12 +47,18 @@ BATCH = 512
 """Simulations at once."""
 
 
+@overload
+def compare(
+    baseline: Problem | str, candidates: Problem | str | Mapping[str, Problem | str], **options: Any
+) -> Comparison: ...
+@overload
+def compare(baseline: Scores, candidates: Scores, **options: Any) -> ScoreComparison: ...
 @suggests_options
 @reproducible_settings()
 @shows_progress("comparing")
 def compare(
-    baseline: Problem | str,
-    candidates: Problem | str | Mapping[str, Problem | str],
+    baseline: Any,
+    candidates: Any,
     *,
     margin: float = 0.0,
     confidence: float = 0.95,
@@ -58,8 +67,11 @@ def compare(
     stop: Stop | None = None,
     precision: str = "float32",
     run_on: RunOn | None = None,
+    undisturbed: bool = True,
+    cluster: str | None = None,
+    in_order: bool = False,
     progress: bool | None = None,
-) -> Comparison:
+) -> Comparison | ScoreComparison:
     """Compare failure rates of problems on common random samples, until the result is decided.
 
     Each pair of simulations has the same features and the same random key. A candidate is *worse*
@@ -77,12 +89,32 @@ def compare(
     - `budget`: maximum number of simulations of all problems together.
     - `stop`: the seconds after which the verdict is made from finished pairs.
     - `run_on`: the workers of the simulations; with them the comparison is the same.
+    - `undisturbed`: whether each pair is also simulated without its disturbances, such as faults
+      and events, which says whether they make the difference.
+    - `cluster`, `in_order`: of tables of scores, see below.
     - all other arguments: as in `falsify`.
-    **Returns:** the comparison; after Ctrl-C that of the finished pairs.
+
+    Both sides may be tables of scores that another evaluator wrote, of which more is better: an
+    `eval_info.json` of LeRobot, a CSV or Parquet file or a DataFrame with a column `success`,
+    `score` or `failed` (or `successes` and `episodes`) and any of `run`, `seed`, `task` and
+    `episode`, a matrix of scores `[runs, tasks]` (JSON, `.npz`, an array), or a list of such files,
+    one of each run. Then only `margin`, `confidence`, `cluster` and `in_order` count.
+    `cluster` names the column whose values are independent; by default runs, otherwise seeds,
+    otherwise each episode, if there are two of each side. With `in_order` the rows are in the
+    order of the trials, and the interval holds after any number of them, in which one may stop.
+
+    **Returns:** a `Comparison`, after Ctrl-C that of the finished pairs; of tables a
+    `ScoreComparison`.
     **Raises:** before anything is simulated, `TypeError` for anything but a `Problem`;
     `ProblemError` if other features vary; `ValueError` for numbers out of range, and for targets
     that cannot be loaded.
     """
+    if is_scores(baseline) and is_scores(candidates):
+        one, other = (each if isinstance(each, str) else "" for each in (baseline, candidates))
+        named = one or "the baseline", other or "the candidate"
+        return compare_scores((baseline, candidates), named, margin, confidence, cluster, in_order)
+    if cluster is not None or in_order:
+        raise ValueError("cluster and in_order are for tables of scores on both sides")
     seconds = options_of("compare", Stop, stop, "seconds").seconds
     executor = options_of("compare", RunOn, run_on, "executor").executor
     with ExitStack() as loaded:
@@ -109,14 +141,15 @@ def compare(
             given = candidates
         named = {name: problem(candidate) for name, candidate in given.items()}
         return _compare(
-            first, named, target, margin, confidence, budget, seed, seconds, precision, executor
-        )
+            first, named, target, margin, confidence, budget, seed, seconds, precision, executor,
+            undisturbed,
+        )  # fmt: skip
 
 
 def _compare(
     baseline: Problem, named: Mapping[str, Problem], target: str | None, margin: float,
     confidence: float, budget: int, seed: int, max_seconds: float | None, precision: str,
-    executor: Executor | None,
+    executor: Executor | None, undisturbed: bool,
 ) -> Comparison:  # fmt: skip
     """Compare problems; see `compare`."""
     started = time.perf_counter()
@@ -136,10 +169,11 @@ def _compare(
     tallies = {name: _Tally() for name in named}
     open_ones, stopped, size, first = set(named), "budget", FIRST, 0
     prior = _Prior(baseline.space, run_keys(seed)[0])
-    spent = 0
+    spent, calm = 0, _without_disturbances(baseline.space) if undisturbed else None
+    arms = 2 if calm else 1
     try:
         while open_ones:
-            size = min(size, (budget - spent) // (1 + len(open_ones)))
+            size = min(size, (budget - spent) // (arms * (1 + len(open_ones))))
             if size < 1:
                 break
             if max_seconds is not None and time.perf_counter() - started > max_seconds:
@@ -147,10 +181,13 @@ def _compare(
                 break
             u = prior.take(size)
             known = _failing(evaluators[None], u, first)
-            spent += size
+            still = _failing(evaluators[None], calm(u), first) if calm else ()
+            spent += arms * size
             for name in [name for name in named if name in open_ones]:
                 tallies[name].add(u, known, _failing(evaluators[name], u, first))
-                spent += size
+                if calm:
+                    tallies[name].still.add(u, still, _failing(evaluators[name], calm(u), first))
+                spent += arms * size
                 if judge(tallies[name].rates(each), margin) != UNDECIDED:
                     open_ones.discard(name)
             first += size
@@ -183,7 +220,18 @@ class _Tally:
         self.proper: list[Bool[np.ndarray, " n"]] = []
         self.pairs = 0
 
-    def add(self, u: Any, one: tuple[Any, Any], other: tuple[Any, Any]) -> None:
+    @functools.cached_property
+    def still(self) -> "_Tally":
+        """The same pairs without disturbances."""
+        return _Tally()
+
+    def undisturbed(self, confidence: float) -> tuple[PairedRates, int, int] | None:
+        if not self.still.pairs:
+            return None
+        one, other, proper = self.still.columns()
+        return self.still.rates(confidence), int(np.sum(one & proper)), int(np.sum(other & proper))
+
+    def add(self, u: Any, one: tuple[Any, ...], other: tuple[Any, ...]) -> None:
         self.points.append(u)
         self.failing.append((one[0], other[0]))
         self.proper.append(one[1] & other[1])
@@ -209,6 +257,21 @@ def _failing(evaluate: Evaluator, u: Any, first: int) -> tuple[Any, Any]:
     """Return which simulations fail, and which have a verdict."""
     verdicts = evaluate(u, first=first)
     return np.asarray(verdicts.violated, bool), np.asarray(verdicts.status) == Status.OK
+
+
+def _without_disturbances(space: FeatureSpace) -> Callable[[Any], Any] | None:
+    """Return a function that takes from points what has a nominal value for any system.
+
+    These are faults and events. None if a space has none, or if its constraint may refuse this.
+    """
+    calm, found = np.full(space.dim, np.nan, np.float32), 0
+    for _, domain in space.root.fields:
+        if domain.size and domain.nominal is not None:
+            calm[found : found + domain.size] = domain.to_unit(domain.coerce(domain.nominal))
+        found += domain.size
+    if np.isnan(calm).all() or space.constraint is not None:
+        return None
+    return lambda u: np.where(np.isnan(calm), u, calm)
 
 
 class _Prior:
@@ -241,7 +304,10 @@ def _compared(
     table["worse"], table["better"] = other & ~one & proper, one & ~other & proper
     discordant = table[table["worse"] | table["better"]].drop(columns="better")
     both = int(np.sum(one & other & proper))
-    return Compared(name, tally.rates(confidence), both, margin, discordant, table[proper], space)
+    return Compared(
+        name, tally.rates(confidence), both, margin, discordant, table[proper], space,
+        tally.undisturbed(confidence),
+    )  # fmt: skip
 
 
 def _check(

@@ -34,6 +34,8 @@ class Compared:
       if the candidate fails. Its index is the number of the pair; `Comparison.random_key` gives the
       key.
     - `pairs`: features of all pairs, with `worse` and `better`; None if they were not kept.
+    - `undisturbed`: the difference in the same pairs without disturbances, and the failures of
+      both there; None if the problem has none.
     """
 
     name: str
@@ -43,6 +45,7 @@ class Compared:
     discordant: "pd.DataFrame" = field(repr=False)
     pairs: "pd.DataFrame" = field(repr=False)
     space: FeatureSpace = field(repr=False)
+    undisturbed: tuple[PairedRates, int, int] | None = None
 
     @property
     def verdict(self) -> str:
@@ -73,7 +76,16 @@ class Compared:
         return (
             f"{self.name} is {words}{margin}: {shares}\n"
             f"    {rates.only_second:,} pairs fail with it only, {rates.only_first:,} with the "
-            f"baseline only, {self.both:,} with both{without}"
+            f"baseline only, {self.both:,} with both{without}{self._undisturbed()}"
+        )
+
+    def _undisturbed(self) -> str:
+        if self.undisturbed is None:
+            return ""
+        rates, first, second = self.undisturbed
+        return (
+            f"\n    without disturbances it fails in {format_percent(second / rates.pairs)} of the "
+            f"same pairs, the baseline in {format_percent(first / rates.pairs)}: {rates}"
         )
 
 
@@ -157,6 +169,15 @@ def judge(rates: PairedRates, margin: float) -> str:
     if margin and rates.low >= -margin and rates.high <= margin:
         return SAME
     return BETTER if rates.high < 0 else UNDECIDED
+
+
+def judge_score(low: float, high: float, margin: float) -> str:
+    """Decide from the interval of a difference of scores, of which more is better."""
+    if high < -margin:
+        return WORSE
+    if margin and low >= -margin and high <= margin:
+        return SAME
+    return BETTER if low > 0 else UNDECIDED
 
 
 @dataclass(frozen=True, eq=False)

@@ -17,6 +17,12 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
+from verifai_jax.addons.faults.failure_table.detection import (
+    Detector,
+    as_detector,
+    detection,
+    false_alarms,
+)
 from verifai_jax.addons.faults.failure_table.effects import with_counterexample
 from verifai_jax.addons.faults.failure_table.result import FailureTable
 from verifai_jax.addons.faults.failure_table.rows import Points, Rows
@@ -45,6 +51,7 @@ def fmea(
     budget: int = 2000,
     pairs: bool = True,
     confidence: float = 0.95,
+    detector: Detector | None = None,
     seed: int = 0,
     folder: str | Path | None = None,
     run_on: RunOn | None = None,
@@ -66,6 +73,9 @@ def fmea(
       if few samples fail; 0 switches off all three.
     - `pairs`: whether to try pairs of the faults that cause no failure alone.
     - `confidence`: the confidence of each interval.
+    - `detector`: a detector on board, whose false alarms, misses and delays are measured: a formula
+      that is true while there is an alarm, or a function that returns a truth value for each
+      sample of a trace. It sees the signals of the trace.
     - `folder`: the folder of the counterexamples (a run) and of finished simulations; the same call
       continues an interrupted table there.
     - `run_on`: the workers of the simulations.
@@ -78,6 +88,8 @@ def fmea(
     started = time.perf_counter()
     where = options_of("fmea", RunOn, run_on, "executor")
     faulty = problem.with_faults(*faults) if faults else problem
+    if detector is not None:
+        as_detector(detector)
     known = _faults_of(faulty)
     rates = _rates(rate, mission_time, known)
     check_fraction("confidence", confidence)
@@ -92,7 +104,7 @@ def fmea(
         "formulas": {name: str(formula) for name, formula in faulty.formulas.items()},
         "samples": samples, "budget": budget, "seed": seed,
     }  # fmt: skip
-    effects = []
+    effects, alarms = [], None
     with locked_cache(folder, "fmea") as cache:
         cache.claim(work, faulty.sources())
         rows = Rows(faulty, known, cache, seed, where)
@@ -116,11 +128,17 @@ def fmea(
                 own = {row: verdicts[row] for row in range(first, last) if row in verdicts}
                 effect = with_counterexample(effect, run, own, known)
             bounds = {"probability": probability, "low": low, "high": high}
-            effects.append(replace(effect, occurrence=chance, **bounds))
+            effect = replace(effect, occurrence=chance, **bounds)
+            if detector is not None:
+                seen = detection(rows, effect.faults, detector, samples, confidence)
+                effect = replace(effect, detection=seen)
+            effects.append(effect)
+        if detector is not None:
+            alarms = false_alarms(rows, detector, samples, confidence)
     effects.sort(key=lambda effect: (-effect.fails, -effect.probability, effect.faults))
     return FailureTable(
         faulty.name, tuple(effects), run, rates, mission_time, confidence, bool(healthy),
-        time.perf_counter() - started,
+        time.perf_counter() - started, alarms,
     )  # fmt: skip
 
 

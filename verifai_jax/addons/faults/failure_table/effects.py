@@ -36,9 +36,7 @@ def with_counterexample(
     if row is None or run.problem is None:
         return effect
     again, own = run.replay(row), {name: faults[name] for name in effect.faults}
-    columns = again.columns()
-    fixed = {f"{name}.onset": fault.numbers["onset"] for name, fault in own.items()}
-    onset = min(float({**fixed, **columns}[name]) for name in fixed)
+    columns, onset = again.columns(), onset_of(again, own)
     off = {f"{name}.{n}": fault.weakest(n) for name, fault in own.items() for n in fault.domains}
     key = run_keys(run.seed)[1]
     without = simulate_again(run.problem, {**columns, **off}, key, row, run.precision)
@@ -52,13 +50,19 @@ def with_counterexample(
     return replace(
         effect, row=row, edge=edge, severity={number: float(columns[number]) for number in grades},
         verdict=verdicts[row], broken=again.worst,
-        delay=_violation(again, onset) - max(onset, 0.0), shown_by=shown_by,
+        delay=first_violation(again, onset) - max(onset, 0.0), shown_by=shown_by,
         shown_after=shown - max(onset, 0.0), command=command,
     )  # fmt: skip
 
 
-def _violation(again: Replay, onset: float) -> float:
-    """Return the seconds from the onset to the first violation of the deciding predicate."""
+def onset_of(again: Replay, faults: Mapping[str, Fault]) -> float:
+    """Return the time of the first onset of some faults in a simulation."""
+    fixed = {f"{name}.onset": fault.numbers["onset"] for name, fault in faults.items()}
+    return min(float({**fixed, **again.columns()}[name]) for name in fixed)
+
+
+def first_violation(again: Replay, onset: float) -> float:
+    """Return the time of the first violation of the deciding predicate after the onset."""
     why = again.explain()
     trace = why.trace.finely()
     clock = np.asarray(trace.clock())

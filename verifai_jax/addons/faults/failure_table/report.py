@@ -36,12 +36,14 @@ def failure_table_page(found: FailureTable, about: About, problem: Problem | Non
     ]
     heads = ["fault", "fails from", "breaks", "after the onset", "shown by", "probability", "low",
              "high", "verdict"]  # fmt: skip
+    heads += [] if found.false_alarms is None else ["missed by the detector"]
     rows = [
         (
             each.name, each.severity_text, each.broken,
             format_seconds(each.delay, 3) if each.broken else "", each.shown_by,
             f"{each.probability:z.2g}", f"{each.low:z.2g}", f"{each.high:z.2g}",
             each.verdict or "no failure found",
+            *([] if each.detection is None else [str(each.detection.missed)]),
         )
         for each in found
     ]  # fmt: skip
@@ -49,6 +51,8 @@ def failure_table_page(found: FailureTable, about: About, problem: Problem | Non
     limits = ["A fault without a failure may fail in ways that no sample and no search met."]
     if not found.healthy:
         limits.append("The nominal features break the property without any fault.")
+    if found.false_alarms is not None:
+        limits.append(f"The detector gives false alarms: {found.false_alarms}.")
     return result_page(
         found.name,
         "failure modes and effects of faults",

@@ -5,14 +5,42 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
+from verifai_jax.addons.faults.failure_table.sheet import (
+    DECADES,
+    Scale,
+    Sheet,
+    Words,
+    make_sheet,
+)
 from verifai_jax.core.display.figure import Drawn, Reported
 from verifai_jax.core.display.notebook import Tabular
 from verifai_jax.core.messages.errors import check_names
 from verifai_jax.core.messages.text import format_percent, format_seconds
 from verifai_jax.falsification.run import Run
+from verifai_jax.statistics.binomial import Rate
 
 if TYPE_CHECKING:
     import pandas as pd
+
+
+@dataclass(frozen=True)
+class Detection:
+    """The misses and the delay of a detector on board, for a fault or a pair.
+
+    - `missed`: the share of simulations without an alarm from the onset until the property is
+      broken, or until the end if it is not, with its interval.
+    - `failing`: whether these simulations break the property; False if no sample breaks it.
+    - `delay`: the median time in seconds from the onset to the alarm; NaN without an alarm.
+    """
+
+    missed: Rate
+    failing: bool
+    delay: float
+
+    def __str__(self) -> str:
+        share = f"the detector misses {self.missed}"
+        after = "" if math.isnan(self.delay) else f", alarm after {format_seconds(self.delay, 3)}"
+        return f"{share}{after}"
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,6 +64,7 @@ class Effect:
     - `probability`, `low`, `high`: probability that a mission fails because of it, and its
       interval.
     - `command`: the command that simulates the counterexample again.
+    - `detection`: what the detector finds of it; None without a detector.
     """
 
     faults: tuple[str, ...]
@@ -56,6 +85,22 @@ class Effect:
     low: float = 0.0
     high: float = 1.0
     command: str = ""
+    detection: Detection | None = None
+
+    @property
+    def missed(self) -> float:
+        """The share of simulations that the detector misses; NaN without a detector."""
+        return math.nan if self.detection is None else self.detection.missed.estimate
+
+    @property
+    def missed_high(self) -> float:
+        """The upper end of the interval of this share; NaN without a detector."""
+        return math.nan if self.detection is None else self.detection.missed.high
+
+    @property
+    def alarm_after(self) -> float:
+        """The median time in seconds from the onset to the alarm; NaN without one."""
+        return math.nan if self.detection is None else self.detection.delay
 
     @property
     def name(self) -> str:
@@ -75,15 +120,16 @@ class Effect:
 
     def __str__(self) -> str:
         chance = f"{self.probability:z.2g} ({self.low:z.2g} to {self.high:z.2g})"
+        found = "" if self.detection is None else f";\n    {self.detection}"
         if not self.fails:
-            return f"{chance}, no failure in {self.simulations:,} samples"
+            return f"{chance}, no failure in {self.simulations:,} samples{found}"
         if self.row is None:
-            return f"{chance}, fails under few random keys"
+            return f"{chance}, fails under few random keys{found}"
         after, shown = (format_seconds(each, 3) for each in (self.delay, self.shown_after))
         shows = f";\n    {self.shown_by} shows it after {shown}" if self.shown_by else ""
         return (
             f"{chance}, {self.verdict}\n    from {self.severity_text}; breaks {self.broken} "
-            f"{after} after the onset{shows}"
+            f"{after} after the onset{shows}{found}"
         )
 
 
@@ -91,6 +137,7 @@ COLUMNS = {
     "fails": "fails", "severity": "severity_text", "property": "broken",
     "onset_to_violation": "delay", "shown_by": "shown_by", "shown_after": "shown_after",
     "occurrence": "occurrence", "probability": "probability", "low": "low", "high": "high",
+    "missed": "missed", "missed_high": "missed_high", "alarm_after": "alarm_after",
     "verdict": "verdict", "replay": "command",
 }  # fmt: skip
 """Columns of the table, each with the attribute of an effect that it shows."""
@@ -109,6 +156,8 @@ class FailureTable(Drawn, Reported, Tabular):
     - `confidence`: the confidence of each interval.
     - `healthy`: whether the property holds for the nominal features without a fault.
     - `seconds`: wall-clock time.
+    - `false_alarms`: the share of simulations without a fault in which the detector gives an alarm;
+      None without a detector.
     """
 
     _report = "verifai_jax.addons.faults.failure_table.report", "failure_table_page"
@@ -122,6 +171,7 @@ class FailureTable(Drawn, Reported, Tabular):
     confidence: float
     healthy: bool
     seconds: float
+    false_alarms: Rate | None = None
 
     def __iter__(self) -> Iterator[Effect]:
         return iter(self.effects)
@@ -146,6 +196,26 @@ class FailureTable(Drawn, Reported, Tabular):
         columns = {name: [getattr(each, of) for each in self] for name, of in COLUMNS.items()}
         return pd.DataFrame(columns, pd.Index([each.name for each in self], name="fault"))
 
+    def sheet(self, words: Words = None, scale: Scale = DECADES) -> Sheet:
+        """Make the sheet of an FMEA: the words of its authors beside what was measured.
+
+        **Arguments:**
+        - `words`: by the name of a fault or a pair any of `component`, `cause`, `effect`,
+          `mitigation`, `owner` (texts) and `severity` (1 to 10); or the path of a CSV file with
+          these columns and `fault`. A pair has the components, causes and owners of its faults if
+          it has none of its own.
+        - `scale`: how probabilities and missed failures become ratings from 1 to 10.
+        **Returns:** the sheet, for `to_xlsx`, `to_csv` and `table`.
+        **Raises:** `ValueError` for a fault, a column or a severity that does not exist.
+        """
+        sure = format_percent(self.confidence)
+        what = "in a mission" if self.rate is not None else "given that the fault happens"
+        notes = {"probability": f"of a failure {what}, with {sure} intervals; occurrence and "
+                                "detection rate the upper ends"}  # fmt: skip
+        if self.false_alarms is not None:
+            notes["false alarms"] = str(self.false_alarms)
+        return make_sheet(self.name, self.table, notes, words, scale)
+
     def replay(self, name: str) -> Any:
         """Simulate the counterexample of a row again, and keep the trace.
 
@@ -168,6 +238,8 @@ class FailureTable(Drawn, Reported, Tabular):
         ]
         width = max((len(each.name) for each in self.effects), default=0)
         lines += [f"  {each.name:<{width}}  {each}" for each in self.effects]
+        if self.false_alarms is not None:
+            lines.append(f"  false alarms of the detector: {self.false_alarms}")
         if not self.healthy:
             lines.append("  note: the nominal features break the property without any fault")
         return "\n".join(lines)

@@ -57,6 +57,10 @@ if TYPE_CHECKING:
     "--end", type=click.Choice(["hold", "truncate", "strict"]), default="hold",
     help="How a trace continues after the last sample.",
 )  # fmt: skip
+@option(
+    "--error-bar", "bars", multiple=True, metavar="NAME=WIDTH",
+    help="Half the width of a signal's error bar: a number, or an expression of signals.",
+)  # fmt: skip
 @option("--compat", type=click.Choice(["pymtl"]), help="Right-open windows, as in py-mtl.")
 @NAMES
 @option(
@@ -68,9 +72,10 @@ if TYPE_CHECKING:
 @fleet_options
 @fail_on(violation="if a formula fails", incomplete="if one fails or has no verdict on a recording")
 def monitor(
-    formula: str, recording: tuple[Path, ...], compat: Literal["pymtl"] | None,
-    constants: tuple[str, ...], definitions: tuple[str, ...], header: Path | None, explain: bool,
-    plot: Path | None, report: Path | None, junit: Path | None, jobs: int, fail_on: Gate | None,
+    formula: str, recording: tuple[Path, ...], bars: tuple[str, ...],
+    compat: Literal["pymtl"] | None, constants: tuple[str, ...], definitions: tuple[str, ...],
+    header: Path | None, explain: bool, plot: Path | None, report: Path | None, junit: Path | None,
+    jobs: int, fail_on: Gate | None,
     **given: Any,
 ) -> None:  # fmt: skip
     """Compute the robustness of FORMULA on a recorded trace, RECORDING.csv or .parquet.
@@ -92,6 +97,7 @@ def monitor(
 
     if (explain or plot is not None) and compat is not None:
         raise click.UsageError("--explain and --plot do not go with --compat")
+    given["error_bars"] = _error_bars(bars)
     reading = Reading(**given, explain=explain)
     dt, end = reading.dt, reading.end
     numbers, named = read_names(constants, definitions)
@@ -100,9 +106,12 @@ def monitor(
             raise click.UsageError("--export-c goes with --dt SECONDS, and with no RECORDING")
         parsed = vj.parse(formula, numbers, named)
         if header.suffix == ".fmu":
+            if bars:
+                raise click.UsageError("--error-bar goes with FILE.h, and with no FILE.fmu")
             vj.mtl.export_fmu(parsed, dt, header)
         else:
-            text = vj.mtl.export_c(parsed, dt, re.sub(r"\W", "_", header.stem))
+            name = re.sub(r"\W", "_", header.stem)
+            text = vj.mtl.export_c(parsed, dt, name, error_bars=reading.error_bars)
             with replacing(header) as partial:
                 partial.write_text(text, encoding="utf-8")
         say(f"monitor {header}")
@@ -110,12 +119,11 @@ def monitor(
         return
     if not recording:
         raise click.UsageError("give a RECORDING to judge, or --export-c FILE.h")
-    if is_fleet(formula, recording, report, junit):
+    if is_fleet(formula, recording, report, junit) or bars:
         if plot is not None or compat is not None:
             raise click.UsageError("--plot and --compat go with one formula on one recording")
         found = monitor_fleet(formula, recording, numbers, named, report, junit, jobs, given)
-        failing, unjudged = bool(found.failing), bool(found.without_verdict)
-        check_gate(fail_on, {"violation": failing, "incomplete": failing or unjudged})
+        check_gate(fail_on, {"violation": bool(found.failing), "incomplete": not found.all_hold})
         return
     (file,) = recording
     parsed = vj.parse(formula, numbers, named)
@@ -194,6 +202,20 @@ def _read(recording: Path, reading: "Reading") -> "vj.Trace":
             f"{error.fact}{near or '.'} Give the sampling period, --dt SECONDS, or the name of "
             f"the column, --time NAME. It has: {', '.join(error.columns)}"
         ) from None
+
+
+def _error_bars(given: tuple[str, ...]) -> dict[str, float | str] | None:
+    """Return error bars, each `NAME=WIDTH`, by the name of the signal."""
+    bars: dict[str, float | str] = {}
+    for each in given:
+        name, equals, width = (part.strip() for part in each.partition("="))
+        if not (name and equals and width):
+            raise click.UsageError(f"--error-bar is NAME=WIDTH, as in x=0.1; got {each}")
+        try:
+            bars[name] = float(width)
+        except ValueError:
+            bars[name] = width
+    return bars or None
 
 
 SOURCE = "the standard input"

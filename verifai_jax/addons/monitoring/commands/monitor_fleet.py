@@ -99,7 +99,8 @@ def monitor_fleet(
     for name, path, write in (("report", report, found.report), ("junit", junit, found.junit)):
         if path is not None:
             say(f"{name} {write(path)}")
-    give_result(failing=len(found.failing), without_verdict=len(found.without_verdict))
+    counts = {"failing": len(found.failing), "depending": len(found.depending)}
+    give_result(**counts, without_verdict=len(found.without_verdict))
     give_result(verdicts=[row._asdict() for row in found.rows])
     if len(found.without_verdict) == len(found.rows):
         raise CommandError("no requirement had a verdict on any recording", BROKEN)

@@ -313,7 +313,7 @@ class Work:
             comparison = compare(
                 *(self.study.problem(self.policies[HARDENED, stage]) for stage in (0, at)),
                 confidence=sampled.confidence, budget=16 * sampled.samples,
-                seed=plan.seed_for(COMPARED), progress=False,
+                seed=plan.seed_for(COMPARED), undisturbed=False, progress=False,
             )  # fmt: skip
             end_if_interrupted(comparison.stopped)
             if comparison.regression:
