@@ -20,7 +20,6 @@ from verifai_jax.addons.simulators.environments.episode import (
     check_features,
     features_at,
     first_memory,
-    fold,
     has_waveforms,
     policy_function,
     policy_that_sees,
@@ -40,6 +39,7 @@ from verifai_jax.core.values.waveform import set_durations
 from verifai_jax.systems.base import Carry, Features, Seed, System
 from verifai_jax.systems.channels import Channels, Link, Passing, first_refusal
 from verifai_jax.systems.delays import DelayOption, as_delay, joined, links_of
+from verifai_jax.systems.forks import Rollout
 from verifai_jax.systems.pytree_checks import in_working_precision
 
 
@@ -70,13 +70,16 @@ class PolicyLoop(System):
 
     def __call__(self, features: Features, key: Seed = None) -> Trace:
         """Simulate one episode, not reset at its end."""
+        return self.rollout(features, key).trace()
+
+    def rollout(self, features: Features, key: Seed = None) -> Rollout:
         return rollout(self._episode(features), key)
 
     def fold(
         self, features: Features, key: Seed, carry: Carry,
         update: Callable[[Carry, dict[str, Array]], Carry],
     ) -> tuple[Carry, Int[Array, ""]]:  # fmt: skip
-        return fold(self._episode(features), key, carry, update)
+        return self.rollout(features, key).fold(carry, update)
 
     def _configured(self, features: Features) -> Any:
         """Return the environment under the features of an instant, in the form that it has."""
