@@ -75,7 +75,8 @@ def test_an_ode_with_faults_and_one_with_a_fixed_key():
     plain = vj.Problem("p", SPACE, pendulum(), "always[0, 1] x <= 0.8")
     faults = vj.faults
     noisy = plain.with_faults(
-        faults.Noise("action", std=vj.Box(0.1, 0.3), onset=0.2), faults.Delay("action", seconds=0.03)
+        faults.Noise("action", std=vj.Box(0.1, 0.3), onset=0.2),
+        faults.Delay("action", seconds=0.03),
     )
     check_forks(noisy.system, noisy.space, samples=1)
     check_forks(FixedKey(pendulum(), jax.random.key(5)), SPACE, samples=1)

@@ -36,6 +36,7 @@ from verifai_jax.core.messages.errors import MissingExtra
 from verifai_jax.core.user_code.user_errors import check_called_with
 from verifai_jax.core.values.trace import Trace
 from verifai_jax.core.values.waveform import set_durations
+from verifai_jax.systems.actions import Continuous, Discrete
 from verifai_jax.systems.base import Carry, Features, Seed, System
 from verifai_jax.systems.channels import Channels, Link, Passing, first_refusal
 from verifai_jax.systems.delays import DelayOption, as_delay, joined, links_of
@@ -161,7 +162,16 @@ class PolicyLoop(System):
         key = jax.eval_shape(lambda: jax.random.key(0))
         observation, action = jax.eval_shape(first, features, key)
         names = names_of_entries(self.signals)
-        return Passing(observation, action, self.dt, self.duration, names)
+        return Passing(
+            observation, action, self.dt, self.duration, names, bounds=self._action_bounds()
+        )
+
+    def _action_bounds(self) -> tuple[PyTree, PyTree] | None:
+        """Return the lowest and the highest action; None if neither policy nor environment says."""
+        action = getattr(self.policy, "action", None)
+        if isinstance(action, Discrete):
+            return 0, action.n - 1
+        return (action.low, action.high) if isinstance(action, Continuous) else None
 
     def with_links(self, links: tuple[Link, ...]) -> "PolicyLoop":
         return replace(self, links=joined(self.links, links))
