@@ -17,7 +17,6 @@ from verifai_jax.falsification.run import Run
 from verifai_jax.problem.dependence import depends_on_key
 from verifai_jax.problem.problem import Problem
 from verifai_jax.systems.base import Carry, Features, Outcome, Seed, System
-from verifai_jax.systems.forks import Rollout
 
 
 class FixedKey(System):
@@ -52,13 +51,6 @@ class FixedKey(System):
         update: Callable[[Carry, dict[str, Array]], Carry],
     ) -> tuple[Carry, Int[Array, ""]]:  # fmt: skip
         return self.system.fold(features, self.key, carry, update)
-
-    @property
-    def can_fork(self) -> bool:
-        return self.system.can_fork
-
-    def rollout(self, features: Features, key: Seed = None) -> Rollout:
-        return self.system.rollout(features, self.key)
 
     @property
     def can_simulate_batch(self) -> bool:

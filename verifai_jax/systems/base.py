@@ -24,7 +24,7 @@ from verifai_jax.core.user_code.user_errors import format_user_error
 from verifai_jax.core.values.trace import Status, Trace
 from verifai_jax.features.domain import Domain
 from verifai_jax.systems.channels import Link, Passing
-from verifai_jax.systems.forks import Fork, Forks, Rollout, all_forks, continued
+from verifai_jax.systems.forks import Fork, Rollout
 
 KnownSignals: TypeAlias = tuple[str, ...] | Mapping[str, int] | None
 """Names of signals, or names with their numbers of components, 1 for a scalar; None if unknown."""
@@ -111,7 +111,9 @@ class System(ForUsers):
 
     def __call__(self, features: Features, key: Seed = None) -> Trace:
         """Simulate once, the same trace for the same features and key."""
-        raise NotImplementedError(f"{type(self).__name__} has no __call__(features, key)")
+        if not self.can_fork:
+            raise NotImplementedError(f"{type(self).__name__} has no __call__(features, key)")
+        return self.rollout(features, key).trace()
 
     def check(self, features: Features) -> None:
         """Refuse features that do not fit the system, before anything compiles.
@@ -148,7 +150,7 @@ class System(ForUsers):
     @property
     def can_fold(self) -> bool:
         """True if the system can simulate without storing its samples."""
-        return type(self).fold is not System.fold
+        return type(self).fold is not System.fold or self.can_fork
 
     def fold(
         self, features: Features, key: Seed, carry: Carry,
@@ -160,7 +162,7 @@ class System(ForUsers):
 
         **Returns:** the last carry, and the status of the simulation.
         """
-        raise NotImplementedError(f"{self!r} has no fold(features, key, carry, update)")
+        return self.rollout(features, key).fold(carry, update)
 
     @property
     def can_fork(self) -> bool:
@@ -169,21 +171,20 @@ class System(ForUsers):
 
     def rollout(self, features: Features, key: Seed = None) -> Rollout:
         """Return one simulation as a loop over its samples, for a system that can fork."""
-        raise ValueError(
-            f"{self!r} cannot fork, because it has no rollout(features, key): systems made by "
-            "vj.ode, mujoco (backend mjx), brax, gymnax and playground have one"
-        )
+        raise ValueError(f"{self!r} cannot fork, because it has no rollout(features, key)")
 
-    def forks(self, features: Features, key: Seed = None) -> Forks:
-        """Simulate once, and return the forks before all samples; `at(k)` gives one of them.
-
-        **Raises:** `ValueError` for a system that cannot fork.
-        """
-        return all_forks(self.rollout(features, key), features, key)
+    def forks(self, features: Features, key: Seed = None) -> Fork:
+        """Simulate once, and return the forks before all samples; `at(k)` selects one."""
+        return self.rollout(features, key).forks(features, key)
 
     def go_on(self, fork: Fork, first: Int[Array, ""] | int = 0) -> Trace:
-        """Return the whole trace of a fork that goes on; `first` is that of `forks.continued`."""
-        return continued(self.rollout(fork.features, fork.key), fork, first)
+        """Return the whole trace of a fork that goes on.
+
+        **Arguments:**
+        - `first`: an index, common to a batch, before which none of its forks begins; the samples
+          before it take no time.
+        """
+        return self.rollout(fork.features, fork.key).go_on(fork, first)
 
     @property
     def can_refine(self) -> bool:

@@ -21,7 +21,7 @@ from verifai_jax.problem.problem import Problem
 from verifai_jax.systems.actions import Action, Discrete
 from verifai_jax.systems.base import System
 from verifai_jax.systems.channels import Instant, Link, Side
-from verifai_jax.systems.forks import Fork, Forks
+from verifai_jax.systems.forks import Fork
 
 PLAN = "plan of actions"
 """The name of the feature that holds the actions in place of the policy's."""
@@ -72,7 +72,7 @@ class Means:
     ends: bool = False
     constraint: Callable[..., Any] | None = None
 
-    def course(self, features: Mapping[str, Any], key: Any) -> Forks:
+    def course(self, features: Mapping[str, Any], key: Any) -> Fork:
         """Return all forks of the undisturbed simulation; traced by JAX."""
         return self.system.forks(features, key)
 
@@ -80,7 +80,7 @@ class Means:
         """Return a fork that goes on with a choice; traced by JAX."""
         raise NotImplementedError
 
-    def replayed(self, forks: Forks, choice: Choice) -> Trace:
+    def replayed(self, forks: Fork, choice: Choice) -> Trace:
         """Return the trace of one choice; traced by JAX."""
         return self.system.go_on(self.fork(forks.at(choice.start * self.period), choice))
 
@@ -139,18 +139,18 @@ class Controls(Means):
     def fork(self, fork: Fork, choice: Choice) -> Fork:
         return fork._replace(features=self._steered(fork.features, choice))
 
-    def course(self, features: Mapping[str, Any], key: Any) -> Forks:
+    def course(self, features: Mapping[str, Any], key: Any) -> Fork:
         never = jnp.int32(self.shape[0] + 1)
         steered = self._steered(features, Choice(never, jnp.zeros(self.shape), never))
         return self.system.forks(steered, key)._replace(features=features)
 
-    def replayed(self, forks: Forks, choice: Choice) -> Trace:
+    def replayed(self, forks: Fork, choice: Choice) -> Trace:
         # From the start, without a fork.
         return self.system(self._steered(forks.features, choice), forks.key)
 
-    def own(self, forks: Forks) -> Float[np.ndarray, "decisions entries"]:
+    def own(self, forks: Fork) -> Float[np.ndarray, "decisions entries"]:
         """Return the actions of the policy in the undisturbed simulation."""
-        return np.asarray(forks.states.links[0])[1 :: self.period]
+        return np.asarray(forks.state.links[0])[1 :: self.period]
 
 
 class Surroundings(Means):
@@ -200,7 +200,7 @@ class OtherPolicy(Means):
                 f"state has the form {two}, and the problem's {one}"
             )
 
-    def course(self, features: Mapping[str, Any], key: Any) -> Forks:
+    def course(self, features: Mapping[str, Any], key: Any) -> Fork:
         return self.first.forks(features, key)
 
     def fork(self, fork: Fork, choice: Choice) -> Fork:

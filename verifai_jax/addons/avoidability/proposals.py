@@ -13,7 +13,7 @@ from verifai_jax.addons.avoidability.means import Means
 
 ELITES = 24
 """Best choices that are kept for an instant."""
-PIECES = 4
+PIECES = 6
 """Pieces of a drawn choice, at most."""
 SPREAD = 0.03
 """Least standard deviation of a number that cross-entropy draws."""

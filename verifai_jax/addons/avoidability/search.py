@@ -23,7 +23,7 @@ from verifai_jax.core.values.trace import Status, Trace
 from verifai_jax.evaluation.verdicts import boolean_semantics, trace_verdict, violations
 from verifai_jax.mtl import smooth
 from verifai_jax.problem.problem import Problem
-from verifai_jax.systems.forks import Forks
+from verifai_jax.systems.forks import Fork
 
 CLIMBED = 4
 """Choices of an instant that are improved by their gradients in a round."""
@@ -42,7 +42,7 @@ class Programs:
         self.climb = jax.jit(jax.vmap(slope, in_axes=(None, None, 0, None)))
         self.alone = jax.jit(self._alone)
 
-    def _trace(self, forks: Forks, first: Int[Array, ""], choice: Choice) -> Trace:
+    def _trace(self, forks: Fork, first: Int[Array, ""], choice: Choice) -> Trace:
         fork = self.means.fork(forks.at(choice.start * self.means.period), choice)
         return self.means.system.go_on(fork, first)
 
@@ -52,11 +52,11 @@ class Programs:
     def _judged(self, *arguments: Any) -> Any:
         return self._verdict(self._trace(*arguments))
 
-    def _objective(self, forks: Forks, first: Any, choice: Choice, temperature: Any) -> Any:
+    def _objective(self, forks: Fork, first: Any, choice: Choice, temperature: Any) -> Any:
         trace = self._trace(forks, first, choice)
         return jnp.min(trace_verdict(self.problem, trace, smooth(temperature))[0])
 
-    def _alone(self, forks: Forks, choice: Choice) -> Any:
+    def _alone(self, forks: Fork, choice: Choice) -> Any:
         trace = self.means.replayed(forks, choice)
         return self._verdict(trace), trace
 
@@ -71,9 +71,7 @@ class EscapeSearch:
     `simulations` counts the forks that went on; `notes` has sentences for the user.
     """
 
-    def __init__(
-        self, programs: Programs, forks: Forks, lanes: int, rounds: int, seed: int
-    ) -> None:
+    def __init__(self, programs: Programs, forks: Fork, lanes: int, rounds: int, seed: int) -> None:
         self.programs, self.means, self.forks = programs, programs.means, forks
         self.lanes, self.rounds, self.rng = lanes, rounds, np.random.default_rng(seed)
         self.found: dict[int, Choice] = {}

@@ -11,9 +11,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int, PyTree
 
 from verifai_jax.core.user_code.user_errors import defined_at
-from verifai_jax.core.values.trace import Status, Trace
+from verifai_jax.core.values.trace import Status
 from verifai_jax.core.values.waveform import set_durations, within_step
-from verifai_jax.systems.base import Carry, Features, Seed, System
+from verifai_jax.systems.base import Features, Seed, System
 from verifai_jax.systems.channels import Channels, Link, Passing, States, first_refusal
 from verifai_jax.systems.checkpointing import checkpointed_scan
 from verifai_jax.systems.delays import joined
@@ -89,14 +89,11 @@ class Ode(System):
             check_factor(factor)
         return replace(self, substeps=self.substeps * factor)
 
-    def __call__(self, features: Features, key: Seed = None) -> Trace:
-        """Simulate once; `features` and `key` reach the functions given to `ode` as they are.
+    def rollout(self, features: Features, key: Seed = None) -> Rollout:
+        """Return one simulation; `features` and `key` reach the functions of `ode` as they are.
 
         Only a waveform without a duration is given that of the simulation.
         """
-        return self.rollout(features, key).trace()
-
-    def rollout(self, features: Features, key: Seed = None) -> Rollout:
         features = set_durations(features, self.duration)
         start = as_floating(self.initial(features, key), "initial")
         return _Rollout(self, features, key).from_state(start)
@@ -151,12 +148,6 @@ class Ode(System):
 
     def with_links(self, links: tuple[Link, ...]) -> "Ode":
         return replace(self, links=joined(self.links, links))
-
-    def fold(
-        self, features: Features, key: Seed, carry: Carry,
-        update: Callable[[Carry, dict[str, Array]], Carry],
-    ) -> tuple[Any, Int[Array, ""]]:  # fmt: skip
-        return self.rollout(features, key).fold(carry, update)
 
 
 @contextlib.contextmanager

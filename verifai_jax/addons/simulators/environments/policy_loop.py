@@ -11,7 +11,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar
 
 import jax
-from jaxtyping import Array, Int, Key, PyTree
+from jaxtyping import Array, Key, PyTree
 
 from verifai_jax.addons.simulators.environments.episode import (
     Episode,
@@ -34,10 +34,9 @@ from verifai_jax.addons.simulators.environments.episode_signals import (
 )
 from verifai_jax.core.messages.errors import MissingExtra
 from verifai_jax.core.user_code.user_errors import check_called_with
-from verifai_jax.core.values.trace import Trace
 from verifai_jax.core.values.waveform import set_durations
 from verifai_jax.systems.actions import Continuous, Discrete
-from verifai_jax.systems.base import Carry, Features, Seed, System
+from verifai_jax.systems.base import Features, Seed, System
 from verifai_jax.systems.channels import Channels, Link, Passing, first_refusal
 from verifai_jax.systems.delays import DelayOption, as_delay, joined, links_of
 from verifai_jax.systems.forks import Rollout
@@ -69,18 +68,9 @@ class PolicyLoop(System):
         """Duration of a simulation in seconds."""
         return self.steps * self.dt
 
-    def __call__(self, features: Features, key: Seed = None) -> Trace:
-        """Simulate one episode, not reset at its end."""
-        return self.rollout(features, key).trace()
-
     def rollout(self, features: Features, key: Seed = None) -> Rollout:
+        """Return one episode, not reset at its end."""
         return rollout(self._episode(features), key)
-
-    def fold(
-        self, features: Features, key: Seed, carry: Carry,
-        update: Callable[[Carry, dict[str, Array]], Carry],
-    ) -> tuple[Carry, Int[Array, ""]]:  # fmt: skip
-        return self.rollout(features, key).fold(carry, update)
 
     def _configured(self, features: Features) -> Any:
         """Return the environment under the features of an instant, in the form that it has."""
