@@ -1,8 +1,4 @@
-"""Who could have avoided a failure, and by what: actions, other features, or another policy.
-
-A choice of any of them is an array `[steps, entries]` of numbers from 0 to 1, with the numbers of
-the decisions at which it starts and stops.
-"""
+"""Who could have avoided a failure, and by what: actions, other features, or another policy."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -98,6 +94,7 @@ class Controls(Means):
     ) -> None:
         passing = problem.system.passing(problem.space.feature_form)
         forms = jax.tree.leaves(passing.action)
+        size = sum(form.size for form in forms)
         whole = [not jnp.issubdtype(form.dtype, jnp.floating) for form in forms]
         given = passing.bounds if actions is None else actions
         if isinstance(given, Action):
@@ -107,12 +104,10 @@ class Controls(Means):
                 f"the actions in problem {problem.name!r} have no bounds, so nothing would be "
                 "unavoidable: give actions=(lowest, highest)"
             )
-        size = sum(form.size for form in forms)
         try:
-            ends = (jax.tree.leaves(end) for end in given)
-            parts = [np.concatenate([np.ravel(leaf).astype(float) for leaf in end]) for end in ends]
-            self.low, self.high = (np.broadcast_to(part, size) for part in parts)
-            fits = np.isfinite(parts).all() and np.all(self.low < self.high)
+            ends = (np.concatenate(list(map(np.ravel, jax.tree.leaves(end)))) for end in given)
+            self.low, self.high = (np.broadcast_to(end.astype(float), size) for end in ends)
+            fits = np.isfinite([self.low, self.high]).all() and np.all(self.low < self.high)
         except (TypeError, ValueError):
             fits = False
         if not fits or any(whole) != all(whole):
@@ -121,9 +116,9 @@ class Controls(Means):
                 f"all real or all whole; got {given!r}"
             )
         counts = (self.high - self.low + 1).astype(int).tolist()
-        self.levels = tuple(counts) if all(whole) else (0,) * len(counts)
+        self.levels = tuple(counts) if all(whole) else (0,) * size
         self.period = round(passing.period / dt)
-        self.shape = -(-(length - 1) // self.period), len(counts)
+        self.shape = -(-(length - 1) // self.period), size
         self.system = problem.system.with_links((Steering(),))
 
     def actions(self, numbers: Any, xp: Any = jnp) -> Any:
@@ -133,20 +128,21 @@ class Controls(Means):
             return self.low + xp.floor(xp.minimum(numbers * (width + 1), width))
         return xp.clip(self.low + numbers * width, self.low, self.high)
 
-    def _steered(self, features: PyTree, choice: Choice) -> dict[str, Any]:
+    def steered(self, features: PyTree, choice: Choice) -> dict[str, Any]:
+        """Return features with the actions of a choice."""
         return {**features, PLAN: (choice.start, self.actions(choice.numbers), choice.stop)}
 
     def fork(self, fork: Fork, choice: Choice) -> Fork:
-        return fork._replace(features=self._steered(fork.features, choice))
+        return fork._replace(features=self.steered(fork.features, choice))
 
     def course(self, features: Mapping[str, Any], key: Any) -> Fork:
         never = jnp.int32(self.shape[0] + 1)
-        steered = self._steered(features, Choice(never, jnp.zeros(self.shape), never))
+        steered = self.steered(features, Choice(never, jnp.zeros(self.shape), never))
         return self.system.forks(steered, key)._replace(features=features)
 
     def replayed(self, forks: Fork, choice: Choice) -> Trace:
         # From the start, without a fork.
-        return self.system(self._steered(forks.features, choice), forks.key)
+        return self.system(self.steered(forks.features, choice), forks.key)
 
     def own(self, forks: Fork) -> Float[np.ndarray, "decisions entries"]:
         """Return the actions of the policy in the undisturbed simulation."""
@@ -154,25 +150,22 @@ class Controls(Means):
 
 
 class Surroundings(Means):
-    """Other values of some features, by default of all that vary, from an instant on.
-
-    **Raises:** `UnknownNameError` for a feature that does not exist.
-    """
+    """Other values of some features, by default of all that vary, from an instant on."""
 
     who = "the environment"
 
-    def __init__(self, problem: Problem, names: tuple[str, ...] | None) -> None:
-        domains = problem.space.domains
-        check_names("feature", names or (), domains)
-        self.names = names or tuple(name for name, domain in domains.items() if domain.size)
-        self.space = FeatureSpace({name: domains[name] for name in self.names})
+    def __init__(self, problem: Problem, names: tuple[str, ...]) -> None:
+        domains, space = problem.space.domains, problem.space
+        check_names("feature", names, domains)
+        chosen = names or [name for name, domain in domains.items() if domain.size]
+        self.space = FeatureSpace({name: domains[name] for name in chosen})
         self.system, self.levels, self.shape = (
             problem.system,
             self.space.levels,
             (1, self.space.dim),
         )
-        # It speaks of all features.
-        self.constraint = problem.space.constraint if self.space.dim == problem.space.dim else None
+        # The constraint speaks of all features.
+        self.constraint = space.constraint if self.space.dim == space.dim else None
 
     def fork(self, fork: Fork, choice: Choice) -> Fork:
         changed = self.space.unflatten(choice.numbers[0].astype(jnp.float32))
@@ -180,10 +173,7 @@ class Surroundings(Means):
 
 
 class OtherPolicy(Means):
-    """Another policy: a system that differs in its policy alone.
-
-    **Raises:** `ValueError` for a system whose state has another form.
-    """
+    """Another policy: a system that differs in its policy alone."""
 
     who = "the other policy"
 
@@ -191,10 +181,10 @@ class OtherPolicy(Means):
         self.system, self.first = other, problem.system
         form, key = problem.space.feature_form, jax.random.key(0)
         one, two = (
-            jax.eval_shape(lambda f, s=system: s.rollout(f, key).start.plant, form)
+            str(jax.eval_shape(lambda f, s=system: s.rollout(f, key).start.plant, form))
             for system in (self.first, other)
         )
-        if str(one) != str(two):
+        if one != two:
             raise ValueError(
                 "by must be a system that differs from the problem's in its policy alone; its "
                 f"state has the form {two}, and the problem's {one}"

@@ -4,7 +4,7 @@ The best responses of many systems are extreme and change seldom (bang-bang), so
 are ends of their range, and a third of the choices have few pieces.
 """
 
-from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -21,17 +21,13 @@ Numbers = Float[np.ndarray, "n steps entries"]
 Stops = Int[np.ndarray, " n"]
 
 
-@dataclass
 class Proposals:
     """The choices of one instant: the best first, and those that wait to be tried."""
 
-    means: Means
-    start: int
-    rng: np.random.Generator
-    waiting: list[tuple[Numbers, Stops]] = field(default_factory=list)
-
-    def __post_init__(self) -> None:
-        self.numbers, self.stops = np.zeros((0, *self.means.shape)), np.zeros(0, int)
+    def __init__(self, means: Means, start: int, rng: np.random.Generator) -> None:
+        self.means, self.start, self.rng = means, start, rng
+        self.waiting: list[tuple[Numbers, Stops]] = []
+        self.numbers, self.stops = np.zeros((0, *means.shape)), np.zeros(0, int)
         self.rho = np.zeros(0)
 
     def learn(self, numbers: Numbers, stops: Stops, rho: Float[np.ndarray, " n"]) -> None:
@@ -47,31 +43,28 @@ class Proposals:
         left = max(count - sum(len(stops) for _, stops in parts), 0)
         third = left // 3 if len(self.rho) else 0
         parts.append(self._few_pieces(left - 2 * third))
-        if third:
-            parts += [self._with_segment(third), self._cross_entropy(third)]
+        parts += [self._with_segment(third), self._cross_entropy(third)] if third else []
         numbers, stops = (np.concatenate(both)[:count] for both in zip(*parts, strict=True))
         return numbers, stops
 
-    def _levels(self, *shape: int) -> np.ndarray:
-        """Return numbers from 0 to 1, half of them 0 or 1."""
+    def _levels(self, *shape: int) -> Any:
         extreme = self.rng.random(shape) < 0.5
         return np.where(extreme, self.rng.integers(0, 2, shape), self.rng.random(shape))
 
     def _stops(self, count: int) -> Stops:
         """Return where choices stop: half of them at the end."""
-        steps = self.means.shape[0]
         early = self.means.ends & (self.rng.random(count) < 0.5)
+        steps = self.means.shape[0]
         return np.where(early, self.rng.integers(self.start + 1, steps + 1, count), steps)
 
     def _few_pieces(self, count: int) -> tuple[Numbers, Stops]:
-        steps, entries = self.means.shape
+        (steps, entries), rng = self.means.shape, self.rng
         # Changes are more likely soon after the start, where they matter most.
-        changes = self.start + (steps - self.start) * self.rng.random((count, PIECES - 1)) ** 2
-        few = self.rng.integers(0, PIECES, (count, 1)) <= np.arange(PIECES - 1)
-        changes = np.where(few, steps, changes)
-        pieces = (np.arange(steps)[None, :, None] >= changes[:, None]).sum(2)[:, :, None]
+        changes = self.start + (steps - self.start) * rng.random((count, PIECES - 1)) ** 2
+        few = rng.integers(0, PIECES, (count, 1)) <= np.arange(PIECES - 1)
+        pieces = np.arange(steps)[:, None] >= np.where(few, steps, changes)[:, None]
         levels = self._levels(count, PIECES, entries)
-        return np.take_along_axis(levels, pieces, axis=1), self._stops(count)
+        return np.take_along_axis(levels, pieces.sum(2)[:, :, None], axis=1), self._stops(count)
 
     def _with_segment(self, count: int) -> tuple[Numbers, Stops]:
         """Return good choices with another value of some entries over a segment."""
@@ -79,10 +72,9 @@ class Proposals:
         parents = (len(self.rho) * rng.random(count) ** 2).astype(int)
         length = np.maximum(1, ((steps - self.start) * rng.random(count) ** 3).astype(int))
         begin = rng.integers(self.start, np.maximum(steps - length, self.start) + 1)
-        inside = np.arange(steps) - begin[:, None]
-        inside = (inside >= 0) & (inside < length[:, None])
+        since = np.arange(steps) - begin[:, None]
         chosen = rng.random((count, entries)) < max(0.5, 1.5 / max(entries, 1))
-        replaced = inside[:, :, None] & chosen[:, None]
+        replaced = ((since >= 0) & (since < length[:, None]))[:, :, None] & chosen[:, None]
         made = np.where(replaced, self._levels(count, 1, entries), self.numbers[parents])
         kept = rng.random(count) < 0.8
         return made, np.where(kept, self.stops[parents], self._stops(count))
@@ -90,11 +82,10 @@ class Proposals:
     def _cross_entropy(self, count: int) -> tuple[Numbers, Stops]:
         """Return draws around the best choices, whose deviations hold for a while."""
         (steps, entries), rng, size = self.means.shape, self.rng, len(self.rho)
-        hold = np.maximum(1, (steps * rng.random(count) ** 3).astype(int))
-        blocks = (np.arange(steps) // hold[:, None])[:, :, None]
-        noise = np.take_along_axis(rng.standard_normal((count, steps, entries)), blocks, axis=1)
-        parents = rng.integers(0, size, count)
-        about_mean = rng.random((count, 1, 1)) < 0.5
+        blocks = np.arange(steps) // np.maximum(1, steps * rng.random((count, 1)) ** 3).astype(int)
+        noise = rng.standard_normal((count, steps, entries))
+        noise = np.take_along_axis(noise, blocks[:, :, None], axis=1)
+        parents, about_mean = rng.integers(0, size, count), rng.random((count, 1, 1)) < 0.5
         centre = np.where(about_mean, self.numbers.mean(0), self.numbers[parents])
         made = np.clip(centre + (self.numbers.std(0) + SPREAD) * noise, 0, 1)
         # Whole numbers have no mean: each step is that of some good choice.

@@ -8,6 +8,7 @@ One program judges forks from all instants, and one differentiates them.
 """
 
 from collections.abc import Sequence
+from functools import partial
 from typing import Any
 
 import jax
@@ -15,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from verifai_jax.addons.avoidability.means import Choice, Means
+from verifai_jax.addons.avoidability.means import Choice, Controls, Means
 from verifai_jax.addons.avoidability.proposals import Numbers, Proposals, Stops
 from verifai_jax.core.display.progress import count_done
 from verifai_jax.core.messages.text import format_error
@@ -41,6 +42,7 @@ class Programs:
         slope = jax.grad(self._objective, argnums=2, allow_int=True)
         self.climb = jax.jit(jax.vmap(slope, in_axes=(None, None, 0, None)))
         self.alone = jax.jit(self._alone)
+        self.advance = jax.jit(jax.vmap(self._advanced, in_axes=(None, None, 0, 0)))
 
     def _trace(self, forks: Fork, first: Int[Array, ""], choice: Choice) -> Trace:
         fork = self.means.fork(forks.at(choice.start * self.means.period), choice)
@@ -49,8 +51,8 @@ class Programs:
     def _verdict(self, trace: Trace) -> Any:
         return *trace_verdict(self.problem, trace), boolean_semantics(self.problem, trace)
 
-    def _judged(self, *arguments: Any) -> Any:
-        return self._verdict(self._trace(*arguments))
+    def _judged(self, forks: Fork, first: Int[Array, ""], choice: Choice) -> Any:
+        return self._verdict(self._trace(forks, first, choice))
 
     def _objective(self, forks: Fork, first: Any, choice: Choice, temperature: Any) -> Any:
         trace = self._trace(forks, first, choice)
@@ -59,6 +61,18 @@ class Programs:
     def _alone(self, forks: Fork, choice: Choice) -> Any:
         trace = self.means.replayed(forks, choice)
         return self._verdict(trace), trace
+
+    def _advanced(self, forks: Fork, decision: Any, state: Any, numbers: Any) -> Any:
+        """Return the state one decision later, and the extremes of all signals so far."""
+        plan = Choice(jnp.int32(0), jnp.broadcast_to(numbers, self.means.shape), decision + 1)
+        fork = self.means.fork(forks, plan)
+        rollout = self.means.system.rollout(fork.features, forks.key)
+        loop, low, high = state
+        for k in range(self.means.period):
+            loop, signals = rollout.sample(loop, decision * self.means.period + k)
+            low = jax.tree.map(jnp.minimum, low, signals)
+            high = jax.tree.map(jnp.maximum, high, signals)
+        return loop, low, high
 
 
 class EscapeSearch:
@@ -86,9 +100,8 @@ class EscapeSearch:
         parts = []
         for begin in range(0, len(starts), self.lanes):
             some = slice(begin, begin + self.lanes)
-            first, choice = self._packed(starts[some], numbers[some], stops[some], self.lanes)
-            rho, status, holds = map(np.asarray, self.programs.judge(self.forks, first, choice))
-            parts.append(escaping(rho, status, holds))
+            packed = self._packed(starts[some], numbers[some], stops[some], self.lanes)
+            parts.append(escaping(*map(np.asarray, self.programs.judge(self.forks, *packed))))
         rho, escaped = (np.concatenate(both)[: len(starts)] for both in zip(*parts, strict=True))
         self.simulations += len(starts)
         count_done(len(starts))
@@ -108,6 +121,8 @@ class EscapeSearch:
         """
         for instant in instants:
             self._begin(instant)
+            if effort > 1 and all(self.means.levels) and isinstance(self.means, Controls):
+                self.proposals[instant].waiting.append(self._distinct(instant, self.means))
         for number in range(self.rounds * effort if self.means.shape[1] else 1):
             # An escape from a later instant is one from all before it.
             latest = max((i for i in instants if i in self.found), default=-1)
@@ -125,7 +140,7 @@ class EscapeSearch:
                     i = n * share + int(np.argmax(np.where(escaped[mine], rho[mine], -np.inf)))
                     self.found[instant] = _choice(instant, numbers[i], stops[i])
             if self.climbs and number % 2:
-                self._climb([i for i in left if i not in self.found])
+                self._climb([self.proposals[i] for i in left if i not in self.found])
         return [i for i in instants if i in self.found]
 
     def _begin(self, instant: int) -> None:
@@ -140,11 +155,34 @@ class EscapeSearch:
                 shifted = numbers[:, np.clip(np.arange(steps) - by, 0, steps - 1)]
                 mine.waiting.append((shifted, np.clip(stops + by, instant + 1, steps)))
 
-    def _climb(self, instants: Sequence[int]) -> None:
+    def _distinct(self, instant: int, controls: Controls) -> tuple[Numbers, Stops]:
+        """Return sequences of whole-number actions that lead to distinct states, breadth first."""
+        each = np.meshgrid(*[(np.arange(n) + 0.5) / n for n in controls.levels])
+        each = np.stack(each, -1).reshape(-1, controls.shape[1])
+        plans, width = np.zeros((1, *controls.shape)), max(self.lanes // len(each), 1)
+        index = np.full(1, instant * controls.period)
+        now = jax.tree.map(lambda leaf: np.asarray(leaf)[index], self.forks.samples)
+        states = jax.tree.map(np.asarray, (self.forks.at(index).state, now, now))
+        for decision in range(instant, controls.shape[0]):
+            plans = np.repeat(plans, len(each), axis=0)
+            plans[:, decision] = np.tile(each, (len(plans) // len(each), 1))
+            lanes = np.resize(np.arange(len(plans)), width * len(each))
+            before = jax.tree.map(partial(np.take, indices=lanes // len(each), axis=0), states)
+            given = np.int32(decision), before, plans[lanes, decision]
+            after = jax.tree.map(np.asarray, self.programs.advance(self.forks, *given))
+            # The first link remembers the last action alone.
+            seen = jax.tree.leaves((after[0]._replace(links=after[0].links[1:]), *after[1:]))
+            rows = np.concatenate([np.reshape(leaf, (len(lanes), -1)) for leaf in seen], axis=1)
+            kept = np.unique(rows[: len(plans)], axis=0, return_index=True)[1]
+            kept = self.rng.permutation(kept)[:width]
+            plans, states = plans[kept], jax.tree.map(partial(np.take, indices=kept, axis=0), after)
+        return plans, np.full(len(plans), controls.shape[0])
+
+    def _climb(self, proposals: Sequence[Proposals]) -> None:
         """Let steps along gradients wait, from the best choices of each instant."""
         lanes = 16 * CLIMBED
-        chosen = [(p, k) for p in map(self.proposals.get, instants) for k in range(CLIMBED) if p]
-        chosen = [(p, k) for p, k in chosen if k < len(p.rho) and np.isfinite(p.rho[k])]
+        chosen = [(p, k) for p in proposals for k in range(CLIMBED) if k < len(p.rho)]
+        chosen = [(p, k) for p, k in chosen if np.isfinite(p.rho[k])]
         for begin in range(0, len(chosen), lanes):
             some = chosen[begin : begin + lanes]
             starts, stops = np.array([(p.start, p.stops[k]) for p, k in some]).T
@@ -159,11 +197,11 @@ class EscapeSearch:
                 return
             slopes = np.nan_to_num(np.asarray(slopes)[: len(some)])
             self.simulations += len(some)
-            for (proposals, _), here, slope, stop in zip(some, numbers, slopes, stops, strict=True):
+            for (mine, _), here, slope, stop in zip(some, numbers, slopes, stops, strict=True):
                 if (size := np.abs(slope).max()) > 0:
                     steps = [s * move for move in (slope / size, np.sign(slope)) for s in STEPS]
                     tried = np.clip(here + np.stack(steps), 0, 1)
-                    proposals.waiting.append((tried, np.full(len(tried), stop)))
+                    mine.waiting.append((tried, np.full(len(tried), stop)))
 
 
 def _choice(start: Any, numbers: Any, stop: Any) -> Choice:
