@@ -120,8 +120,8 @@ class Fork(NamedTuple):
     state: LoopState
     samples: PyTree
 
-    def at(self, index: Int[Array, ""] | int) -> "Fork":
-        """Return the fork of a simulation before one sample, which JAX may trace."""
+    def at(self, index: Int[Array | np.ndarray, "*n"] | int) -> "Fork":
+        """Return the fork of a simulation before a sample, or those before several."""
         state = jax.tree.map(lambda leaf: leaf[index], self.state)
         return self._replace(index=self.index[index], state=state)
 

@@ -26,6 +26,7 @@ class Proposals:
 
     def __init__(self, means: Means, start: int, rng: np.random.Generator) -> None:
         self.means, self.start, self.rng = means, start, rng
+        self.first = min(start, means.shape[0] - 1)
         self.waiting: list[tuple[Numbers, Stops]] = []
         self.numbers, self.stops = np.zeros((0, *means.shape)), np.zeros(0, int)
         self.rho = np.zeros(0)
@@ -55,12 +56,12 @@ class Proposals:
         """Return where choices stop: half of them at the end."""
         early = self.means.ends & (self.rng.random(count) < 0.5)
         steps = self.means.shape[0]
-        return np.where(early, self.rng.integers(self.start + 1, steps + 1, count), steps)
+        return np.where(early, self.rng.integers(self.first + 1, steps + 1, count), steps)
 
     def _few_pieces(self, count: int) -> tuple[Numbers, Stops]:
         (steps, entries), rng = self.means.shape, self.rng
         # Changes are more likely soon after the start, where they matter most.
-        changes = self.start + (steps - self.start) * rng.random((count, PIECES - 1)) ** 2
+        changes = self.first + (steps - self.first) * rng.random((count, PIECES - 1)) ** 2
         few = rng.integers(0, PIECES, (count, 1)) <= np.arange(PIECES - 1)
         pieces = np.arange(steps)[:, None] >= np.where(few, steps, changes)[:, None]
         levels = self._levels(count, PIECES, entries)
@@ -70,8 +71,8 @@ class Proposals:
         """Return good choices with another value of some entries over a segment."""
         (steps, entries), rng = self.means.shape, self.rng
         parents = (len(self.rho) * rng.random(count) ** 2).astype(int)
-        length = np.maximum(1, ((steps - self.start) * rng.random(count) ** 3).astype(int))
-        begin = rng.integers(self.start, np.maximum(steps - length, self.start) + 1)
+        length = np.maximum(1, ((steps - self.first) * rng.random(count) ** 3).astype(int))
+        begin = rng.integers(self.first, np.maximum(steps - length, self.first) + 1)
         since = np.arange(steps) - begin[:, None]
         chosen = rng.random((count, entries)) < max(0.5, 1.5 / max(entries, 1))
         replaced = ((since >= 0) & (since < length[:, None]))[:, :, None] & chosen[:, None]

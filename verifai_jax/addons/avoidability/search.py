@@ -160,7 +160,7 @@ class EscapeSearch:
         each = np.meshgrid(*[(np.arange(n) + 0.5) / n for n in controls.levels])
         each = np.stack(each, -1).reshape(-1, controls.shape[1])
         plans, width = np.zeros((1, *controls.shape)), max(self.lanes // len(each), 1)
-        index: Any = np.full(1, instant * controls.period)
+        index = np.full(1, instant * controls.period)
         now = jax.tree.map(lambda leaf: np.asarray(leaf)[index], self.forks.samples)
         states = jax.tree.map(np.asarray, (self.forks.at(index).state, now, now))
         for decision in range(instant, controls.shape[0]):
