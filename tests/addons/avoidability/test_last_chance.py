@@ -114,7 +114,8 @@ def test_the_environment_avoids_it_by_a_feature_from_an_instant_on():
     # Braking in proportion to the speed, a = -2 v, goes v / 2 (1 - exp(-2 t)) in t seconds.
     other = vj.last_chance(problem, features, by=system(-2.0), **SMALL)
     known = brentq(lambda t: 6 * t + 3 * (1 - np.exp(-2 * (3 - t))) - 10, 0, 2)
-    assert other.avoidable_until <= known <= other.no_escape_from
+    # Held between samples, it brakes a little more.
+    assert other.avoidable_until - 0.01 <= known <= other.no_escape_from
     assert "the other policy could avoid it" in str(other)
 
 

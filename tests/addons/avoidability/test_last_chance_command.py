@@ -25,7 +25,7 @@ wall = vj.Problem("wall", {"v0": vj.Box(5, 8)}, car, "always x <= 10")
 def test_the_command_prints_the_bracket_and_draws_it(tmp_path):
     (tmp_path / "model.py").write_text(MODEL)
     folder = tmp_path / "run"
-    options = ("--search", "uniform", "--budget", "16", "--into", str(folder), "--no-progress")
+    options = ("--search", "uniform", "--budget", "16", "--folder", str(folder), "--no-progress")
     done = CliRunner().invoke(main, ["falsify", f"{tmp_path / 'model.py'}:wall", *options])
     assert folder.is_dir(), done.output
     few = ("--problem", f"{tmp_path / 'model.py'}:wall", "--forks", "256", "--rounds", "6")

@@ -14,7 +14,7 @@ from verifai_jax.cli.json_output import command, draw, give_result, say
 @arguments.ROW
 @arguments.PROBLEM
 @arguments.EVEN_IF_CHANGED
-@option("--by", default="controller", help="controller or environment.", show_default=True)
+@option("--by", default="controller", help="controller or environment.")
 @option("--actions", nargs=2, type=float, metavar="LOW HIGH", help="Lowest and highest action.")
 @option("--forks", default=2048, help="Simulations at once.")
 @option("--rounds", default=12, help="Batches for each refinement of the bracket.")
