@@ -56,6 +56,7 @@ ADDONS = {
         "searches",
         "verification",
     },
+    "avoidability": {"verification"},
     "faults": {"estimation", "reports"},
     "synthesis": {"estimation", "verification"},
     "perception": {"analysis"},

@@ -22,6 +22,8 @@ if TYPE_CHECKING:
     from verifai_jax.addons.assurance.signing import sign_report as sign_report
     from verifai_jax.addons.assurance.traceability import TraceMatrix as TraceMatrix
     from verifai_jax.addons.assurance.traceability import trace_matrix as trace_matrix
+    from verifai_jax.addons.avoidability import LastChance as LastChance
+    from verifai_jax.addons.avoidability import last_chance as last_chance
     from verifai_jax.addons.checking import replay_counterexamples as replay_counterexamples
     from verifai_jax.addons.checking import test as test
     from verifai_jax.addons.estimation import Estimate as Estimate

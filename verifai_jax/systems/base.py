@@ -24,6 +24,7 @@ from verifai_jax.core.user_code.user_errors import format_user_error
 from verifai_jax.core.values.trace import Status, Trace
 from verifai_jax.features.domain import Domain
 from verifai_jax.systems.channels import Link, Passing
+from verifai_jax.systems.forks import Fork, Rollout
 
 KnownSignals: TypeAlias = tuple[str, ...] | Mapping[str, int] | None
 """Names of signals, or names with their numbers of components, 1 for a scalar; None if unknown."""
@@ -84,12 +85,12 @@ class System(ForUsers):
     """
 
     _internal = frozenset((
-        "abstract", "backend", "backends", "black_box", "can_fold", "can_refine",
+        "abstract", "backend", "backends", "black_box", "can_fold", "can_fork", "can_refine",
         "can_simulate_batch", "can_simulate_each", "constants", "derived", "effort", "exact_step",
-        "filmed", "fold", "forward_up_to", "known_signals", "lanes", "likely", "links",
-        "may_draw", "passing", "refined", "renewed", "reverse_hint", "simulate_batch",
-        "simulate_each", "switches", "traced_factor", "unroll", "why_error", "why_not",
-        "with_backend", "with_domains", "with_links", "workers",
+        "filmed", "fold", "forks", "forward_up_to", "go_on", "known_signals", "lanes", "likely",
+        "links", "may_draw", "passing", "refined", "renewed", "reverse_hint", "rollout",
+        "simulate_batch", "simulate_each", "switches", "traced_factor", "unroll", "why_error",
+        "why_not", "with_backend", "with_domains", "with_links", "workers",
     ))  # fmt: skip
     black_box: bool = False
     # About 1 MB of a trace with 200 samples and two signals.
@@ -110,7 +111,9 @@ class System(ForUsers):
 
     def __call__(self, features: Features, key: Seed = None) -> Trace:
         """Simulate once, the same trace for the same features and key."""
-        raise NotImplementedError(f"{type(self).__name__} has no __call__(features, key)")
+        if not self.can_fork:
+            raise NotImplementedError(f"{type(self).__name__} has no __call__(features, key)")
+        return self.rollout(features, key).trace()
 
     def check(self, features: Features) -> None:
         """Refuse features that do not fit the system, before anything compiles.
@@ -147,7 +150,7 @@ class System(ForUsers):
     @property
     def can_fold(self) -> bool:
         """True if the system can simulate without storing its samples."""
-        return type(self).fold is not System.fold
+        return type(self).fold is not System.fold or self.can_fork
 
     def fold(
         self, features: Features, key: Seed, carry: Carry,
@@ -159,7 +162,29 @@ class System(ForUsers):
 
         **Returns:** the last carry, and the status of the simulation.
         """
-        raise NotImplementedError(f"{self!r} has no fold(features, key, carry, update)")
+        return self.rollout(features, key).fold(carry, update)
+
+    @property
+    def can_fork(self) -> bool:
+        """True if a simulation may stop before any sample, and go on from there."""
+        return type(self).rollout is not System.rollout
+
+    def rollout(self, features: Features, key: Seed = None) -> Rollout:
+        """Return one simulation as a loop over its samples, for a system that can fork."""
+        raise ValueError(f"{self!r} cannot fork, because it has no rollout(features, key)")
+
+    def forks(self, features: Features, key: Seed = None) -> Fork:
+        """Simulate once, and return the forks before all samples; `at(k)` selects one."""
+        return self.rollout(features, key).forks(features, key)
+
+    def go_on(self, fork: Fork, first: Int[Array, ""] | int = 0) -> Trace:
+        """Return the whole trace of a fork that goes on.
+
+        **Arguments:**
+        - `first`: an index, common to a batch, before which none of its forks begins; the samples
+          before it take no time.
+        """
+        return self.rollout(fork.features, fork.key).go_on(fork, first)
 
     @property
     def can_refine(self) -> bool:
@@ -328,6 +353,7 @@ class FunctionSystem(System):
     with_domains = _delegated("with_domains", makes_system=True)
     abstract = _delegated("abstract")
     fold = _delegated("fold")
+    rollout = _delegated("rollout")
     refined = _delegated("refined", makes_system=True)
     filmed = _delegated("filmed")
     renewed = _delegated("renewed", makes_system=True)
@@ -339,6 +365,7 @@ class FunctionSystem(System):
     simulate_batch = _delegated("simulate_batch")
     simulate_each = _delegated("simulate_each")
     can_fold = property(lambda self: self._offers("fold"))
+    can_fork = property(lambda self: self._offers("rollout"))
     can_refine = property(lambda self: self._offers("refined") and not self.exact_step)
     can_simulate_batch = property(lambda self: self._offers("simulate_batch"))
     can_simulate_each = property(lambda self: self._offers("simulate_each"))

@@ -58,10 +58,12 @@ class Link:
     - `features`: names of the features that it reads.
     - `draws`: whether it uses random numbers.
     - `arrays`: names of the parts of an observation that it reads in addition; see `Entries`.
+    - `decides`: whether it stands in for the policy, ahead of all delays and faults of actions.
     """
 
     side: Side = "observation"
     draws: bool = False
+    decides: bool = False
 
     @property
     def features(self) -> tuple[str, ...]:
@@ -176,6 +178,7 @@ class Passing(NamedTuple):
     - `period`: seconds between two decisions; `duration`: that of a simulation.
     - `names`: names of single numbers, in addition to the names of the parts.
     - `hidden`: parts of an observation that do not belong to the whole, such as the time.
+    - `bounds`: the lowest and the highest action, numbers or arrays in its form; None if unknown.
     """
 
     observation: PyTree
@@ -184,6 +187,7 @@ class Passing(NamedTuple):
     duration: float
     names: Mapping[str, NamedNumbers] = {}
     hidden: tuple[str, ...] = ()
+    bounds: tuple[PyTree, PyTree] | None = None
 
     def entries(self, channel: str) -> "Entries":
         """Return the numbers selected by a channel.

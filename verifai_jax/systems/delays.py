@@ -162,10 +162,10 @@ def joined(links: tuple[Link, ...], faults: tuple[Link, ...]) -> tuple[Link, ...
     """Return links with faults inserted.
 
     Faults of sensors come before the delay of the observation, faults of actuators after the delay
-    of the action; faults keep their order.
+    of the action; faults keep their order. What stands in for the policy comes before all.
     """
     delays = [link for link in links if isinstance(link, Delay)]
     others = [link for link in (*links, *faults) if not isinstance(link, Delay)]
     observed = [link for link in others if link.side == "observation"]
-    acted = [link for link in others if link.side == "action"]
-    return (*observed, *delays, *acted)
+    acted = [link for link in others if link.side == "action" and not link.decides]
+    return (*(link for link in others if link.decides), *observed, *delays, *acted)

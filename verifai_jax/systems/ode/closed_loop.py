@@ -3,6 +3,7 @@
 import contextlib
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any, ClassVar
 
 import jax
@@ -10,12 +11,13 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int, PyTree
 
 from verifai_jax.core.user_code.user_errors import defined_at
-from verifai_jax.core.values.trace import Status, Trace
+from verifai_jax.core.values.trace import Status
 from verifai_jax.core.values.waveform import set_durations, within_step
-from verifai_jax.systems.base import Carry, Features, Seed, System
+from verifai_jax.systems.base import Features, Seed, System
 from verifai_jax.systems.channels import Channels, Link, Passing, States, first_refusal
 from verifai_jax.systems.checkpointing import checkpointed_scan
 from verifai_jax.systems.delays import joined
+from verifai_jax.systems.forks import LoopState, Rollout
 from verifai_jax.systems.ode.delay_line import DelayLine
 from verifai_jax.systems.ode.integrators import (
     Integrator,
@@ -87,14 +89,14 @@ class Ode(System):
             check_factor(factor)
         return replace(self, substeps=self.substeps * factor)
 
-    def __call__(self, features: Features, key: Seed = None) -> Trace:
-        """Simulate once; `features` and `key` reach the functions given to `ode` as they are.
+    def rollout(self, features: Features, key: Seed = None) -> Rollout:
+        """Return one simulation; `features` and `key` reach the functions of `ode` as they are.
 
         Only a waveform without a duration is given that of the simulation.
         """
         features = set_durations(features, self.duration)
         start = as_floating(self.initial(features, key), "initial")
-        return _Rollout(self, features, key).trace(start)
+        return _Rollout(self, features, key).from_state(start)
 
     def check(self, features: Features) -> None:
         """Refuse features that a fault cannot read."""
@@ -147,14 +149,6 @@ class Ode(System):
     def with_links(self, links: tuple[Link, ...]) -> "Ode":
         return replace(self, links=joined(self.links, links))
 
-    def fold(
-        self, features: Features, key: Seed, carry: Carry,
-        update: Callable[[Carry, dict[str, Array]], Carry],
-    ) -> tuple[Any, Int[Array, ""]]:  # fmt: skip
-        features = set_durations(features, self.duration)
-        rollout = _Rollout(self, features, key)
-        return rollout.fold(as_floating(self.initial(features, key), "initial"), carry, update)
-
 
 @contextlib.contextmanager
 def _explaining_no_control(
@@ -199,62 +193,39 @@ class _Rollout:
         nothing = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), form)
         return self.channels.begin(state, nothing, self.key)
 
-    def trace(self, state: PyTree) -> Trace:
-        loop = self.loop
-        memory = in_working_precision(loop.controller_memory)
-        finite = self.check(state, memory)
-        last, age, _, samples = self.run(state, memory, None, lambda _, sample: (None, sample))
-        ends = loop.terminate is not None
-        return Trace(
-            samples, dt=loop.dt, valid=age + 1 if ends else None,
-            status=_status(last, self.channels.valid()), held=ends, finite=finite,
-        )  # fmt: skip
+    def from_state(self, start: PyTree) -> Rollout:
+        """Return the simulation as a loop from a state on."""
+        loop, memory = self.loop, in_working_precision(self.loop.controller_memory)
+        finite = self.check(start, memory)
 
-    def fold(
-        self, state: PyTree, carry: Carry, update: Callable[[Carry, dict[str, Array]], Carry]
-    ) -> Any:
-        memory = in_working_precision(self.loop.controller_memory)
-        self.check(state, memory)
-        last, _, carry, _ = self.run(
-            state, memory, carry, lambda c, sample: (update(c, sample), None)
-        )
-        return carry, _status(last, self.channels.valid())
-
-    def run(
-        self, state: PyTree, memory: PyTree, collected: PyTree,
-        collect: Callable[[PyTree, dict[str, Array]], tuple[PyTree, PyTree]],
-    ) -> tuple[Any, Any, Any, Any]:  # fmt: skip
-        """Return the last state, the number of steps, the last `collected` and the outputs."""
-        loop, start = self.loop, state
-
-        def sample(carry: PyTree, k: Int[Array, ""]) -> Any:
-            (state, memory, held, age), collected = carry
+        def sample(carry: LoopState, k: Int[Array, ""]) -> Any:
+            state, age, known = carry.plant, carry.age, (carry.memory, carry.links)
             time, frozen = self.clock(k, age, state)
-            control, (own, states) = self.decide(k, age, time, frozen, state, memory, held)
+            control, (own, links) = self.decide(k, age, time, frozen, state, known, carry.held)
             signals = self.signals(time, state, control)
             next_state = self.step(time, self.safe_state(frozen, state, start), control)
             next_state = updated(loop, time + loop.dt, next_state, self.features)
-            applied = None if held is None else control
+            applied = None if carry.held is None else control
             following = (next_state, own, applied, age + 1)
             # The links know of the end themselves: a long line of past values is not copied for it.
-            state, own, applied, age = _where(frozen, (state, memory[0], applied, age), following)
-            collected, output = collect(collected, signals)
-            return ((state, (own, states), applied, age), collected), output
+            unchanged = (state, carry.memory, applied, age)
+            state, own, applied, age = _where(frozen, unchanged, following)
+            return LoopState(state, own, links, age, applied), signals
 
         # A controller that runs at every sample holds nothing between samples.
         held = None
-        memory = (memory, self.states(state, memory))
+        links = self.states(start, memory)
         if loop.steps_per_control > 1:
-            time = jnp.zeros((), _dtype(state))
-            form = jax.eval_shape(self.control, time, jnp.array(False), state, memory)[0]
+            time = jnp.zeros((), _dtype(start))
+            form = jax.eval_shape(self.control, time, jnp.array(False), start, (memory, links))[0]
             held = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), form)
-        # One iteration more than there are steps: it samples the final state and moves nothing,
-        # which is cheaper than copying all samples to append one.
-        ((state, _, _, age), collected), outputs = checkpointed_scan(
-            sample, ((state, memory, held, jnp.int32(0)), collected), loop.steps + 1,
-            unroll=loop.unroll,
+        # One sample more than there are steps: the last one moves nothing, which is cheaper than
+        # copying all samples to append one.
+        return Rollout(
+            LoopState(start, memory, links, jnp.int32(0), held), sample, loop.steps + 1, loop.dt,
+            lambda last: _status(last.plant, self.channels.valid()), loop.terminate is not None,
+            finite, partial(checkpointed_scan, unroll=loop.unroll),
         )  # fmt: skip
-        return state, age, collected, outputs
 
     def decide(
         self, k: Int[Array, ""], age: Int[Array, ""], time: Time, frozen: Bool[Array, ""],

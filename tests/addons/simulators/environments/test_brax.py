@@ -14,7 +14,7 @@ from verifai_jax.core.messages.errors import MissingExtra, UnknownNameError
 from verifai_jax.core.values.trace import Status
 from verifai_jax.core.values.waveform import Waveform
 from verifai_jax.systems.policy import new_layers
-from verifai_jax.testing import check_system
+from verifai_jax.testing import check_forks, check_system
 
 pytest.importorskip("brax")
 
@@ -203,7 +203,9 @@ def test_falsified_in_batches(changed):
 @pytest.mark.slow
 def test_keeps_the_contract_of_systems():
     system = brax(Slide(), jitter, steps=30, features={"mass": "mass[0]", "drag": "drag"})
-    check_system(system, vj.FeatureSpace({"mass": vj.Box(1.0, 4.0), "drag": vj.Box(0.0, 1.0)}))
+    space = vj.FeatureSpace({"mass": vj.Box(1.0, 4.0), "drag": vj.Box(0.0, 1.0)})
+    check_system(system, space)
+    check_forks(system, space)
 
 
 def test_signal_feature_changes_the_system_as_time_goes_by():

@@ -10,7 +10,6 @@ from verifai_jax.addons.simulators.environments.episode import (
     Moment,
     episode_keys,
     features_at,
-    fold,
     has_waveforms,
     policy_function,
     rollout,
@@ -52,7 +51,7 @@ def tank(level, **changes):
 
 def test_what_is_over_is_frozen_and_has_a_finite_gradient():
     def total(level):
-        trace = rollout(tank(level), KEY)
+        trace = rollout(tank(level), KEY).trace()
         return jnp.sum(trace["level"]), trace
 
     (_, trace), slope = jax.jit(jax.value_and_grad(total, has_aux=True))(jnp.float32(1.0))
@@ -74,8 +73,8 @@ def test_a_fold_takes_in_the_samples_of_the_trace():
 
     for level, steps in ((1.0, 30), (9.0, 30)):
         episode = tank(jnp.float32(level), steps=steps)
-        trace = rollout(episode, KEY)
-        (total, latest), status = fold(episode, KEY, (0.0, 0.0), add)
+        trace = rollout(episode, KEY).trace()
+        (total, latest), status = rollout(episode, KEY).fold((0.0, 0.0), add)
         assert float(total) == pytest.approx(float(trace["level"].sum()), rel=1e-5)
         assert float(latest) == float(trace["time"][-1])
         assert int(status) == int(trace.status) == Status.OK
@@ -87,7 +86,7 @@ def test_a_state_that_is_not_a_number_is_a_status():
 
     def status(x):
         start = lambda key: Moment(x, x, 0.0, False)  # noqa: E731
-        return rollout(tank(x, step=step, start=start), KEY).status
+        return rollout(tank(x, step=step, start=start), KEY).trace().status
 
     codes = jax.jit(jax.vmap(status))(jnp.array([0.9, 3.0, jnp.nan]))
     np.testing.assert_array_equal(codes, [Status.OK, Status.NONFINITE, Status.NONFINITE])
@@ -100,7 +99,7 @@ def test_types_of_the_start_give_way_to_those_of_a_step():
 
     start = Moment({"n": 0, "one": True}, jnp.zeros(1, int), 0, False)
     signals = {"signals": lambda time, moment, action: {"n": moment.state["n"]}}
-    trace = rollout(tank(jnp.ones(()), start=lambda key: start, step=step, **signals), KEY)
+    trace = rollout(tank(jnp.ones(()), start=lambda key: start, step=step, **signals), KEY).trace()
     np.testing.assert_allclose(trace["n"], np.arange(31) / 2)
 
 
@@ -130,7 +129,7 @@ def test_types_of_the_start_give_way_to_those_of_a_step():
 )
 def test_parts_that_do_not_fit(changes, message):
     with pytest.raises(ValueError, match=message):
-        jax.eval_shape(lambda level: rollout(tank(level, **changes), KEY), 1.0)
+        jax.eval_shape(lambda level: rollout(tank(level, **changes), KEY).trace(), 1.0)
 
 
 def test_random_policies_get_a_key_of_each_step():
@@ -140,7 +139,7 @@ def test_random_policies_get_a_key_of_each_step():
         return {"action": action}
 
     decide = without_features(lambda observation, key: jax.random.normal(key))
-    trace = rollout(tank(jnp.float32(9.0), decide=decide, signals=signals), KEY)
+    trace = rollout(tank(jnp.float32(9.0), decide=decide, signals=signals), KEY).trace()
     for k in range(31):
         seen.append(jax.random.normal(jax.random.fold_in(episode_keys(KEY).decide, k)))
     np.testing.assert_allclose(trace["action"], seen, rtol=1e-6)

@@ -14,7 +14,7 @@ from verifai_jax.core.messages.errors import MissingExtra, UnknownNameError
 from verifai_jax.core.values.trace import Status
 from verifai_jax.core.values.waveform import Waveform
 from verifai_jax.systems.policy import new_layers
-from verifai_jax.testing import check_system
+from verifai_jax.testing import check_forks, check_system
 
 package = pytest.importorskip("gymnax")
 
@@ -164,9 +164,9 @@ def test_keeps_the_contract_of_systems():
     system = gymnax(
         "CartPole-v1", coin, steps=50, features=["masspole"], initial={"spin": "theta_dot"}
     )
-    check_system(
-        system, vj.FeatureSpace({"spin": vj.Box(-2.0, 2.0), "masspole": vj.Box(0.05, 0.5)})
-    )
+    space = vj.FeatureSpace({"spin": vj.Box(-2.0, 2.0), "masspole": vj.Box(0.05, 0.5)})
+    check_system(system, space)
+    check_forks(system, space)
 
 
 def test_time_limit_cuts_only_when_asked():

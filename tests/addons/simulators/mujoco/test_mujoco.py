@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from checked_types import unchecked
 
+import verifai_jax as vj
 from envs import cartpole as analytic
 from verifai_jax.addons.simulators.mujoco.bindings import Scaled
 from verifai_jax.addons.simulators.mujoco.system import mjx, native
@@ -17,6 +18,7 @@ from verifai_jax.core.messages.errors import UnknownNameError
 from verifai_jax.core.values.trace import Status
 from verifai_jax.core.values.waveform import Waveform
 from verifai_jax.systems.ode import ode
+from verifai_jax.testing import check_forks
 
 CART = str(Path(__file__).parents[4] / "envs" / "mujoco_cartpole.xml")
 GAINS = np.array([0.91, 2.13, 30.6, 7.84])
@@ -191,6 +193,14 @@ def test_mujoco_is_the_analytic_cart_pole():
     # Semi-implicit Euler at 5 ms against Runge-Kutta.
     np.testing.assert_allclose(got["theta"], np.asarray(fine["theta"])[::4], atol=4e-3)
     assert np.abs(got["theta"]).max() > 0.3
+
+
+@pytest.mark.slow
+def test_forks_go_on_bit_for_bit():
+    system = loop(duration=0.4, bind={"x0": "joint/slider/qpos", "theta0": "joint/hinge/qpos"})
+    space = vj.FeatureSpace({"x0": vj.Box(-1, 1), "theta0": vj.Box(-0.15, 0.15)})
+    assert not system.with_backend("native").can_fork
+    check_forks(system.with_backend("mjx"), space, samples=1)
 
 
 def test_controller_with_memory_and_initial_state():

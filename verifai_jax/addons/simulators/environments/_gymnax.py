@@ -79,6 +79,12 @@ class Gymnax(PolicyLoop):
     def _action(self, action: PyTree) -> Array:
         return _as_action(action, self.env.action_space(self.params), self.name)
 
+    def _action_bounds(self) -> tuple[PyTree, PyTree] | None:
+        space = self.env.action_space(self.params)
+        if hasattr(space, "n"):
+            return 0, space.n - 1
+        return (space.low, space.high) if hasattr(space, "low") else super()._action_bounds()
+
     def _configured(self, features: Features) -> Params:
         params = self.params
         if self.features:

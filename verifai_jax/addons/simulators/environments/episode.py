@@ -1,6 +1,6 @@
 """One trace of one episode: a policy in the loop with any environment.
 
-    rollout(Episode(name, start, step, decide, memory, see, steps=200, dt=0.02), key)
+    rollout(Episode(name, start, step, decide, memory, see, steps=200, dt=0.02), key).trace()
 
 An episode that is over stays in its final state; it is never reset within a trace.
 """
@@ -19,12 +19,12 @@ from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
 from verifai_jax.core.messages.checks import check_count
 from verifai_jax.core.messages.errors import check_names
-from verifai_jax.core.values.trace import Status, Trace
+from verifai_jax.core.values.trace import Status
 from verifai_jax.core.values.waveform import is_waveform
-from verifai_jax.systems.base import Carry, Features, Seed
+from verifai_jax.systems.base import Features, Seed
 from verifai_jax.systems.channels import NOTHING_PASSED, Channels
-from verifai_jax.systems.checkpointing import checkpointed_scan
 from verifai_jax.systems.clock import count_periods
+from verifai_jax.systems.forks import LoopState, Rollout
 from verifai_jax.systems.pytree_checks import (
     as_precise_as,
     check_like,
@@ -89,8 +89,8 @@ def episode_keys(key: Seed) -> _Keys:
     return _Keys(*jax.random.split(jax.random.key(0) if key is None else key, 3))
 
 
-def rollout(episode: Episode, key: Seed) -> Trace:
-    """Simulate one episode: a sample after the reset and after each step, with its action.
+def rollout(episode: Episode, key: Seed) -> Rollout:
+    """Return one episode as a loop: a sample after the reset and after each step, with its action.
 
     The reward of a sample is that of the step that led to it. The first sample at which the episode
     is over is the last valid one. The status is `NONFINITE` if the episode ends in a state with a
@@ -99,34 +99,12 @@ def rollout(episode: Episode, key: Seed) -> Trace:
 
     **Raises:** `ValueError` when JAX traces it, for parts that do not fit together.
     """
-    last, age, _, samples = _run(episode, key, None, lambda _, sample: (None, sample))
-    status = _status(last, episode.channels.valid())
-    return Trace(samples, dt=episode.dt, valid=age + 1, status=status, held=True)
-
-
-def fold(
-    episode: Episode, key: Seed, carry: Carry, update: Callable[[Carry, dict[str, Array]], Carry]
-) -> tuple[Carry, Int[Array, ""]]:
-    """Apply `carry = update(carry, sample)` to the samples of `rollout` without storing them.
-
-    After the end the last valid sample is repeated. **Returns:** the last carry, and the status.
-    """
-    last, _, carry, _ = _run(episode, key, carry, lambda c, sample: (update(c, sample), None))
-    return carry, _status(last, episode.channels.valid())
-
-
-def _run(
-    episode: Episode, key: Seed, collected: PyTree,
-    collect: Callable[[PyTree, dict[str, Array]], tuple[PyTree, PyTree]],
-) -> tuple[Moment, Any, Any, Any]:  # fmt: skip
-    """Return the last moment, the number of steps, the last `collected` and the outputs."""
     keys = episode_keys(key)
     first, memory, action = _first_moment(episode, episode.start(keys.start), keys)
     channels = episode.channels
-    states = channels.begin(first.observation, action, key)
 
-    def sample(carry: PyTree, k: Int[Array, ""]) -> Any:
-        (moment, memory, states, age), collected = carry
+    def sample(carry: LoopState, k: Int[Array, ""]) -> Any:
+        moment, memory, states, age, _ = carry
         frozen = (k >= episode.steps) | moment.over
         # Time, and with it randomness, stops with the state: the samples after the end repeat.
         time = age.astype(float) * episode.dt
@@ -135,19 +113,20 @@ def _run(
         action, after = episode.decide(time, observed, memory, decide_key)
         after = as_precise_as(after, memory)
         action, states = channels.action(states, action, time, frozen)
-        collected, output = collect(collected, episode.signals(time, moment, action))
+        signals = episode.signals(time, moment, action)
         # A state in which an episode has ended may have no finite derivative.
         state = _where(frozen, first.state, moment.state)
         following = _cast(episode.next_moment(time, state, action, step_key), moment)
         unchanged, onwards = (moment, memory, age), (following, after, age + 1)
         moment, memory, age = _where(frozen, unchanged, onwards)
-        return ((moment, memory, states, age), collected), output
+        return LoopState(moment, memory, states, age), signals
 
-    # One iteration more than there are steps samples the end and moves nothing.
-    ((last, _, _, age), collected), outputs = checkpointed_scan(
-        sample, ((first, memory, states, jnp.int32(0)), collected), episode.steps + 1
-    )
-    return last, age, collected, outputs
+    start = LoopState(first, memory, channels.begin(first.observation, action, key), jnp.int32(0))
+    # One sample more than there are steps: the last one moves nothing.
+    return Rollout(
+        start, sample, episode.steps + 1, episode.dt,
+        lambda last: _status(last.plant, channels.valid()),
+    )  # fmt: skip
 
 
 def _status(last: Moment, valid: Bool[Array, ""] | bool) -> Int[Array, ""]:

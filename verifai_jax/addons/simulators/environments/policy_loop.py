@@ -11,7 +11,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar
 
 import jax
-from jaxtyping import Array, Int, Key, PyTree
+from jaxtyping import Array, Key, PyTree
 
 from verifai_jax.addons.simulators.environments.episode import (
     Episode,
@@ -20,7 +20,6 @@ from verifai_jax.addons.simulators.environments.episode import (
     check_features,
     features_at,
     first_memory,
-    fold,
     has_waveforms,
     policy_function,
     policy_that_sees,
@@ -35,11 +34,12 @@ from verifai_jax.addons.simulators.environments.episode_signals import (
 )
 from verifai_jax.core.messages.errors import MissingExtra
 from verifai_jax.core.user_code.user_errors import check_called_with
-from verifai_jax.core.values.trace import Trace
 from verifai_jax.core.values.waveform import set_durations
-from verifai_jax.systems.base import Carry, Features, Seed, System
+from verifai_jax.systems.actions import Continuous, Discrete
+from verifai_jax.systems.base import Features, Seed, System
 from verifai_jax.systems.channels import Channels, Link, Passing, first_refusal
 from verifai_jax.systems.delays import DelayOption, as_delay, joined, links_of
+from verifai_jax.systems.forks import Rollout
 from verifai_jax.systems.pytree_checks import in_working_precision
 
 
@@ -68,15 +68,9 @@ class PolicyLoop(System):
         """Duration of a simulation in seconds."""
         return self.steps * self.dt
 
-    def __call__(self, features: Features, key: Seed = None) -> Trace:
-        """Simulate one episode, not reset at its end."""
+    def rollout(self, features: Features, key: Seed = None) -> Rollout:
+        """Return one episode, not reset at its end."""
         return rollout(self._episode(features), key)
-
-    def fold(
-        self, features: Features, key: Seed, carry: Carry,
-        update: Callable[[Carry, dict[str, Array]], Carry],
-    ) -> tuple[Carry, Int[Array, ""]]:  # fmt: skip
-        return fold(self._episode(features), key, carry, update)
 
     def _configured(self, features: Features) -> Any:
         """Return the environment under the features of an instant, in the form that it has."""
@@ -158,7 +152,16 @@ class PolicyLoop(System):
         key = jax.eval_shape(lambda: jax.random.key(0))
         observation, action = jax.eval_shape(first, features, key)
         names = names_of_entries(self.signals)
-        return Passing(observation, action, self.dt, self.duration, names)
+        return Passing(
+            observation, action, self.dt, self.duration, names, bounds=self._action_bounds()
+        )
+
+    def _action_bounds(self) -> tuple[PyTree, PyTree] | None:
+        """Return the lowest and the highest action; None if neither policy nor environment says."""
+        action = getattr(self.policy, "action", None)
+        if isinstance(action, Discrete):
+            return 0, action.n - 1
+        return (action.low, action.high) if isinstance(action, Continuous) else None
 
     def with_links(self, links: tuple[Link, ...]) -> "PolicyLoop":
         return replace(self, links=joined(self.links, links))

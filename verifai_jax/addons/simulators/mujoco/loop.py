@@ -212,7 +212,11 @@ class Loop:
         for number, name in enumerate(names(compiled, "actuator")):
             named.setdefault(name, NamedNumbers("action", "", (number,)))
         control = jax.ShapeDtypeStruct((compiled.nu,), state.time.dtype)
-        return Passing(state, control, self.control_period, self.duration, named, ("time",))
+        limited, ranges = np.all(compiled.actuator_ctrllimited), compiled.actuator_ctrlrange.T
+        return Passing(
+            state, control, self.control_period, self.duration, named, ("time",),
+            (ranges[0], ranges[1]) if limited and compiled.nu else None,
+        )  # fmt: skip
 
     def rest(self) -> Float[Array, " nu"]:
         """Return the control if there is no controller: the keyframe's, or zero."""

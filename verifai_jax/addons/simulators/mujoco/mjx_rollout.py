@@ -23,8 +23,9 @@ from verifai_jax.addons.simulators.mujoco.model import MjxData, MjxModel, Model,
 from verifai_jax.addons.simulators.mujoco.part_paths import MjModel
 from verifai_jax.core.compute.derivatives import with_derivative_of
 from verifai_jax.core.messages.errors import require
-from verifai_jax.core.values.trace import Status, Trace
+from verifai_jax.core.values.trace import Status
 from verifai_jax.systems.base import Features, Seed
+from verifai_jax.systems.forks import LoopState, Rollout
 
 # Values at which MJX looks once, to see whether there is any friction; features may change them.
 _SWITCHES = ("dof_frictionloss", "tendon_frictionloss")
@@ -42,8 +43,8 @@ class Physics(NamedTuple):
     sensordata: Array
 
 
-def rollout(loop: Loop, features: Features, key: Seed) -> Trace:
-    """Simulate once."""
+def rollout(loop: Loop, features: Features, key: Seed) -> Rollout:
+    """Return one simulation as a loop over its samples."""
     mjx = mjx_module()
     model, blank = prepare_model(loop.bindings, features)
     if not _is_one(loop.finer):
@@ -81,8 +82,9 @@ def rollout(loop: Loop, features: Features, key: Seed) -> Trace:
         # Runge-Kutta evaluates the sensors at its inner stages too.
         return Physics(**{**after, "sensordata": data.sensordata}), rest
 
-    def sample(carry: tuple[Physics, Progress], k: Int[Array, ""]) -> Any:
-        before, progress = carry
+    def sample(carry: LoopState, k: Int[Array, ""]) -> Any:
+        before, finite = carry.plant
+        progress = Progress(carry.memory, carry.age, finite, carry.links)
         time = progress.age.astype(before.qpos.dtype) * loop.control_period
 
         def substep(carry: PyTree, j: Int[Array, ""]) -> Any:
@@ -112,23 +114,26 @@ def rollout(loop: Loop, features: Features, key: Seed) -> Trace:
                 0, substeps, lambda j, carry: substep(carry, j)[0], begun
             )
         held = jax.tree.map(lambda new, old: jnp.where(sampled.frozen, old, new), after, before)
-        return (held, progress), sampled.signals
+        return _state_of(held, progress), sampled.signals
 
-    # Reverse mode keeps the state at each sample, and does a control period again for what is
-    # between: memory does not grow with the substeps.
-    (physics, progress), signals = jax.lax.scan(
-        jax.checkpoint(sample, prevent_cse=False), (physics, progress), jnp.arange(loop.periods + 1)
-    )
-    ends = loop.terminate is not None
-    status = jnp.where(progress.finite, jnp.int32(Status.OK), jnp.int32(Status.NONFINITE))
-    return Trace(
-        signals,
-        dt=loop.control_period,
-        valid=progress.age + 1 if ends else None,
-        status=jnp.where(loop.channels(features).valid(), status, jnp.int32(Status.ERROR)),
-        held=ends,
-        finite=loop.finite_signals(),
-    )
+    def scan(step: Callable[..., Any], carry: PyTree, length: int) -> Any:
+        # Reverse mode keeps the state at each sample, and does a control period again for what is
+        # between: memory does not grow with the substeps.
+        return jax.lax.scan(jax.checkpoint(step, prevent_cse=False), carry, jnp.arange(length))
+
+    def status(last: LoopState) -> Any:
+        status = jnp.where(last.plant[1], jnp.int32(Status.OK), jnp.int32(Status.NONFINITE))
+        return jnp.where(loop.channels(features).valid(), status, jnp.int32(Status.ERROR))
+
+    return Rollout(
+        _state_of(physics, progress), sample, loop.periods + 1, loop.control_period, status,
+        loop.terminate is not None, loop.finite_signals(), scan,
+    )  # fmt: skip
+
+
+def _state_of(physics: Physics, progress: Progress) -> LoopState:
+    plant = (physics, progress.finite)
+    return LoopState(plant, progress.memory, progress.states, progress.age)
 
 
 def _is_one(count: int | Int[Array, ""]) -> bool:

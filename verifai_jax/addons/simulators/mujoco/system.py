@@ -37,6 +37,7 @@ from verifai_jax.systems.base import Features, Seed, System
 from verifai_jax.systems.channels import Link, Passing, first_refusal
 from verifai_jax.systems.clock import count_periods
 from verifai_jax.systems.delays import DelayOption, as_delay, joined, links_of
+from verifai_jax.systems.forks import Rollout
 from verifai_jax.systems.ode.integrators import check_factor
 
 FILM = "verifai_jax.addons.simulators.pictures.mujoco_film"
@@ -218,15 +219,24 @@ class MuJoCo(System):
 
     def __call__(self, features: Features, key: Seed = None) -> Trace:
         """Simulate once: traced by JAX unless the backend is native."""
-        features = set_durations(features, self.duration)
         if not self.black_box:
-            self.loop.check(features)
-            return rollout(self.loop, features, key)
+            return self.rollout(features, key).trace()
+        features = set_durations(features, self.duration)
         key = jax.random.key(0) if key is None else key
         batch = self.simulate_batch(
             jax.tree.map(lambda leaf: np.asarray(leaf)[None], features), jnp.asarray(key)[None]
         )
         return jax.tree.map(lambda leaf: leaf[0], batch)
+
+    @property
+    def can_fork(self) -> bool:
+        """True for MJX: a native simulation keeps more than its forks would."""
+        return not self.black_box
+
+    def rollout(self, features: Features, key: Seed = None) -> Rollout:
+        features = set_durations(features, self.duration)
+        self.loop.check(features)
+        return rollout(self.loop, features, key)
 
     def simulate_batch(self, features: Features, keys: Key[Array, " n"]) -> Trace:
         """Simulate a batch natively; all leaves have a leading axis `[n]`."""

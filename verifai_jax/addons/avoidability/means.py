@@ -1,0 +1,198 @@
+"""Who could have avoided a failure, and by what: actions, other features, or another policy."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, Float, Int, Key, PyTree
+
+from verifai_jax.core.messages.errors import check_names
+from verifai_jax.core.values.trace import Trace
+from verifai_jax.features import FeatureSpace
+from verifai_jax.problem.problem import Problem
+from verifai_jax.systems.actions import Action, Discrete
+from verifai_jax.systems.base import System
+from verifai_jax.systems.channels import Instant, Link, Side
+from verifai_jax.systems.forks import Fork
+
+PLAN = "plan of actions"
+"""The name of the feature that holds the actions in place of the policy's."""
+
+
+class Choice(NamedTuple):
+    """Numbers `[steps, entries]` from 0 to 1, in force from one decision to another."""
+
+    start: Int[Array, "*n"]
+    numbers: Float[Array, "*n steps entries"]
+    stop: Int[Array, "*n"]
+
+
+@dataclass(frozen=True)
+class Steering(Link):
+    """A link that replaces the actions of the policy; its memory is the last action."""
+
+    side: Side = "action"
+    decides: bool = True
+    features: tuple[str, ...] = (PLAN,)
+
+    def begin(self, value: PyTree, now: Instant, key: Key[Array, ""] | int | None) -> PyTree:
+        return jnp.zeros_like(ravel_pytree(value)[0])
+
+    def through(self, state: PyTree, value: PyTree, now: Instant) -> tuple[PyTree, PyTree]:
+        start, actions, stop = now.features[PLAN]
+        own, unravel = ravel_pytree(value)
+        planned = actions[jnp.clip(now.step, 0, len(actions) - 1)].astype(own.dtype)
+        action = jnp.where((now.step >= start) & (now.step < stop), planned, own)
+        return unravel(action), now.kept(state, action)
+
+
+class Means:
+    """What could have avoided a failure.
+
+    - `who`: the subject of a sentence; `system`: the system in which forks go on.
+    - `shape`: `(steps, entries)` of a choice; `levels`: number of values of each entry, 0 for real
+      numbers; `period`: samples between two decisions.
+    - `ends`: whether a choice may stop before the end, so that the policy goes on.
+    - `constraint`: a function that says which points `[n, entries]` are admissible; None for all.
+    """
+
+    who: str
+    system: System
+    shape: tuple[int, int] = (1, 0)
+    levels: tuple[int, ...] = ()
+    period: int = 1
+    ends: bool = False
+    constraint: Callable[..., Any] | None = None
+
+    def course(self, features: Mapping[str, Any], key: Any) -> Fork:
+        """Return all forks of the undisturbed simulation; traced by JAX."""
+        return self.system.forks(features, key)
+
+    def fork(self, fork: Fork, choice: Choice) -> Fork:
+        """Return a fork that goes on with a choice; traced by JAX."""
+        raise NotImplementedError
+
+    def replayed(self, forks: Fork, choice: Choice) -> Trace:
+        """Return the trace of one choice; traced by JAX."""
+        return self.system.go_on(self.fork(forks.at(choice.start * self.period), choice))
+
+
+class Controls(Means):
+    """Any actions between the lowest and the highest, by default those that the system names.
+
+    **Raises:** `ValueError` for a system without a policy, and for missing or wrong bounds.
+    """
+
+    who, ends = "the controller", True
+
+    def __init__(
+        self, problem: Problem, length: int, dt: float, actions: Action | tuple[Any, Any] | None
+    ) -> None:
+        passing = problem.system.passing(problem.space.feature_form)
+        forms = jax.tree.leaves(passing.action)
+        size = sum(form.size for form in forms)
+        whole = [not jnp.issubdtype(form.dtype, jnp.floating) for form in forms]
+        given = passing.bounds if actions is None else actions
+        if isinstance(given, Action):
+            given = (0, given.n - 1) if isinstance(given, Discrete) else (given.low, given.high)
+        if given is None:
+            raise ValueError(
+                f"the actions in problem {problem.name!r} have no bounds, so nothing would be "
+                "unavoidable: give actions=(lowest, highest)"
+            )
+        try:
+            ends = (np.concatenate(list(map(np.ravel, jax.tree.leaves(end)))) for end in given)
+            self.low, self.high = (np.broadcast_to(end.astype(float), size) for end in ends)
+            fits = np.isfinite([self.low, self.high]).all() and np.all(self.low < self.high)
+        except (TypeError, ValueError):
+            fits = False
+        if not fits or any(whole) != all(whole):
+            raise ValueError(
+                f"actions must be a pair (lowest, highest) of finite numbers for {size} entries, "
+                f"all real or all whole; got {given!r}"
+            )
+        counts = (self.high - self.low + 1).astype(int).tolist()
+        self.levels = tuple(counts) if all(whole) else (0,) * size
+        self.period = round(passing.period / dt)
+        self.shape = -(-(length - 1) // self.period), size
+        self.system = problem.system.with_links((Steering(),))
+
+    def actions(self, numbers: Any, xp: Any = jnp) -> Any:
+        """Return the actions of a choice."""
+        width = self.high - self.low
+        if self.levels[0]:
+            return self.low + xp.floor(xp.minimum(numbers * (width + 1), width))
+        return xp.clip(self.low + numbers * width, self.low, self.high)
+
+    def steered(self, features: PyTree, choice: Choice) -> dict[str, Any]:
+        """Return features with the actions of a choice."""
+        return {**features, PLAN: (choice.start, self.actions(choice.numbers), choice.stop)}
+
+    def fork(self, fork: Fork, choice: Choice) -> Fork:
+        return fork._replace(features=self.steered(fork.features, choice))
+
+    def course(self, features: Mapping[str, Any], key: Any) -> Fork:
+        never = jnp.int32(self.shape[0] + 1)
+        steered = self.steered(features, Choice(never, jnp.zeros(self.shape), never))
+        return self.system.forks(steered, key)._replace(features=features)
+
+    def replayed(self, forks: Fork, choice: Choice) -> Trace:
+        # From the start, without a fork.
+        return self.system(self.steered(forks.features, choice), forks.key)
+
+    def own(self, forks: Fork) -> Float[np.ndarray, "decisions entries"]:
+        """Return the actions of the policy in the undisturbed simulation."""
+        return np.asarray(forks.state.links[0])[1 :: self.period]
+
+
+class Surroundings(Means):
+    """Other values of some features, by default of all that vary, from an instant on."""
+
+    who = "the environment"
+
+    def __init__(self, problem: Problem, names: tuple[str, ...]) -> None:
+        domains, space = problem.space.domains, problem.space
+        check_names("feature", names, domains)
+        chosen = names or [name for name, domain in domains.items() if domain.size]
+        self.space = FeatureSpace({name: domains[name] for name in chosen})
+        self.system, self.levels, self.shape = (
+            problem.system,
+            self.space.levels,
+            (1, self.space.dim),
+        )
+        # The constraint speaks of all features.
+        self.constraint = space.constraint if self.space.dim == space.dim else None
+
+    def fork(self, fork: Fork, choice: Choice) -> Fork:
+        changed = self.space.unflatten(choice.numbers[0].astype(jnp.float32))
+        return fork._replace(features={**fork.features, **changed})
+
+
+class OtherPolicy(Means):
+    """Another policy: a system that differs in its policy alone."""
+
+    who = "the other policy"
+
+    def __init__(self, problem: Problem, other: System) -> None:
+        self.system, self.first = other, problem.system
+        form, key = problem.space.feature_form, jax.random.key(0)
+        one, two = (
+            str(jax.eval_shape(lambda f, s=system: s.rollout(f, key).start.plant, form))
+            for system in (self.first, other)
+        )
+        if one != two:
+            raise ValueError(
+                "by must be a system that differs from the problem's in its policy alone; its "
+                f"state has the form {two}, and the problem's {one}"
+            )
+
+    def course(self, features: Mapping[str, Any], key: Any) -> Fork:
+        return self.first.forks(features, key)
+
+    def fork(self, fork: Fork, choice: Choice) -> Fork:
+        start = self.system.rollout(fork.features, fork.key).start
+        return fork._replace(state=start._replace(plant=fork.state.plant, age=fork.state.age))
