@@ -35,7 +35,7 @@ from verifai_jax.falsification.simulations import MEASURED, Simulations
 from verifai_jax.falsification.table import ErrorTable
 from verifai_jax.problem.problem import Problem
 from verifai_jax.search import Search
-from verifai_jax.search.search_program import compiled_search
+from verifai_jax.search.search_program import compiled_search, compiled_start
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -110,6 +110,7 @@ class Rounds:
             # They take longest to load: first, where nothing of them is to be traced.
             self._simulations.begin_if_recalled()
         compiled_search(stage, cube, self.batch, self.learning.coverage_id_count)
+        compiled_start(stage, cube, self.batch)
         self.evaluate.begin_compiling()
         if differentiates:
             self._simulations.begin_derivatives()
