@@ -15,7 +15,6 @@ XLA spends most of its time on optimisation. A program that runs only a few doze
 sooner with less of it (`XlaOptimization`), as compilation then takes a half to a fifth of the time.
 """
 
-import gc
 import threading
 import time
 from collections.abc import Callable, Hashable, Iterator, Mapping
@@ -30,6 +29,7 @@ import numpy as np
 
 from verifai_jax.core.compute.cores import available_cores
 from verifai_jax.core.compute.devices import enable_compile_cache
+from verifai_jax.core.display.lazy import uncollected
 
 K = TypeVar("K", bound=Hashable)
 V = TypeVar("V")
@@ -238,21 +238,11 @@ def while_compiling(work: Callable[[], object], after: float = LONG) -> None:
 def tracing(name: str = "") -> Iterator[None]:
     """Return a context, or a decorator, for tracing, in which garbage collection is suspended.
 
-    Tracing makes millions of small objects that live until everything is compiled. The collector
-    would scan all of them repeatedly, which takes a fifth of the time.
-
     **Arguments:**
     - `name`: the name of the program for `describe_compilation` during tracing; none by default.
     """
-    with _said(name) if name else nullcontext():
-        if not gc.isenabled():
-            yield
-            return
-        gc.disable()
-        try:
-            yield
-        finally:
-            gc.enable()
+    with _said(name) if name else nullcontext(), uncollected():
+        yield
 
 
 @contextmanager
