@@ -5,6 +5,7 @@ import functools
 import re
 from typing import Any, Protocol, runtime_checkable
 
+from verifai_jax.core.display.lazy import uncollected
 from verifai_jax.mtl.words import ANGLES, NAME, OPERATORS, RESERVED, WORDS
 
 _BEFORE, _BETWEEN = (
@@ -60,6 +61,7 @@ class Tree(Protocol):
 
 
 @functools.cache
+@uncollected()
 def parser() -> Any:
     """Return the LALR parser, made once."""
     import lark
