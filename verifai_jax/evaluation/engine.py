@@ -31,7 +31,7 @@ from verifai_jax.core.compute.compilation import (
 from verifai_jax.core.compute.fingerprint import as_traced, fingerprint
 from verifai_jax.core.compute.keys import as_key
 from verifai_jax.core.compute.precision import in_precision
-from verifai_jax.core.compute.remembered import is_kept, lower_or_recall, remembered_as
+from verifai_jax.core.compute.remembered import lower_or_recall, remembered_as
 from verifai_jax.evaluation.guidance import NOTHING, Guidance
 from verifai_jax.evaluation.layout import Layout
 from verifai_jax.evaluation.row import CubePoints, Inputs
@@ -105,19 +105,6 @@ class Engine:
         """Trace now, and compile in the background."""
         with in_precision(self.precision):
             self._begin("evaluate")
-
-    def begin_if_recalled(self) -> None:
-        """Start compiling derivatives if an earlier process stored them: loading them is quick.
-
-        Simulation and monitor are traced to find out.
-        """
-        with in_precision(self.precision):
-            started = time.perf_counter()
-            with tracing("gradients"):
-                known = self.gradient and is_kept(self._gradient_kept_as)
-            self.compile_seconds += time.perf_counter() - started
-            if known:
-                self._begin("evaluate")
 
     def compile(self) -> None:
         """Compile now, so that `evaluate` only runs; `compile_seconds` counts the time."""
@@ -243,26 +230,20 @@ class Engine:
         """Return the name under which a program of batches is kept on disk, if it can be."""
         if list(self.layout.devices) != jax.local_devices()[: len(self.layout.devices)]:
             return None  # A program from a file runs on the first ones.
-        shape = (
-            self.padded,
-            self.layout.chunks,
-            self.own_keys,
-            len(self.layout.devices),
-        )
-        shape = (*shape, self.precision, type(self.inputs).__qualname__)
+        rows = (self.padded, self.layout.chunks, self.own_keys, len(self.layout.devices))
+        shape = (*rows, self.precision, type(self.inputs).__qualname__)
         return remembered_as(kind, computes, shape, *values)
-
-    @property
-    def _gradient_kept_as(self) -> str | None:
-        return self._kept_as("gradients", self.program.derivatives[0], self.program.derivative)
 
     def _lower_gradient(self) -> jax.stages.Lowered:
         """Lower the program of derivatives, or recall it; see `core.compute.remembered`."""
-        one_row = self.program.derivatives[1]
+        computes, one_row, _ = self.program.derivatives
         program = self.layout.spread(one_row, self.own_keys)
-        return self.program.differentiable(
-            lambda: lower_or_recall(self._gradient_kept_as, partial(program), self._arguments)
-        )
+
+        def lower() -> jax.stages.Lowered:
+            name = self._kept_as("gradients", computes, self.program.derivative)
+            return lower_or_recall(name, partial(program), self._arguments)
+
+        return self.program.differentiable(lower)
 
     @cached_property
     def _arguments(self) -> tuple[Any, ...]:
@@ -270,9 +251,7 @@ class Engine:
         row, key, _, shared, numbers = self.program.forms
         first = jax.ShapeDtypeStruct((), jnp.int32)
         count = (self.padded,)
-        number: Any = (key, first)
-        if self.own_keys:
-            number = jax.ShapeDtypeStruct(count, key.dtype)
+        number: Any = jax.ShapeDtypeStruct(count, key.dtype) if self.own_keys else (key, first)
         return (
             jax.tree.map(lambda form: jax.ShapeDtypeStruct(count + form.shape, form.dtype), row),
             (number, first) if self.alone else number,

@@ -60,8 +60,8 @@ def compiled_search(search: Search, cube: Cube, batch: int, coverage_ids: int) -
 def compiled_start(search: Search, cube: Cube, batch: int) -> Callable[..., PyTree]:
     """Compile `init` of a search on a cube, in the background."""
     key, state = _forms(search, cube, batch)
-    begun = lambda key: search.init(key, cube, batch)  # noqa: E731
-    return _compiled(search, cube, batch, 0, "init", begun, state, key)
+    start = partial(search.init, cube=cube, batch=batch)
+    return _compiled(search, cube, batch, 0, "init", start, state, key)
 
 
 @lru_cache(maxsize=64)

@@ -282,8 +282,10 @@ def _compiled(
     name: str, lowered: jax.stages.Lowered, effort: XlaOptimization, splits: bool, wide: bool
 ) -> jax.stages.Compiled:
     with _said(name):
-        options = _wanted_options(effort, splits, wide)
-        if not options:
+        options = _OPTIONS[effort] | ({} if splits else _WHOLE_LOOPS) | (_WIDE if wide else {})
+        # The user of this switch wants the least of all programs.
+        least = jax.config.read("jax_disable_most_optimizations")
+        if not options or least or jax.default_backend() != "cpu":
             return lowered.compile()
         try:
             return lowered.compile(options)
@@ -293,21 +295,6 @@ def _compiled(
             if known == options:
                 raise
             return lowered.compile(known)
-
-
-def _wanted_options(
-    effort: XlaOptimization, splits: bool = True, wide: bool = False
-) -> dict[str, Any]:
-    # The user of this switch wants the least of all programs.
-    if jax.default_backend() != "cpu" or jax.config.read("jax_disable_most_optimizations"):
-        return {}
-    return _OPTIONS[effort] | ({} if splits else _WHOLE_LOOPS) | (_WIDE if wide else {})
-
-
-@cache
-def options_of(effort: XlaOptimization) -> dict[str, Any] | None:
-    """Return the options of XLA for this effort; None if it knows none."""
-    return known_options(_wanted_options(effort)) or None
 
 
 def known_options(options: Mapping[str, Any]) -> dict[str, Any]:
