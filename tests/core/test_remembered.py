@@ -183,16 +183,3 @@ def test_a_search_is_the_same_recalled(folder, monkeypatch, search):
     monkeypatch.setenv("VERIFAI_JAX_CACHE", "off")
     for other in (second, rows()):
         assert first.equals(other)
-
-
-@pytest.mark.thorough
-def test_gradients_begin_first_where_they_are_recalled(folder):
-    def begun():
-        engine = Engine(falling(), 4, gradient=True, clauses=True)
-        engine.begin_if_recalled()
-        return bool(engine._compiling)
-
-    assert not begun()
-    Engine(falling(), 4, gradient=True, clauses=True).compile()
-    assert begun()
-    assert not Engine(falling(), 4)._compiling

@@ -256,6 +256,20 @@ def steps(of, spec="always x <= 0.5"):
     return vj.Problem("steps", {"x": vj.Box(0.0, 1.0)}, Steps(of), spec)
 
 
+def test_a_row_that_raises_takes_no_other_of_its_call_along():
+    def look(x):
+        if x > 0.95:
+            raise RuntimeError("out of reach")
+        return np.asarray(x)
+
+    def called(features, key):
+        x = features["x"]
+        return jax.pure_callback(look, jax.ShapeDtypeStruct(x.shape, x.dtype), x)
+
+    found = checked(plain(called), [0.9, 0.99, 0.85])
+    assert found.verdict.tolist() == ["confirmed", "raised", "confirmed"]
+
+
 def test_a_simulation_that_breaks_down_at_a_finer_step_is_fragile():
     gone = steps(lambda x, factor: x if factor < 4 else x * jnp.nan)
     found = checked(gone, [0.9])

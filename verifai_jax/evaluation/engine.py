@@ -11,7 +11,7 @@ fit into the cache. So there is one executable for each (problem, batch, mode).
 """
 
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import cached_property, partial
 from typing import Any, Literal, NamedTuple
 
@@ -31,7 +31,7 @@ from verifai_jax.core.compute.compilation import (
 from verifai_jax.core.compute.fingerprint import as_traced, fingerprint
 from verifai_jax.core.compute.keys import as_key
 from verifai_jax.core.compute.precision import in_precision
-from verifai_jax.core.compute.remembered import is_kept, lower_or_recall, remembered_as
+from verifai_jax.core.compute.remembered import lower_or_recall, remembered_as
 from verifai_jax.evaluation.guidance import NOTHING, Guidance
 from verifai_jax.evaluation.layout import Layout
 from verifai_jax.evaluation.row import CubePoints, Inputs
@@ -60,8 +60,8 @@ class Engine:
     - `inputs`: how rows become features and a system; by default they are points of the unit cube.
     - `own_keys`: whether each row has its own random key, instead of one derived from the run's key
       and the row number.
-    - `alone`: whether the engine takes one row at a time, without `jax.vmap`, which compiles
-      faster; only with `own_keys`.
+    - `alone`: whether it simulates the rows of a call one after the other, without `jax.vmap` and
+      padding, which compiles faster; only with `own_keys` and without a gradient.
     - `lanes`: number of rows that a device processes together; by default that of the system.
     - `effort`: XLA's optimisation effort; by default that of the system, and for derivatives, which
       have few rows, at most little.
@@ -94,7 +94,7 @@ class Engine:
             effort = "little" if gradient and effort == "most" else effort
         self.effort: XlaOptimization = effort
         devices = jax.local_devices() if devices is None else devices
-        self.layout = Layout.of(problem, batch, devices, lanes)
+        self.layout = Layout.of(problem, batch, devices[:1] if alone else devices, lanes)
         self.compile_seconds = 0.0
         self.program = RowProgram(problem, self.inputs, precision, gradient, clauses, guidance)
         self._compiling: dict[Mode, Compilation] = {}
@@ -105,19 +105,6 @@ class Engine:
         """Trace now, and compile in the background."""
         with in_precision(self.precision):
             self._begin("evaluate")
-
-    def begin_if_recalled(self) -> None:
-        """Start compiling derivatives if an earlier process stored them: loading them is quick.
-
-        Simulation and monitor are traced to find out.
-        """
-        with in_precision(self.precision):
-            started = time.perf_counter()
-            with tracing("gradients"):
-                known = self.gradient and is_kept(self._gradient_kept_as)
-            self.compile_seconds += time.perf_counter() - started
-            if known:
-                self._begin("evaluate")
 
     def compile(self) -> None:
         """Compile now, so that `evaluate` only runs; `compile_seconds` counts the time."""
@@ -194,13 +181,10 @@ class Engine:
             rows = jax.tree.map(lambda leaf: pad_rows(leaf, self.padded), rows)
             program = self._executable(mode)
             numbers = self._vectors[mode]
+            number = _pad_keys(key, self.padded) if self.own_keys else (key, np.int32(first))
             if self.alone:
-                one = jax.tree.map(lambda leaf: leaf[0], rows)
-                packed = program(one, _one_key(key), temperatures[0], shared, numbers)
-                packed = jax.tree.map(lambda leaf: np.asarray(leaf)[None], packed)
-            else:
-                number = _pad_keys(key, self.padded) if self.own_keys else (key, np.int32(first))
-                packed = program(rows, number, temperatures, shared, numbers)
+                number = (number, np.int32(count))
+            packed = program(rows, number, temperatures, shared, numbers)
             return self.program.unpack(mode, packed, count)
 
     def _executable(self, mode: Mode) -> jax.stages.Compiled:
@@ -236,7 +220,8 @@ class Engine:
         """Lower a program without derivatives, or recall it; see `core.compute.remembered`."""
         traced = self.program.trace(mode)
         if self.alone:
-            return traced.lower()
+            one_row = self.program.functions[mode]
+            return jax.jit(partial(_one_by_one, one_row, traced.out_info)).lower(*self._arguments)
         name = self._kept_as("simulations", fingerprint(traced.jaxpr, derivatives=False))
         program = layout.spread(as_traced(traced), self.own_keys)
         return lower_or_recall(name, program, self._arguments)
@@ -245,40 +230,32 @@ class Engine:
         """Return the name under which a program of batches is kept on disk, if it can be."""
         if list(self.layout.devices) != jax.local_devices()[: len(self.layout.devices)]:
             return None  # A program from a file runs on the first ones.
-        shape = (
-            self.padded,
-            self.layout.chunks,
-            self.own_keys,
-            self.alone,
-            len(self.layout.devices),
-        )
-        shape = (*shape, self.precision, type(self.inputs).__qualname__)
+        rows = (self.padded, self.layout.chunks, self.own_keys, len(self.layout.devices))
+        shape = (*rows, self.precision, type(self.inputs).__qualname__)
         return remembered_as(kind, computes, shape, *values)
-
-    @property
-    def _gradient_kept_as(self) -> str | None:
-        return self._kept_as("gradients", self.program.derivatives[0], self.program.derivative)
 
     def _lower_gradient(self) -> jax.stages.Lowered:
         """Lower the program of derivatives, or recall it; see `core.compute.remembered`."""
-        one_row = self.program.derivatives[1]
-        program = one_row if self.alone else self.layout.spread(one_row, self.own_keys)
-        return self.program.differentiable(
-            lambda: lower_or_recall(self._gradient_kept_as, partial(program), self._arguments)
-        )
+        computes, one_row, _ = self.program.derivatives
+        program = self.layout.spread(one_row, self.own_keys)
+
+        def lower() -> jax.stages.Lowered:
+            name = self._kept_as("gradients", computes, self.program.derivative)
+            return lower_or_recall(name, partial(program), self._arguments)
+
+        return self.program.differentiable(lower)
 
     @cached_property
     def _arguments(self) -> tuple[Any, ...]:
         """Shapes and types of the arguments of the programs of batches."""
         row, key, _, shared, numbers = self.program.forms
         first = jax.ShapeDtypeStruct((), jnp.int32)
-        leading = () if self.alone else (self.padded,)
+        count = (self.padded,)
+        number: Any = jax.ShapeDtypeStruct(count, key.dtype) if self.own_keys else (key, first)
         return (
-            jax.tree.map(
-                lambda form: jax.ShapeDtypeStruct((*leading, *form.shape), form.dtype), row
-            ),
-            jax.ShapeDtypeStruct(leading, key.dtype) if self.own_keys else (key, first),
-            jax.ShapeDtypeStruct(leading, jnp.float32),
+            jax.tree.map(lambda form: jax.ShapeDtypeStruct(count + form.shape, form.dtype), row),
+            (number, first) if self.alone else number,
+            jax.ShapeDtypeStruct(count, jnp.float32),
             shared,
             numbers,
         )
@@ -290,9 +267,27 @@ def _pad_keys(keys: Key[Array, " lanes"], count: int) -> Key[Array, " count"]:
     return as_key(pad_rows(np.asarray(jax.random.key_data(keys)), count))
 
 
-def _one_key(keys: Key[Array, "*lanes"]) -> Key[Array, ""]:
-    """Return a key, or the only one of several; nothing compiles."""
-    return keys if keys.ndim == 0 else as_key(np.asarray(jax.random.key_data(keys))[0])
+def _one_by_one(
+    one_row: Callable[..., PyTree], form: PyTree, rows: PyTree, number: tuple[Array, Array],
+    temperature: Array, shared: PyTree, vector: Array,
+) -> PyTree:  # fmt: skip
+    """Compute the first rows one after the other.
+
+    - `one_row`: the function of one row; `form` is the form of its result.
+    - `number`: the random keys of the rows, and how many rows to compute.
+    """
+    keys, count = number
+
+    def compute(i: Array, found: PyTree) -> PyTree:
+        # Indices are known to be inside, for which these need no other operations.
+        at = partial(jax.lax.dynamic_index_in_dim, index=i, keepdims=False)
+        row, key, tau = jax.tree.map(at, (rows, keys, temperature))
+        result = one_row(row, key, tau, shared, vector)
+        put = partial(jax.lax.dynamic_update_index_in_dim, index=i, axis=0)
+        return jax.tree.map(put, found, result)
+
+    blank = jax.tree.map(lambda leaf: jax.lax.full((len(keys), *leaf.shape), 0, leaf.dtype), form)
+    return jax.lax.fori_loop(jnp.int32(0), count, compute, blank)
 
 
 class EngineMode(NamedTuple):

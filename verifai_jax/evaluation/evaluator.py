@@ -19,7 +19,7 @@ from verifai_jax.core.compute.compilation import power_of_two
 from verifai_jax.core.compute.keys import run_keys
 from verifai_jax.core.display.extensions import extension, extensions
 from verifai_jax.core.display.progress import count_done
-from verifai_jax.evaluation.engine import FIRST, Engine, Wanted, engine_for
+from verifai_jax.evaluation.engine import FIRST, Wanted, engine_for
 from verifai_jax.evaluation.guidance import NOTHING, Guidance
 from verifai_jax.evaluation.kept_work import present_part
 from verifai_jax.evaluation.raising import ALIKE, Raising
@@ -159,11 +159,6 @@ class Evaluator:
     def begin_compiling(self) -> None:
         """Trace now, and compile in the background."""
         self.engine.begin_compiling()
-
-    def begin_if_recalled(self) -> None:
-        """Start compiling derivatives if they need not be traced; see `Engine`."""
-        if isinstance(self.engine, Engine):
-            self.engine.begin_if_recalled()
 
     def compile(self) -> None:
         """Compile now, so that calls only run."""

@@ -38,7 +38,7 @@ from verifai_jax.systems.base import System
 if TYPE_CHECKING:
     from verifai_jax.core.compute.executors import Executor
 ONE_BY_ONE = 16
-"""Rows up to which they are replayed one by one: that program is compiled much sooner."""
+"""Rows up to which they are replayed one after the other: that program is compiled much sooner."""
 SEEDS = 32
 """Seeds of a host system's rows that are made in one call, so that one program makes all."""
 LANES = (64, 256)
@@ -97,13 +97,13 @@ class Replays:
         # Forms alone are traced: no value has to be made up that a user's domain would accept.
         self._form = problem.space.feature_form_in(precision)
         try:
-            self.draws = self._engine(1, 1).program.draws()
+            self.draws = self._engine(1, ONE_BY_ONE).program.draws()
         except Exception:
             if not self.refiner.traced:
                 raise
             # It takes integers only, whatever it says of itself.
             self.refiner.traced = False
-            self.draws = self._engine(1, 1).program.draws()
+            self.draws = self._engine(1, ONE_BY_ONE).program.draws()
 
     def __call__(
         self, factor: int, each: Sequence[PyTree], numbers: Int[np.ndarray, " n"]
@@ -124,18 +124,23 @@ class Replays:
         numbers = np.tile(numbers, len(each))
         engine, parts = self._engine(factor, together), []
         compiled = engine.compile_seconds
-        for start in range(0, len(numbers), together):
-            block = slice(start, start + together)
+        blocks = [slice(i, i + together) for i in range(0, len(numbers), together)]
+        while blocks:
+            block = blocks.pop(0)
             rows = jax.tree.map(lambda leaf, block=block: leaf[block], features)
+            size = len(numbers[block])
             try:
                 keys = self._keys(numbers[block], together)
                 parts.append(engine.evaluate(rows, keys, shared=np.int32(factor)))
             except Exception as error:
-                size = len(numbers[block])
+                if engine.alone and size > 1:
+                    # Which of them raised is seen one by one.
+                    blocks[:0] = [slice(block.start + i, block.start + i + 1) for i in range(size)]
+                    continue
                 rho = np.full((size, len(self.problem.formulas)), np.nan)
                 status, no = np.full(size, Status.ERROR, np.int32), np.zeros(size, bool)
                 parts.append(Verdicts(rho, status, no, messages=[format_error(error)] * size))
-            count_done(len(numbers[block]))
+            count_done(size)
         self.compile_seconds += engine.compile_seconds - compiled
         verdicts = Verdicts.concatenate([part._replace(features=None) for part in parts])
         return verdicts.split(len(each))
@@ -153,7 +158,7 @@ class Replays:
     def _together(count: int, times: int) -> int:
         """Return the number of replays in one call, for numbers of rows and repetitions."""
         if count <= ONE_BY_ONE:
-            return 1
+            return ONE_BY_ONE
         some, many = (lanes * len(jax.local_devices()) for lanes in LANES)
         return many if count * times > CALLS * some else some
 
@@ -178,9 +183,9 @@ class Replays:
                 precision=self.precision,
                 inputs=TableRows(self._form, refine),
                 own_keys=True,
-                alone=together == 1,
+                alone=together == ONE_BY_ONE,
                 # It compiles in a third of the time and runs half again as long.
-                effort="least" if together == 1 else "little",
+                effort="least" if together == ONE_BY_ONE else "little",
             )
             # Traced once, however many rows are together.
             engine.program = self.problem.programs.get(ROWS, mode[:2], lambda: engine.program)

@@ -47,7 +47,8 @@ class RowProgram:
     - `guidance`: additional results for a search.
 
     After tracing, `notes` lists decisions that may surprise a user; `derivative` is the chosen mode
-    of differentiation.
+    of differentiation, and `functions` are those that `trace` has traced: a larger program may call
+    them, and they are not traced again.
     """
 
     def __init__(
@@ -62,6 +63,7 @@ class RowProgram:
         self._function = RowFunction(problem, inputs, precision, gradient, self.goals, guidance)
         self._packing: dict[Mode, Packing] = {}
         self._traced: dict[Mode, jax.stages.Traced] = {}
+        self.functions: dict[Mode, Callable[..., Any]] = {}
         self._numbers: dict[Mode, LiftedNumbers] = {}
 
     def row(
@@ -102,7 +104,8 @@ class RowProgram:
             return self._packed(packing, result)
 
         # A new function object each time: JAX remembers what it traced by the function.
-        traced = self._traced[mode] = jax.jit(packed_row).trace(*self.forms)
+        self.functions[mode] = function = jax.jit(packed_row)
+        traced = self._traced[mode] = function.trace(*self.forms)
         return traced
 
     @cached_property

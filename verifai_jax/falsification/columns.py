@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, TypeAlias
 import numpy as np
 from jaxtyping import Bool, Int, Shaped
 
+from verifai_jax.core.display.lazy import uncollected
 from verifai_jax.core.messages.text import one_line
 from verifai_jax.core.store.files import checksum
 from verifai_jax.core.values.trace import Status
@@ -23,6 +24,7 @@ ROW = "row"
 """Name of the column that numbers the rows."""
 
 
+@uncollected()
 def import_tables() -> None:
     """Import the libraries that tables use, which takes a fifth of a second."""
     import pandas as pd  # noqa: F401

@@ -35,7 +35,7 @@ from verifai_jax.falsification.simulations import MEASURED, Simulations
 from verifai_jax.falsification.table import ErrorTable
 from verifai_jax.problem.problem import Problem
 from verifai_jax.search import Search
-from verifai_jax.search.search_program import compiled_search
+from verifai_jax.search.search_program import compiled_search, compiled_start
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -105,14 +105,12 @@ class Rounds:
         cube = self.problem.space.cube
         while_compiling(import_tables, after=0.0)
         stage = self.search.stage(None, cube, self.batch)
-        differentiates = stage.wants.clause_gradients and not resumed
-        if differentiates:
-            # They take longest to load: first, where nothing of them is to be traced.
-            self._simulations.begin_if_recalled()
         compiled_search(stage, cube, self.batch, self.learning.coverage_id_count)
-        self.evaluate.begin_compiling()
-        if differentiates:
+        compiled_start(stage, cube, self.batch)
+        if stage.wants.clause_gradients and not resumed:
+            # They take longest to compile.
             self._simulations.begin_derivatives()
+        self.evaluate.begin_compiling()
         if self._confirmer is not None:
             # Meanwhile; whatever fails will be replayed.
             self._confirmer.prepare()

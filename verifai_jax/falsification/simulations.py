@@ -100,11 +100,6 @@ class Simulations:
         """Number of rows that are already simulated and wait for their round."""
         return 0 if self._measured is None else len(self._measured.status)
 
-    def begin_if_recalled(self) -> None:
-        """Start compiling derivatives if they need not be traced; see `Engine`."""
-        if self._differentiate is not None:
-            self._differentiate.begin_if_recalled()
-
     def begin_derivatives(self) -> None:
         """Trace derivatives now, and compile them in the background."""
         if self._differentiate is not None:

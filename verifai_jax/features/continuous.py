@@ -10,8 +10,8 @@ from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
+import jax.scipy as jsp
 import numpy as np
-from jax.scipy.special import ndtri
 from jax.typing import DTypeLike
 from jaxtyping import Array, Bool, Float, PyTree
 
@@ -275,7 +275,7 @@ def hazard(u: Float[Array, ""]) -> Float[Array, ""]:
 def normal_score(u: Float[Array, ""]) -> Float[Array, ""]:
     """Map a coordinate to the value of a standard normal distribution, from -5.54 to 5.54."""
     left = u < 0.5
-    z = ndtri(at_least(jnp.where(left, u, 1 - u), OUTERMOST))
+    z = jsp.special.ndtri(at_least(jnp.where(left, u, 1 - u), OUTERMOST))
     return jnp.where(left, z, -z)
 
 

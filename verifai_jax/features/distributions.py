@@ -11,8 +11,8 @@ import math
 from dataclasses import dataclass
 
 import jax.numpy as jnp
+import jax.scipy as jsp
 import numpy as np
-from jax.scipy.special import ndtr, ndtri
 from jaxtyping import Array, Float
 
 from verifai_jax.features import continuous
@@ -62,7 +62,7 @@ class Normal(continuous.Continuous):
         return self.mean + self.std * continuous.normal_score(u)
 
     def probability(self, value: Float[Array, ""]) -> Float[Array, ""]:
-        return ndtr((value - self.mean) / self.std)
+        return jsp.special.ndtr((value - self.mean) / self.std)
 
     def log_density(self, value: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
         z = (np.asarray(value, np.float64) - self.mean) / self.std
@@ -144,7 +144,7 @@ class TruncatedNormal(continuous.Bounded):
         p = below + self._inside * continuous.at_least(left, continuous.OUTERMOST)
         q = above + self._inside * continuous.at_least(right, continuous.OUTERMOST)
         lower = p < 0.5
-        z = ndtri(jnp.where(lower, p, q))
+        z = jsp.special.ndtri(jnp.where(lower, p, q))
         x = self.mean + self.std * jnp.where(lower ^ self._mirrored, z, -z)
         low, high = np.asarray([self.low, self.high], u.dtype)
         x = replace_where(x, (u <= 0) | (x < low), low)
@@ -155,7 +155,7 @@ class TruncatedNormal(continuous.Bounded):
         z = (jnp.clip(value, low, high) - self.mean) / self.std
         z = -z if self._mirrored else z
         below_low, above_low, below_high, above_high = (t / self._inside for t in self._tails)
-        tail = ndtr(-jnp.abs(z)) / self._inside
+        tail = jsp.special.ndtr(-jnp.abs(z)) / self._inside
         left = jnp.where(z < 0, tail - below_low, above_low - tail)
         right = jnp.where(z < 0, below_high - tail, tail - above_high)
         left, right = (right, left) if self._mirrored else (left, right)

@@ -10,8 +10,8 @@ import math
 from dataclasses import dataclass
 
 import jax.numpy as jnp
+import jax.scipy as jsp
 import numpy as np
-from jax.scipy.special import ndtr
 from jaxtyping import Array, Float
 
 from verifai_jax.features.continuous import (
@@ -85,7 +85,7 @@ class LogNormal(Positive):
         return jnp.exp(self.mean + self.std * normal_score(u))
 
     def probability(self, value: Float[Array, ""]) -> Float[Array, ""]:
-        return ndtr((jnp.log(jnp.maximum(value, MIN_REAL)) - self.mean) / self.std)
+        return jsp.special.ndtr((jnp.log(jnp.maximum(value, MIN_REAL)) - self.mean) / self.std)
 
     def log_density(self, value: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
         value, x = _positive(value)

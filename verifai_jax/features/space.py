@@ -82,10 +82,8 @@ class FeatureSpace(PointMaps, ForUsers):
 
         **Raises:** `KeyError` for a missing column; `ValueError` for an entry of the wrong type.
         """
-        records = rows.loc[:, list(self.columns)].to_dict("records")
-        features = [self.from_row(row) for row in records]
-        stacked = jax.tree.map(lambda *leaves: np.stack(leaves), *features)
-        return np.asarray(self.points_at(stacked))
+        columns = {str(name): rows[name].to_numpy() for name in rows}
+        return np.asarray(self.points_at(self.features_of(columns, jnp.result_type(float).name)))
 
     def features_of(
         self, rows: Mapping[str, Numbers], precision: str = "float32"

@@ -14,8 +14,8 @@ from functools import cached_property
 from typing import NamedTuple
 
 import jax.numpy as jnp
+import jax.scipy as jsp
 import numpy as np
-from jax.scipy.special import ndtr
 from jaxtyping import Array, Float
 
 from verifai_jax.features import continuous
@@ -132,7 +132,7 @@ class Gamma(Positive):
 
     def probability(self, value: Float[Array, ""]) -> Float[Array, ""]:
         share = jnp.maximum(value, MIN_REAL) / math.exp(self._median)
-        return ndtr(self._table.score(jnp.log(jnp.maximum(share, MIN_REAL))))
+        return jsp.special.ndtr(self._table.score(jnp.log(jnp.maximum(share, MIN_REAL))))
 
     def log_density(self, value: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
         value = np.asarray(value, np.float64)
@@ -218,7 +218,7 @@ class Beta(continuous.Bounded):
         width = self.high - self.low
         below = jnp.maximum((value - self.low) / width, MIN_REAL)
         above = jnp.maximum((self.high - value) / width, MIN_REAL)
-        return ndtr(self._table.score(jnp.log(below) - jnp.log(above)))
+        return jsp.special.ndtr(self._table.score(jnp.log(below) - jnp.log(above)))
 
     def log_density(self, value: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
         value, width = np.asarray(value, np.float64), self.high - self.low

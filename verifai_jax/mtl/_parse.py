@@ -18,7 +18,7 @@ from verifai_jax.core.messages.errors import unknown_name
 from verifai_jax.mtl import formula as ast
 from verifai_jax.mtl.expression_builder import MAX_DEPTH, ExpressionBuilder, Part
 from verifai_jax.mtl.formula import Formula, Interval
-from verifai_jax.mtl.grammar import FormulaSyntaxError, Tree, explain_error, parser
+from verifai_jax.mtl.grammar import FormulaSyntaxError, Tree, explain_error, operator_of, parser
 from verifai_jax.mtl.sampled import unit_words
 from verifai_jax.mtl.words import NAME, NUMBERS, OPERATORS, TIMES
 
@@ -214,7 +214,7 @@ class FormulaBuilder(ExpressionBuilder):
             raise self._chained(parts, words)
         left, right = map(self._formula, parts)
         interval = self._interval(intervals[0])
-        value = ast.build(words[0].type.lower(), (left, right), interval)
+        value = ast.build(operator_of(words[0]), (left, right), interval)
         return Part(value, *self._span(tree), rule="bin")
 
     def _refuse_open(self, parts: list[Part], words: list[Any], trees: list[Tree]) -> None:
@@ -262,7 +262,7 @@ class FormulaBuilder(ExpressionBuilder):
         word, interval, operand = tree.children
         part = self._build(operand)
         value = self._formula(part)
-        name = word.type.lower()
+        name = operator_of(word)
         if interval is not None and not OPERATORS[name].timed:
             raise self._fail(f"{str(word)!r} takes no interval", *self._span(interval))
         value = ast.build(name, (value,), self._interval(interval))

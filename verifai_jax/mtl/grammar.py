@@ -5,12 +5,14 @@ import functools
 import re
 from typing import Any, Protocol, runtime_checkable
 
+from verifai_jax.core.display.lazy import uncollected
 from verifai_jax.mtl.words import ANGLES, NAME, OPERATORS, RESERVED, TIMES, WORDS
 
-UNARY = tuple(word for word, o in OPERATORS.items() if o.side and o.operands == 1)
-"""Temporal operators in front of one operand."""
-BINARY = tuple(word for word, o in OPERATORS.items() if o.side and o.operands == 2)
-"""Temporal operators between two operands."""
+_BEFORE, _BETWEEN = (
+    tuple(word for word, o in OPERATORS.items() if o.side and o.operands == n) for n in (1, 2)
+)
+"""Temporal operators in front of one operand, and between two."""
+_OPERATOR = {option: word for word in (*_BEFORE, *_BETWEEN) for option in WORDS[word]}
 _MAX_SHOWN = 400
 """Greatest number of characters of a text that an error shows: a few lines of a terminal."""
 _MAX_REASON = 800
@@ -59,6 +61,7 @@ class Tree(Protocol):
 
 
 @functools.cache
+@uncollected()
 def parser(units: tuple[str, ...] = ()) -> Any:
     """Return the LALR parser, made once.
 
@@ -70,11 +73,11 @@ def parser(units: tuple[str, ...] = ()) -> Any:
     known = sorted({*TIMES, *ANGLES, *units}, key=len, reverse=True)
     after = "|".join(re.escape(unit).replace("/", r"\/") for unit in known)
 
-    def keyword(word: str) -> str:
+    def keyword(*words: str) -> str:
         # An underscore may join an operator to its interval: `alw_[0,10]`.
         joint = r"(?:(?![\w.])|_(?=\s*\[))"
         alternatives = []
-        for option in sorted(WORDS[word], key=len, reverse=True):
+        for option in sorted((o for word in words for o in WORDS[word]), key=len, reverse=True):
             if NAME.fullmatch(option):
                 alternatives.append(option + joint)
             else:
@@ -82,21 +85,21 @@ def parser(units: tuple[str, ...] = ()) -> Any:
                 alternatives.append(escaped + r"(?:_(?=\s*\[))?")
         return f"/{'|'.join(alternatives)}/"
 
-    unary = "\n".join(f"{w.upper()}.3: {keyword(w)}" for w in UNARY)
-    binary = "\n".join(f"{w.upper()}.3: {keyword(w)}" for w in BINARY)
     # XOR, IFF and IMPLIES come before the comparisons that start like them.
     joints = "\n".join(
         f"{w.upper()}.4: {keyword(w)}" for w in ("iff", "xor", "implies", "or", "and")
     )
+    # One terminal for all operators of a kind: the parser's tables grow with their number, and it
+    # is made in each process.
     grammar = rf"""
         ?start: iff
         ?iff: impl ((IFF | XOR) impl)*
         ?impl: or_ (IMPLIES or_)*
         ?or_: and_ (OR and_)*
         ?and_: bin (AND bin)*
-        ?bin: unary (({" | ".join(w.upper() for w in BINARY)}) [interval] unary)*
+        ?bin: unary (BETWEEN [interval] unary)*
         ?unary: NOT unary -> negation
-              | ({" | ".join(w.upper() for w in UNARY)}) [interval] unary -> temporal
+              | BEFORE [interval] unary -> temporal
               | cmp
         ?cmp: sum (COMPARISON sum)*
         ?sum: product ((PLUS | MINUS) product)*
@@ -119,8 +122,8 @@ def parser(units: tuple[str, ...] = ()) -> Any:
         interval: (LSQB | LPAR) bound ("," | ":") bound (RSQB | RPAR)
         bound: [MINUS] NUMBER [UNIT] | NAME
 
-        {unary}
-        {binary}
+        BEFORE.3: {keyword(*_BEFORE)}
+        BETWEEN.3: {keyword(*_BETWEEN)}
         {joints}
         NOT.2: {keyword("not")}
         TRUE.3: {keyword("TRUE")}
@@ -147,13 +150,18 @@ def parser(units: tuple[str, ...] = ()) -> Any:
     )  # fmt: skip
 
 
+def operator_of(word: str) -> str:
+    """Return the name of a temporal operator from its word in a text."""
+    return _OPERATOR[word] if word in _OPERATOR else _OPERATOR[word.removesuffix("_")]
+
+
 _GROUPS = (
     ({"NUMBER", "NAME", "QUOTED"}, "a signal or a number"),
     ({"NOT"}, "'!'"),
-    ({"ALWAYS"}, "a temporal operator (always, eventually, ...)"),
+    ({"BEFORE"}, "a temporal operator (always, eventually, ...)"),
     ({"LPAR"}, "'('"),
     ({"AND", "OR"}, "'&', '|', '->'"),
-    ({"UNTIL"}, "until"),
+    ({"BETWEEN"}, "until"),
     ({"COMPARISON"}, "a comparison (<=, >, ...)"),
     ({"PLUS"}, "arithmetic"),
     ({"UNIT"}, "a unit (s, ms, us, ns, min, h, d)"),

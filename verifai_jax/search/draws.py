@@ -4,8 +4,8 @@ import math
 
 import jax
 import jax.numpy as jnp
+import jax.scipy as jsp
 import numpy as np
-from jax.scipy.special import ndtri
 from jaxtyping import Array, Float, Key
 
 
@@ -28,4 +28,4 @@ def draw_columns(
 
 def standard_normal(uniform: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
     """Map uniform numbers in `[0, 1)` to standard normal ones; finite at 0."""
-    return ndtri(jnp.maximum(uniform, np.float32(2**-25)))
+    return jsp.special.ndtri(jnp.maximum(uniform, np.float32(2**-25)))

@@ -26,7 +26,7 @@ from verifai_jax.core.values.cube import Cube
 from verifai_jax.search.base import Observations, Plan, Search
 from verifai_jax.search.contract import check_points, is_user_defined
 from verifai_jax.search.repetition import Repetition
-from verifai_jax.search.search_program import compiled_search
+from verifai_jax.search.search_program import compiled_search, compiled_start
 
 TRIES = 32
 """Maximum number of asks in one round until every row of a search that learns is accepted. Where
@@ -75,8 +75,7 @@ class Proposals:
             # Compiled now, in the shape that it will be asked in.
             self._accepts(np.zeros((batch, self.cube.dim), np.float32))
         self._warm: Callable[..., PyTree] | None = None
-        assert self._program.init is not None
-        self._state = self._program.init(key)
+        self._state = compiled_start(self.stage, self.cube, batch)(key)
         self._queue = np.zeros((0, self.cube.dim), np.float32)
         self._points: Any = self._queue  # Of the last ask of a search that learns, all rows,
         self._rows = np.zeros(0, int)  # and which of them are simulated.
@@ -225,9 +224,7 @@ class Proposals:
         if stage == self.stage:
             return False
         self.stage = stage
-        self._program = compiled_search(
-            stage, self.cube, self.batch, self._coverage_ids, begins=False
-        )
+        self._program = compiled_search(stage, self.cube, self.batch, self._coverage_ids)
         return True
 
     def wait(self) -> None:

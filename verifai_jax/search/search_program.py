@@ -1,7 +1,7 @@
 """Compiled functions of a search, in the background, side by side."""
 
 from collections.abc import Callable
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import Any, NamedTuple
 
 import jax
@@ -25,9 +25,8 @@ def optimization_of(search: Search, batch: int) -> XlaOptimization:
 
 
 class SearchProgram(NamedTuple):
-    """Compiled functions of a search; `init` is None if they start from another search's state."""
+    """Compiled functions of a search; `tell` or `plan` is None for one that does not need it."""
 
-    init: Callable[..., PyTree] | None
     ask: Callable[..., tuple[Array, PyTree]]
     tell: Callable[..., PyTree]
     temperature: Callable[..., Any]
@@ -36,43 +35,49 @@ class SearchProgram(NamedTuple):
 
 @lru_cache(maxsize=64)
 @tracing("the search")
-def compiled_search(
-    search: Search, cube: Cube, batch: int, coverage_ids: int, begins: bool = True
-) -> SearchProgram:
-    """Compile `init / ask / tell` of a search on a cube, concurrently in the background.
-
-    - `begins`: whether `init` is needed.
-    """
-    key = jax.eval_shape(lambda: jax.random.key(0, impl="threefry2x32"))
-    begun = jax.jit(lambda key: search.init(key, cube, batch)).trace(key)
-    state: Any = begun.out_info
-    states = jax.tree.structure(state)
-    # What a search of this package does follows from its options; a user's may do anything.
-    kept = None if is_user_defined(search) else identity(search, cube, batch, coverage_ids)
-
-    def compiled(verb: str, function: Callable[..., Any], *arguments: PyTree, form: Any) -> Any:
-        name = remembered_as(f"search-{verb}", kept, verb)
-        lowered = lower_or_recall(name, function, arguments, form)
-        return compile_soon("the search", lowered, optimization_of(search, batch))
-
+def compiled_search(search: Search, cube: Cube, batch: int, coverage_ids: int) -> SearchProgram:
+    """Compile what is done in each round of a search on a cube, concurrently in the background."""
+    wants, (_, state) = search.wants, _forms(search, cube, batch)
+    named = partial(_compiled, search, cube, batch, coverage_ids)
     # What takes longest to compile begins first.
-    asked = jax.tree.structure((0, jax.tree.unflatten(states, [0] * states.num_leaves)))
-    ask = compiled("ask", lambda state: search.ask(state, cube, batch), state, form=asked)
-    init: Any = None
-    if begins:
-        init = compile_soon("the search", begun.lower(), optimization_of(search, batch))
+    ask = named("ask", lambda state: search.ask(state, cube, batch), (0, state), state)
     plan: Any = None
-    if search.wants.clauses:
-        form = jax.tree.structure(Plan(0, 0, 0))  # pyright: ignore[reportArgumentType]
-        plan = compiled("plan", lambda state: search.plan(state, cube, batch), state, form=form)
+    if wants.clauses:
+        like = Plan(0, 0, 0)  # pyright: ignore[reportArgumentType]
+        plan = named("plan", lambda state: search.plan(state, cube, batch), like, state)
     tell: Any = None
     if search.learns:
-        tell = compiled(
-            "tell", lambda state, rows: search.tell(state, cube, rows), state,
-            search.wants.form(cube, batch, coverage_ids), form=states,
-        )  # fmt: skip
+        rows = wants.form(cube, batch, coverage_ids)
+        tell = named("tell", lambda state, rows: search.tell(state, cube, rows), state, state, rows)
     temperature: Any = lambda state: 1.0  # noqa: E731
-    if search.wants.gradient:
-        form = jax.tree.structure(0)
-        temperature = compiled("temperature", search.temperature, state, form=form)
-    return SearchProgram(init, ask, tell, temperature, plan)
+    if wants.gradient:
+        temperature = named("temperature", search.temperature, 0, state)
+    return SearchProgram(ask, tell, temperature, plan)
+
+
+@lru_cache(maxsize=64)
+@tracing("the search")
+def compiled_start(search: Search, cube: Cube, batch: int) -> Callable[..., PyTree]:
+    """Compile `init` of a search on a cube, in the background."""
+    key, state = _forms(search, cube, batch)
+    start = partial(search.init, cube=cube, batch=batch)
+    return _compiled(search, cube, batch, 0, "init", start, state, key)
+
+
+@lru_cache(maxsize=64)
+def _forms(search: Search, cube: Cube, batch: int) -> tuple[Any, PyTree]:
+    """Return the forms of a key, and of a state of the search."""
+    key = jax.eval_shape(lambda: jax.random.key(0, impl="threefry2x32"))
+    return key, jax.eval_shape(lambda key: search.init(key, cube, batch), key)
+
+
+def _compiled(
+    search: Search, cube: Cube, batch: int, coverage_ids: int, verb: str,
+    function: Callable[..., Any], like: PyTree, *arguments: PyTree,
+) -> Any:  # fmt: skip
+    """Compile one function in the background; `like` is a pytree of the form of its result."""
+    # What a search of this package does follows from its options; a user's may do anything.
+    kept = None if is_user_defined(search) else identity(search, cube, batch, coverage_ids)
+    name = remembered_as(f"search-{verb}", kept, verb)
+    lowered = lower_or_recall(name, function, arguments, jax.tree.structure(like))
+    return compile_soon("the search", lowered, optimization_of(search, batch))

@@ -15,7 +15,6 @@ XLA spends most of its time on optimisation. A program that runs only a few doze
 sooner with less of it (`XlaOptimization`), as compilation then takes a half to a fifth of the time.
 """
 
-import gc
 import threading
 import time
 from collections.abc import Callable, Hashable, Iterator, Mapping
@@ -30,6 +29,7 @@ import numpy as np
 
 from verifai_jax.core.compute.cores import available_cores
 from verifai_jax.core.compute.devices import enable_compile_cache
+from verifai_jax.core.display.lazy import uncollected
 
 K = TypeVar("K", bound=Hashable)
 V = TypeVar("V")
@@ -238,21 +238,11 @@ def while_compiling(work: Callable[[], object], after: float = LONG) -> None:
 def tracing(name: str = "") -> Iterator[None]:
     """Return a context, or a decorator, for tracing, in which garbage collection is suspended.
 
-    Tracing makes millions of small objects that live until everything is compiled. The collector
-    would scan all of them repeatedly, which takes a fifth of the time.
-
     **Arguments:**
     - `name`: the name of the program for `describe_compilation` during tracing; none by default.
     """
-    with _said(name) if name else nullcontext():
-        if not gc.isenabled():
-            yield
-            return
-        gc.disable()
-        try:
-            yield
-        finally:
-            gc.enable()
+    with _said(name) if name else nullcontext(), uncollected():
+        yield
 
 
 @contextmanager
@@ -292,8 +282,10 @@ def _compiled(
     name: str, lowered: jax.stages.Lowered, effort: XlaOptimization, splits: bool, wide: bool
 ) -> jax.stages.Compiled:
     with _said(name):
-        options = _wanted_options(effort, splits, wide)
-        if not options:
+        options = _OPTIONS[effort] | ({} if splits else _WHOLE_LOOPS) | (_WIDE if wide else {})
+        # The user of this switch wants the least of all programs.
+        least = jax.config.read("jax_disable_most_optimizations")
+        if not options or least or jax.default_backend() != "cpu":
             return lowered.compile()
         try:
             return lowered.compile(options)
@@ -303,21 +295,6 @@ def _compiled(
             if known == options:
                 raise
             return lowered.compile(known)
-
-
-def _wanted_options(
-    effort: XlaOptimization, splits: bool = True, wide: bool = False
-) -> dict[str, Any]:
-    # The user of this switch wants the least of all programs.
-    if jax.default_backend() != "cpu" or jax.config.read("jax_disable_most_optimizations"):
-        return {}
-    return _OPTIONS[effort] | ({} if splits else _WHOLE_LOOPS) | (_WIDE if wide else {})
-
-
-@cache
-def options_of(effort: XlaOptimization) -> dict[str, Any] | None:
-    """Return the options of XLA for this effort; None if it knows none."""
-    return known_options(_wanted_options(effort)) or None
 
 
 def known_options(options: Mapping[str, Any]) -> dict[str, Any]:

@@ -56,11 +56,6 @@ def remembered_as(kind: str, *values: object) -> str | None:
     return None if name is None else f"{kind}-{name}"
 
 
-def is_kept(name: str | None) -> bool:
-    """Return whether there is a file with this name, as returned by `remembered_as`."""
-    return name is not None and (_folder() / name).is_file()
-
-
 def lower_or_recall(
     name: str | None, function: Callable[..., Any], arguments: tuple[Any, ...], form: Any = None
 ) -> jax.stages.Lowered:

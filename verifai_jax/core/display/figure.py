@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from verifai_jax.core.display.extensions import verb
-from verifai_jax.core.display.lazy import lazy_import
+from verifai_jax.core.display.lazy import lazy_import, uncollected
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes as Axes
@@ -86,6 +86,7 @@ def missing_glyphs() -> Iterator[None]:
 
 
 @functools.cache
+@uncollected()
 def _figure_class() -> Any:
     # Made on demand: importing matplotlib takes longer than importing everything else here.
     from matplotlib.figure import Figure

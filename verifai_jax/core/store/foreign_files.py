@@ -13,18 +13,16 @@ import io
 import json
 import os
 import stat
-import tomllib
 import warnings
 from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import Any
-from xml.etree import ElementTree
-from xml.etree.ElementTree import Element
-from xml.parsers import expat
+from typing import TYPE_CHECKING, Any
 
 from verifai_jax.core.messages.errors import require
 from verifai_jax.core.messages.text import one_line
 
+if TYPE_CHECKING:
+    from xml.etree.ElementTree import Element
 MAX_BYTES = 1 << 32
 """Maximum bytes of a file that is read as a whole."""
 MAX_LENGTH = 1 << 40
@@ -136,12 +134,14 @@ def decoded(path: str | Path, data: bytes, cut: bool = False) -> tuple[str, str]
     )
 
 
-def read_xml(data: bytes, name: str) -> Element:
+def read_xml(data: bytes, name: str) -> "Element":
     """Read XML from an untrusted source.
 
     **Raises:** `ValueError` for a text that is not XML, and a document type, which can declare
     entities.
     """
+    from xml.etree import ElementTree
+    from xml.parsers import expat
 
     def refuse(*declared: object) -> None:
         raise ValueError(
@@ -185,6 +185,8 @@ def parse_toml(text: str) -> dict[str, Any]:
 
     **Raises:** `ValueError` for anything else, and for tables that are nested too deeply.
     """
+    import tomllib
+
     try:
         return tomllib.loads(text)
     except RecursionError:
