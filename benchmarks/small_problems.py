@@ -168,7 +168,7 @@ def _unit(count, low=0.0, high=1.0):
 MARGINS = {
     "tanks": 1.2085, "shuttle": 1.198, "latch": 1.513, "swing": 2.15, "cycle": 3.382,
     "cruise": 13.44, "bumps": 3.092, "product": 0.033, "driven": 2.357, "gusts": 0.0112,
-    "valley": 36.74, "far_ball": 0.764, "traps": 2.5627,
+    "valley": 2.0, "far_ball": 0.4, "traps": 2.5627,
 }  # fmt: skip
 """Of the problems of this module, chosen for one failing sample in 500 to 10 000."""
 
@@ -192,7 +192,7 @@ def own(name, margin):
                     "throttle": box(0, 1), "brake": box(0, 8), "wind": box(-3, 3),
                     "slope": box(-0.3, 0.3), "v0": box(0, 5)}, cruise,
                    f"always (x > 15 -> v < {margin})"),
-        "bumps": ({"bumps": vj.Array(vj.Struct({"at": box(0, 1), "height": box(0, 1)}), length=(1, 6))},
+        "bumps": ({"bumps": vj.Array(vj.Struct({"at": box(0, 1), "height": box(0, 1)}), (1, 6))},
                   bumps, f"always x < {margin}"),
         "product": ({"rows": whole(1, 60), "columns": whole(1, 60), "layers": whole(1, 20),
                      "more": box(0, 1)}, product, f"always out > {margin}"),
