@@ -3,11 +3,21 @@
     python benchmarks/search_quality.py landscapes [--seeds 24] [--searches bayes,bandit]
     python benchmarks/search_quality.py cartpole [--seeds 20] [--problem rare]
     python benchmarks/search_quality.py kinds [--seeds 10]
+    VERIFAI_JAX_CACHE=off python benchmarks/search_quality.py constants [--seeds 10]
+    python benchmarks/search_quality.py table [--seeds 10] [--problems ball tanks] [--libraries]
 
 What counts is the number of the simulation that found the first failure. On the landscapes the
 share of failures is known, and with it what uniform sampling needs in the median, log(2) / share;
 a search's entry is how many times fewer it needs. On the controller the failure rate is measured
 first. A simulation with a derivative counts as one; the row `gradient (as 2)` counts it as two.
+
+`table` compares searches on thirty small problems (`small_problems`), one line a problem: the
+median cost of the first failure in rounds of 16, a differentiated simulation as two, and the seeds
+that found one if not all did. With `--libraries` the packages cmaes and Optuna (TPE) stand beside
+them, where they are installed.
+
+`constants` changes each number of the default search in turn: the median cost on some of the small
+problems, and the geometric mean of its ratios to that with the numbers as they are.
 
 `kinds` counts how many of eight wells the default search has failures in after 3000 simulations,
 with each number that decides about that changed in turn.
@@ -29,12 +39,13 @@ from benchmarks.seeds import first_failures
 from verifai_jax.core.user_code.targets import load_target
 from verifai_jax.core.values.cube import Cube
 from verifai_jax.search import kinds, portfolio
+from verifai_jax.search.search_program import compiled_search
 
-BATCH = {"uniform": 512, "halton": 512, "sobol": 512, "gradient": 8, "bayes": 8}
+BATCH = {"uniform": 512, "halton": 512, "gradient": 8, "bayes": 8}
 ACTIVE_BATCH = 16
-PASSIVE = ("uniform", "halton", "sobol")
-# Without scrambling the sequences are the same for all seeds.
-OPTIONS = {"halton": {"scramble": True}, "sobol": {"scramble": True}}
+PASSIVE = ("uniform", "halton")
+# Without scrambling the sequence is the same for all seeds.
+OPTIONS = {"halton": {"scramble": True}}
 # A grid's result depends on how it lies to the failures, and the predecessor's one-sample rule
 # learns from failures alone: neither has a figure that would say something here.
 LEFT_OUT = ("grid",)
@@ -253,18 +264,146 @@ def on_kinds(options):
         setattr(module, name, values[0])
 
 
+def by_cmaes(d, seed):
+    """Return `ask` and `tell` of the package cmaes on a cube of `d` dimensions."""
+    import cmaes
+
+    def begun(mean):
+        bounds = np.tile([0.0, 1.0], (d, 1))
+        return cmaes.CMA(mean=mean, sigma=0.3, bounds=bounds, seed=seed, population_size=16)
+
+    held = [begun(np.full(d, 0.5))]
+
+    def tell(points, values):
+        held[0].tell(list(zip(points, values, strict=True)))
+        if held[0].should_stop():
+            held[0] = begun(np.random.default_rng(int(1e6 * values[0]) % 2**31).uniform(size=d))
+
+    return (lambda: np.array([held[0].ask() for _ in range(ACTIVE_BATCH)])), tell
+
+
+def by_optuna(d, seed):
+    """Return `ask` and `tell` of Optuna's TPE on a cube of `d` dimensions."""
+    import optuna
+
+    optuna.logging.set_verbosity(optuna.logging.ERROR)
+    study = optuna.create_study(sampler=optuna.samplers.TPESampler(seed=seed, multivariate=True))
+    floats = {f"u{i}": optuna.distributions.FloatDistribution(0, 1) for i in range(d)}
+    asked = []
+
+    def ask():
+        asked.append(study.ask(floats))
+        return np.array([[asked[-1].params[name] for name in floats]])
+
+    return ask, lambda points, values: study.tell(asked[-1], float(values[0]))
+
+
+LIBRARIES = {"cmaes (library)": by_cmaes, "TPE (library)": by_optuna}
+
+
+def first_of_library(problem, library, budget, seeds):
+    """Return the number of the first failure of each seed; infinite without one."""
+    rho = jax.jit(jax.vmap(problem.objective()))
+    found = np.full(seeds, np.inf)
+    for seed in range(seeds):
+        (ask, tell), done = LIBRARIES[library](problem.space.dim, seed), 0
+        while done < budget and np.isinf(found[seed]):
+            points = ask()
+            values = np.asarray(rho(np.asarray(points, np.float32)))
+            if (values < 0).any():
+                found[seed] = done + 1 + int((values < 0).argmax())
+            tell(points, values)
+            done += len(points)
+    return found
+
+
+def on_small(options):
+    """One line a problem: every search."""
+    from small_problems import SMALL
+
+    names = options.searches.split(",") if options.searches else list(vj.search.names())
+    libraries = list(LIBRARIES) if options.libraries else []
+    print("| problem | " + " | ".join(names + libraries) + " |")
+    for name in options.problems or SMALL:
+        cells, problem = [name], SMALL[name]
+        for search in names + libraries:
+            try:
+                if search in LIBRARIES:
+                    costs = first_of_library(problem, search, options.budget, options.seeds)
+                else:
+                    costs = first_failures(
+                        problem, search, options.budget, ACTIVE_BATCH, range(options.seeds)
+                    ).cost
+            except ValueError:  # It needs a continuous feature.
+                cells.append("-")
+                continue
+            found = int(np.isfinite(costs).sum())
+            median = np.median(np.where(np.isfinite(costs), costs, np.inf))
+            short = "" if found == options.seeds else f" ({found})"
+            cells.append(f"{median:.0f}{short}")
+        print("| " + " | ".join(cells) + " |", flush=True)
+
+
+VARIED = ("ridge", "ripples", "mixed", "levers", "recipe", "decoy", "tanks", "shuttle", "cruise")
+CONSTANTS = {
+    "PRIOR_GAINS": ((2.0, 2.5), (8.0, 2.5)),
+    "PRIOR_COSTS": (2.0, 8.0),
+    "DISCOUNT": (0.95, 0.99),
+    "MIN_SHARE": (0.02, 0.1),
+    "IN_VAIN": (1, 6),
+    "OPENING": (6, 12),
+    "AMONG": (2, 8),
+    "TAKEN": (8,),
+}
+"""Other values of the numbers of the default search."""
+
+
+def on_constants(options):
+    """One line a value of a number of the default search."""
+    from small_problems import SMALL
+
+    def medians():
+        compiled_search.cache_clear()  # The programs know the numbers by their values alone.
+        costs = [
+            first_failures(SMALL[name], "portfolio", 1000, ACTIVE_BATCH, range(options.seeds)).cost
+            for name in options.problems or VARIED
+        ]
+        return np.array([np.median(np.minimum(cost, 1200)) for cost in costs])
+
+    usual = medians()
+    print("as they are", usual, flush=True)
+    for name, values in CONSTANTS.items():
+        chosen = getattr(portfolio, name)
+        for value in values:
+            setattr(portfolio, name, value)
+            found = medians()
+            ratio = np.exp(np.mean(np.log(found / usual)))
+            print(f"{name} {value} instead of {chosen}: {ratio:.2f}", found, flush=True)
+        setattr(portfolio, name, chosen)
+
+
+CASES = {
+    "landscapes": on_landscapes,
+    "cartpole": on_cartpole,
+    "kinds": on_kinds,
+    "table": on_small,
+    "constants": on_constants,
+}
+
+
 def main():
     """Measure and print one line a search."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("where", choices=["landscapes", "cartpole", "kinds"])
+    parser.add_argument("where", choices=list(CASES))
     parser.add_argument("--seeds", type=int, default=24)
     parser.add_argument("--searches", default="", help="names, comma-separated")
     parser.add_argument("--landscapes", default="", help="names, comma-separated")
     parser.add_argument("--budget", type=int, default=10_000)
     parser.add_argument("--problem", default="rare", help="name of a problem in specs/cartpole.py")
+    parser.add_argument("--problems", nargs="*", help="names of small problems")
+    parser.add_argument("--libraries", action="store_true", help="also cmaes and Optuna's TPE")
     options = parser.parse_args()
-    cases = {"landscapes": on_landscapes, "cartpole": on_cartpole, "kinds": on_kinds}
-    cases[options.where](options)
+    CASES[options.where](options)
 
 
 if __name__ == "__main__":

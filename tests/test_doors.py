@@ -19,7 +19,6 @@ ALLOWED = {
     "systems/blackbox/worker_process.py": "the pipe to the process that has started it",
     "core/user_code/source_collection.py": "the user's own program",
     "core/user_code/user_files.py": "regular files that the user has named",
-    "addons/searches/sobol.py": "a file of SciPy",
     "core/compute/devices.py": "/proc/cpuinfo",
     "addons/native/native_code/library.py": "/proc/cpuinfo",
     "addons/native/native_code/source.py": "a file of the package",

@@ -27,7 +27,6 @@ OTHERS = {
         ("uniform", 3, "first"),
         ("halton", 0, "sequence"),
         ("halton", 3, "sequence"),
-        pytest.param("sobol", 0, "sequence", marks=pytest.mark.addons),
         pytest.param("grid", 0, "sequence", marks=pytest.mark.addons),
         (searches.Split({"x": searches.Halton()}, searches.Uniform()), 0, "sequence"),
         (searches.Split({"x": searches.CrossEntropy()}, searches.Uniform()), 0, "learned"),

@@ -1,5 +1,7 @@
 """Regions of failures: how they are described, left for others, and counted in a table."""
 
+from dataclasses import dataclass
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -8,7 +10,7 @@ import pytest
 import verifai_jax as vj
 from verifai_jax.falsification.kinds import regions_of
 from verifai_jax.falsification.validation import adapt_search
-from verifai_jax.search import Observations, Portfolio
+from verifai_jax.search import Observations, Portfolio, Search, Wrapper, split
 from verifai_jax.search.kinds import CAPACITY, ENOUGH, REACH, TAPER, Kinds
 
 CENTRES = np.array([[0.15, 0.2], [0.8, 0.3], [0.5, 0.85]], np.float32)
@@ -100,6 +102,13 @@ def test_a_table_has_as_many_regions_as_were_planted():
     assert len(np.unique(regions_of(bar))) == 1
 
 
+@dataclass(frozen=True)
+class Around(Wrapper):
+    """Another search, unchanged."""
+
+    search: Search
+
+
 def test_with_a_priority_the_search_stays_where_failures_are():
     def system(f, key):
         return vj.Trace({"x": f["x"][None], "y": f["y"][None]}, dt=0.1)
@@ -110,6 +119,9 @@ def test_with_a_priority_the_search_stays_where_failures_are():
     )  # fmt: skip
     search, _ = adapt_search(problem, Portfolio())
     assert search == Portfolio(gradients=False, kinds=False)
+    for around in (Around, lambda inner: split({"x": inner}, inner)):
+        within, _ = adapt_search(problem, around(Portfolio(gradients=False)))
+        assert within == around(search)
 
 
 def wells(f, key):

@@ -2,9 +2,8 @@
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import Float
@@ -165,9 +164,8 @@ def adapt_search(
             f"none: {lacking} has no derivative. Use a search that needs none, such as 'portfolio' "
             "or 'cross_entropy', or give the operation a derivative by jax.custom_jvp"
         )
-    if problem.rulebook is not None and getattr(search, "kinds", False):
-        # Where a lesser rule is broken a graver one may be, too.
-        search = replace(cast(Any, search), kinds=False)
+    if problem.rulebook is not None:
+        search = search.staying()  # Where a lesser rule is broken a graver one may be, too.
     fallback = search.fallback
     if fallback is None or not (search.wants.derivatives or search.wants.traces):
         return search, ()

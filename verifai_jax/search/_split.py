@@ -8,7 +8,7 @@ learns, the other coordinates are noise, so put interacting features into one pa
 """
 
 import operator
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import reduce
 
@@ -71,8 +71,15 @@ class Split(Search[tuple[PyTree, ...]]):
         known = [each for each in parts if each is not None]
         if not self.wants.derivatives or len(known) < len(parts):
             return None
+        return self._of(known)
+
+    def staying(self) -> "Split":
+        return self._of([each.staying() for each in self.searches])
+
+    def _of(self, searches: Sequence[Search]) -> "Split":
+        """Return the same composition of other searches, in the order of the parts."""
         names = (name for name, _ in self.parts)
-        return Split(dict(zip(names, known, strict=False)), known[-1])
+        return Split(dict(zip(names, searches, strict=False)), searches[-1])
 
     @property
     def samples_prior(self) -> bool:

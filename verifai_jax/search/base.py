@@ -220,7 +220,8 @@ class Search(ForUsers, abc.ABC, Generic[State]):
 
     _internal = frozenset((
         "counting", "distinct", "fallback", "learns", "needs_derivatives", "origin", "plan",
-        "samples_prior", "sequence", "stage", "temperature", "total", "wants", "warm_start",
+        "samples_prior", "sequence", "stage", "staying", "temperature", "total", "wants",
+        "warm_start",
     ))  # fmt: skip
 
     @property
@@ -297,6 +298,10 @@ class Search(ForUsers, abc.ABC, Generic[State]):
 
     def counting(self, failures: int) -> "Search[State]":
         """Return this search with room for so many failures that are far from each other."""
+        return self
+
+    def staying(self) -> "Search[State]":
+        """Return this search without leaving regions of failures, for failures of unequal rank."""
         return self
 
     def stage(self, state: State | None, cube: Cube, batch: int) -> "Search[State]":

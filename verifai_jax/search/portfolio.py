@@ -128,6 +128,9 @@ class Portfolio(Search[PortfolioState]):
         """The same search without gradients."""
         return replace(self, gradients=False) if self.gradients else None
 
+    def staying(self) -> "Portfolio":
+        return replace(self, kinds=False)
+
     def _differentiates(self, cube: Cube) -> bool:
         return self.gradients and len(cube.continuous) > 0
 

@@ -89,17 +89,19 @@ class Wrapper(Search[State]):
         return self.search.total(cube)
 
     def counting(self, failures: int) -> Search[State]:
-        inner = self.search.counting(failures)
-        return self if inner == self.search else self._around(inner)
+        return self._around(self.search.counting(failures))
+
+    def staying(self) -> Search[State]:
+        return self._around(self.search.staying())
 
     def stage(self, state: State | None, cube: Cube, batch: int) -> Search[State]:
         inner = self.search.stage(None if state is None else self.inner_state(state), cube, batch)
-        return self if inner == self.search else self._around(inner)
+        return self._around(inner)
 
     def _around(self, inner: Search) -> Search:
         """Return the same wrapper around another search."""
         itself: Any = self  # A dataclass, as every subclass is.
-        return replace(itself, search=inner)
+        return self if inner == self.search else replace(itself, search=inner)
 
     def init(self, key: Key[Array, ""], cube: Cube, batch: int) -> State:
         return self.search.init(key, cube, batch)

@@ -286,7 +286,7 @@ def test_a_store_of_another_sweep_says_what_differs(tmp_path):
             drifting(), {"certification": vj.Certification(16)},
             "options.samples is 16, in the cache 8",
         ),
-        (drifting(), {"search": "sobol"}, "options.search.name is sobol, in the cache halton"),
+        (drifting(), {"search": "grid"}, "options.search.name is grid, in the cache halton"),
         (drifting(steps=256), {}, "steps is 256, in the cache 128"),
         (
             drifting(algorithms=Drift(noise=0.5)), {},
