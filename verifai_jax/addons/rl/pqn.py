@@ -28,6 +28,7 @@ from verifai_jax.addons.rl.experience import (
     observation_size,
     progress,
     start_episodes,
+    step_keys,
 )
 from verifai_jax.addons.rl.observations import (
     ObservationStatistics,
@@ -35,7 +36,7 @@ from verifai_jax.addons.rl.observations import (
     normalise,
     update,
 )
-from verifai_jax.addons.rl.on_policy import minibatch_epochs
+from verifai_jax.addons.rl.on_policy import minibatch_epochs, minibatch_network
 from verifai_jax.addons.rl.optimizer import adam, annealed
 from verifai_jax.addons.rl.task.task import Task
 from verifai_jax.systems.actions import Discrete
@@ -233,20 +234,22 @@ def _collect(
 
     def step(
         carry: tuple[Episodes, Int[Array, " environments"]],
-        drawn: tuple[Float[Array, " environments"], Int[Array, " environments"], Key[Array, ""]],
+        drawn: tuple[
+            Float[Array, " environments"], Int[Array, " environments"], Key[Array, "environments 2"]
+        ],
     ) -> tuple[tuple[Episodes, Int[Array, " environments"]], Experience]:
         episodes, held = carry
-        chance, option, key = drawn
-        observation = jax.vmap(task.observe)(episodes.state)
+        chance, option, keys = drawn
+        observation = jax.lax.optimization_barrier(jax.vmap(task.observe)(episodes.state))
         normalised = normalise(state.statistics, observation, pqn.normalise)
         greedy = jnp.argmax(network(state.layers, normalised, pqn.activation), axis=-1)
         held = next_held(held, chance, option, keep, start)
         action = jnp.where(held >= 0, held, greedy.astype(jnp.int32))
-        episodes, transition = advance(task, episodes, action, key)
+        episodes, transition = advance(task, episodes, action, keys)
         held = jnp.where(transition.over, -1, held)
         return (episodes, held), Experience(observation, action, transition)
 
-    keys = jax.random.split(step_key, pqn.horizon)
+    keys = step_keys(step_key, pqn.horizon, pqn.environments)
     carry = (state.episodes, state.held)
     (episodes, held), experience = jax.lax.scan(step, carry, (chances, options, keys))
     return episodes, held, experience
@@ -298,7 +301,7 @@ def _learn(
 
 
 def _loss(layers: Layers, pqn: PQN, part: Minibatch) -> Float[Array, ""]:
-    values = network(layers, part.observation, pqn.activation)
+    values = minibatch_network(layers, part.observation, pqn.activation)
     # A choice instead of an index, whose derivative would scatter row by row.
     chosen = jnp.arange(values.shape[-1]) == part.action[:, None]
     value = jnp.sum(jnp.where(chosen, values, 0.0), axis=-1)

@@ -164,11 +164,15 @@ class SAC:
             carry: "SACState",
             numbered: tuple[
                 Int[Array, ""],
-                tuple[Float[Array, "environments actions"], Key[Array, ""], Key[Array, ""]],
+                tuple[
+                    Float[Array, "environments actions"],
+                    Key[Array, "environments 2"],
+                    Key[Array, ""],
+                ],
             ],
         ) -> tuple["SACState", tuple[experience.Transition, Float[Array, "environments k"]]]:
-            number, (noise, step_key, learn_key) = numbered
-            carry, transition, observation = act(self, task, carry, noise, step_key)
+            number, (noise, keys, learn_key) = numbered
+            carry, transition, observation = act(self, task, carry, noise, keys)
             taken = (state.done * self.horizon + number + 1) * self.environments
             carry = jax.lax.cond(
                 taken >= self.warmup, lambda: _learn(self, carry, rate, learn_key), lambda: carry
@@ -179,7 +183,7 @@ class SAC:
         drawn = (
             # All random numbers of the update at once: in the loop each draw would cost its own.
             jax.random.normal(noise_key, (self.horizon, *state.noise.shape)),
-            jax.random.split(step_key, self.horizon),
+            experience.step_keys(step_key, self.horizon, self.environments),
             jax.random.split(learn_key, self.horizon),
         )
         after, (transition, observation) = jax.lax.scan(
@@ -258,7 +262,7 @@ def squash_log_prob(
 
 def act(
     sac: SAC, task: Task, state: SACState, noise: Float[Array, "environments actions"],
-    key: Key[Array, ""],
+    keys: Key[Array, "environments 2"],
 ) -> tuple[SACState, experience.Transition, Float[Array, "environments k"]]:  # fmt: skip
     """Take one step of each environment, and write the transitions to the buffer."""
     observation = jax.vmap(task.observe)(state.episodes.state)
@@ -267,7 +271,7 @@ def act(
     unit = jnp.tanh(mean + jnp.exp(log_std) * state.noise)
     assert isinstance(task.action, Continuous)
     episodes, transition = experience.advance(
-        task, state.episodes, scale_to_range(task.action, unit), key
+        task, state.episodes, scale_to_range(task.action, unit), keys
     )
     new = StoredTransitions(
         observation, transition.next_observation, unit, transition.reward,
