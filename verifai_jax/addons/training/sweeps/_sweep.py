@@ -9,6 +9,7 @@ with the same folder, it reads the finished ones, computes the rest, and gives t
 """
 
 from collections.abc import Iterable, Mapping
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -105,7 +106,7 @@ def sweep(
         "budget": certified.budget,
         "attack": attack if isinstance(attack, str) else repr(attack),
         "attack_simulations": certified.attack_simulations,
-        "halving": None if halving is None else {"reduction": halving.reduction, "by": halving.by},
+        "halving": None if halving is None else _given(halving),
         "episodes": episodes,
     }
     if proposer.learns:
@@ -122,6 +123,11 @@ def sweep(
             sources=sources,
         )  # fmt: skip
         return Sweep(running.run(proposer), study, reuse=cache.reuse())
+
+
+def _given(halving: Halving) -> dict[str, Any]:
+    """Return the options of a halving as they are recorded, without those that are left out."""
+    return {name: value for name, value in asdict(halving).items() if value is not None}
 
 
 def check_options(
