@@ -287,7 +287,7 @@ def main() -> None:
     halvings = {
         "ours": None,
         "halving": vj.Halving(reduction=3),
-        "stopping": vj.Halving(reduction=3),
+        "stopping": vj.Halving(reduction=1, p=0.9),
     }
     for name in chosen.cases:
         case = CASES[name]

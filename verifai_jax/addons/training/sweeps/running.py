@@ -42,6 +42,14 @@ _LAST = 10**9
 """Number of a checkpoint beyond the last one of every training."""
 
 
+def runs_of(
+    study: Study, cache: Cache, clock: Clock, executor: Executor | None = None
+) -> TrainingRuns:
+    """Return the training runs of a study, by its algorithms or its function."""
+    kind = FunctionRuns if isinstance(study.trainer, FunctionTrainer) else TrainingRuns
+    return kind(study, cache, clock, executor)
+
+
 @dataclass(eq=False)
 class _Configuration:
     """One configuration: values, training runs, and the checkpoint at which halving stopped it."""
@@ -76,9 +84,7 @@ class RunningSweep:
     safety: dict[tuple[int, int], Certificate] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        by_function = isinstance(self.study.trainer, FunctionTrainer)
-        kind = FunctionRuns if by_function else TrainingRuns
-        self.runs = kind(self.study, self.cache, self.clock, self.executor)
+        self.runs = runs_of(self.study, self.cache, self.clock, self.executor)
 
     def run(self, proposer: Proposer) -> record.SweepRecord:
         """Train and certify, or as much of it as time allows."""
