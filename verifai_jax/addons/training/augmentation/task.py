@@ -113,21 +113,12 @@ class SupervisedTask:
         if not isinstance(name, str) or not name.strip():
             raise TaskError(f"a supervised task needs a name; got {name!r}")
         values: dict[str, Any] = {
-            "name": name,
-            "space": _as_space("space", space),
-            "render": render,
-            "label": label,
-            "train": train,
-            "predict": predict,
-            "wrongness": wrongness,
-            "present": present,
-            "detected": detected,
-            "transform": transform,
-            "training_space": training_space,
-            "measures": dict(measures or {}),
-            "lanes": check_count("lanes", lanes, error=TaskError),
+            "name": name, "space": _as_space("space", space), "render": render, "label": label,
+            "train": train, "predict": predict, "wrongness": wrongness, "present": present,
+            "detected": detected, "transform": transform, "training_space": training_space,
+            "measures": dict(measures or {}), "lanes": check_count("lanes", lanes, error=TaskError),
             "black_box": bool(black_box),
-        }
+        }  # fmt: skip
         taken = next((name for name in values["space"].columns if name in _RESERVED), None)
         if taken is not None:
             raise TaskError(

@@ -102,12 +102,9 @@ def sweep(
         )
     # Read by a later --resume.
     note = {
-        "target": target,
-        "configurations": configurations,
-        "given": given,
-        "options": list(options),
-        "nominal": list(nominal),
-    }
+        "target": target, "configurations": configurations, "given": given,
+        "options": list(options), "nominal": list(nominal),
+    }  # fmt: skip
     keywords = _keywords(given, options)
     goes_on = partial(
         _resuming, target=target, cache=cache, max_seconds=max_seconds, cluster=cluster
@@ -120,15 +117,10 @@ def sweep(
         ):
             folder = path
             result = run_sweep(
-                study,
-                configurations=configurations,
-                folder=folder if cache is None else cache,
-                stop=Stop(seconds=max_seconds),
-                note=note,
-                run_on=RunOn(executor=executor),
-                even_if_changed=even_if_changed,
-                **keywords,
-            )
+                study, configurations=configurations, folder=folder if cache is None else cache,
+                stop=Stop(seconds=max_seconds), note=note, run_on=RunOn(executor=executor),
+                even_if_changed=even_if_changed, **keywords,
+            )  # fmt: skip
             record = replace(result.record, options={**result.record.options, "target": target})
             result = replace(result, record=record)
             say(result)
@@ -141,14 +133,10 @@ def sweep(
         raise
     say(f"  table        {folder / 'table.parquet'}")
     give_result(
-        study=study.name,
-        target=target,
-        policies=result.table,
-        safe=[int(row) for row in result.safe.index],
-        complete=record.complete,
-        seconds=record.seconds,
-        folder=folder,
-    )
+        study=study.name, target=target, policies=result.table,
+        safe=[int(row) for row in result.safe.index], complete=record.complete,
+        seconds=record.seconds, folder=folder,
+    )  # fmt: skip
     if pictures and record.certified:
         draw(result, folder / "sweep.png")
     if not record.complete:

@@ -91,17 +91,10 @@ def _draw_safety(axes: Axes, sweep: Sweep) -> None:
             if weight == 1.0:
                 _draw_intervals(axes, rows, colour, 0.35 if crowded else 0.6)
             axes.scatter(
-                rows["nominal_return"],
-                rows["failure_rate"],
-                c=colour,
-                marker=marker,
-                s=26 if crowded else 42,
-                alpha=weight,
-                edgecolors="white",
-                linewidths=0.6,
-                label=f"{verdict}{when} ({len(rows)})",
-                zorder=2 + weight,
-            )
+                rows["nominal_return"], rows["failure_rate"], c=colour, marker=marker,
+                s=26 if crowded else 42, alpha=weight, edgecolors="white", linewidths=0.6,
+                label=f"{verdict}{when} ({len(rows)})", zorder=2 + weight,
+            )  # fmt: skip
     front = shown.loc[shown.index.isin(sweep.pareto().index)].sort_values("nominal_return")
     axes.scatter(
         front["nominal_return"], front["failure_rate"], facecolors="none", edgecolors=style.BOUND,
@@ -128,15 +121,10 @@ def _draw_safety(axes: Axes, sweep: Sweep) -> None:
 def _draw_intervals(axes: Axes, rows: "pd.DataFrame", colour: str, alpha: float) -> None:
     rate = rows["failure_rate"]
     axes.errorbar(
-        rows["nominal_return"],
-        rate,
-        yerr=[rate - rows["failure_low"], rows["failure_high"] - rate],
-        fmt="none",
-        ecolor=colour,
-        elinewidth=0.9,
-        alpha=alpha,
-        zorder=1,
-    )
+        rows["nominal_return"], rate,
+        yerr=[rate - rows["failure_low"], rows["failure_high"] - rate], fmt="none", ecolor=colour,
+        elinewidth=0.9, alpha=alpha, zorder=1,
+    )  # fmt: skip
 
 
 def _legend_below(axes: Axes, columns: int) -> None:
@@ -210,28 +198,17 @@ def _draw_curves(axes: Axes, sweep: Sweep, rows: list[int]) -> None:
         trace, steps = sweep.curve(end), int(entry["steps"])
         clock, values = np.asarray(trace.clock()), np.asarray(trace["return"])
         axes.plot(
-            clock / 1000,
-            values,
-            color=colour,
-            marker=marker,
-            markevery=max(1, len(clock) // 8),
-            markersize=4,
-            linewidth=1.5,
-            linestyle="--" if again else "-",
+            clock / 1000, values, color=colour, marker=marker, markevery=max(1, len(clock) // 8),
+            markersize=4, linewidth=1.5, linestyle="--" if again else "-",
             label=f"row {row}, {verdict}: {_failures(entry)}",
-        )
+        )  # fmt: skip
         if end != row:
             at = min(int(np.searchsorted(clock, steps)), len(clock) - 1)
             axes.plot(
-                clock[at] / 1000,
-                values[at],
-                color=colour,
-                marker="*",
-                markersize=12,
-                markeredgecolor=style.BOUND,
-                linestyle="none",
+                clock[at] / 1000, values[at], color=colour, marker="*", markersize=12,
+                markeredgecolor=style.BOUND, linestyle="none",
                 label=f"row {row}: checkpoint at {steps:,} steps",
-            )
+            )  # fmt: skip
     axes.set_xlabel("environment steps in thousands")
     axes.set_ylabel("mean return of training episodes")
     axes.set_title("Learning curves", fontsize=10)
@@ -255,15 +232,10 @@ def _draw_shares(axes: Axes, importance: HyperparameterImportance) -> None:
         colour, what, hatch = BARS[target]
         at = position + (k - (len(targets) - 1) / 2) * height
         axes.barh(
-            at,
-            shown[f"{target}_total"].to_numpy(float),
-            height * 0.9,
-            color=colour,
-            hatch=hatch,
-            edgecolor="white",
-            linewidth=0,
+            at, shown[f"{target}_total"].to_numpy(float), height * 0.9, color=colour, hatch=hatch,
+            edgecolor="white", linewidth=0,
             label=f"{what} (model: R² {importance.scores[target]:z.2f})",
-        )
+        )  # fmt: skip
         alone = shown[f"{target}_first"].to_numpy(float)
         axes.vlines(
             alone, at - 0.45 * height, at + 0.45 * height, color=style.BOUND, linewidth=1.6,
@@ -295,14 +267,9 @@ def _draw_trends(axes: Axes, importance: HyperparameterImportance) -> None:
         colour, what, hatch = BARS[target]
         axes.barh(
             position + (k - (len(names) - 1) / 2) * height,
-            shown[f"{target}_trend"].to_numpy(float),
-            height * 0.9,
-            color=colour,
-            hatch=hatch,
-            edgecolor="white",
-            linewidth=0,
-            label=what,
-        )
+            shown[f"{target}_trend"].to_numpy(float), height * 0.9, color=colour, hatch=hatch,
+            edgecolor="white", linewidth=0, label=what,
+        )  # fmt: skip
     axes.axvline(0, color=style.BOUND, linewidth=0.8)
     axes.set_yticks(position, [style.wrap_name(str(name), 18) for name in shown.index])
     axes.invert_yaxis()

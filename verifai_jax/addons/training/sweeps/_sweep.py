@@ -99,16 +99,12 @@ def sweep(
     )
     attack = certified.attack
     options: dict[str, Any] = {
-        "search": proposer.to_json(),
-        "seed": seed,
-        "samples": certified.samples,
-        "confidence": certified.confidence,
-        "budget": certified.budget,
+        "search": proposer.to_json(), "seed": seed, "samples": certified.samples,
+        "confidence": certified.confidence, "budget": certified.budget,
         "attack": attack if isinstance(attack, str) else repr(attack),
         "attack_simulations": certified.attack_simulations,
-        "halving": None if halving is None else _given(halving),
-        "episodes": episodes,
-    }
+        "halving": None if halving is None else _given(halving), "episodes": episodes,
+    }  # fmt: skip
     if proposer.learns:
         # Its proposals depend on both.
         options |= {"configurations": configurations, "batch": proposer.batch}

@@ -30,13 +30,9 @@ if TYPE_CHECKING:
     from optuna.samplers import BaseSampler
     from optuna.trial import Trial
 _SAMPLERS = {
-    "tpe": "TPESampler",
-    "random": "RandomSampler",
-    "cmaes": "CmaEsSampler",
-    "gp": "GPSampler",
-    "nsgaii": "NSGAIISampler",
-    "qmc": "QMCSampler",
-}
+    "tpe": "TPESampler", "random": "RandomSampler", "cmaes": "CmaEsSampler", "gp": "GPSampler",
+    "nsgaii": "NSGAIISampler", "qmc": "QMCSampler",
+}  # fmt: skip
 """Classes of Optuna's samplers, by the names that are used here."""
 _MAX_REFUSED = 1000
 """Trials in a row that the constraint may refuse before proposals end."""

@@ -115,12 +115,10 @@ def _trial(
     parameters = {n: _clamp(as_scalar(row[n]), d) for n, d in distributions.items()}
     parameters = {n: v for n, v in parameters.items() if v == v}
     return optuna.trial.create_trial(
-        state=state,
-        values=values if complete else None,
-        params=parameters,
+        state=state, values=values if complete else None, params=parameters,
         distributions={n: d for n, d in distributions.items() if n in parameters},
         user_attrs={"configuration": number, **attributes},
-    )
+    )  # fmt: skip
 
 
 def _clamp(value: object, distribution: "BaseDistribution") -> object:

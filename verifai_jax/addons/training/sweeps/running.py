@@ -315,12 +315,9 @@ class RunningSweep:
             self._measure_returns(list(dict.fromkeys(run for run, _ in entries)))
             policies = [self._policy(entry) for entry in entries]
             certificates = self._certify_policies(
-                policies,
-                self.certified,
-                self.options["seed"],
-                self.study.p,
+                policies, self.certified, self.options["seed"], self.study.p,
                 progress=self.clock.show,
-            )
+            )  # fmt: skip
         self.safety = dict(zip(entries, certificates.rows, strict=True))
         for entry, safety in self.safety.items():
             numbers = columns_of(safety)
@@ -358,21 +355,13 @@ class RunningSweep:
                     rows.append(row)
         table = tabulate(rows, self.study)
         return record.SweepRecord(
-            study=self.study.name,
-            seed=self.options["seed"],
-            columns=table.columns,
-            hyperparameters=tuple(self.study.space.columns),
-            policies=table.policies,
-            worst=table.worst,
-            curves=table.curves,
-            certificates=certificates,
-            certified=tuple(certified[entry] for entry in self.safety),
-            options=self.options,
-            version=__version__,
-            seconds=dict(self.clock.seconds),
-            complete=complete,
+            study=self.study.name, seed=self.options["seed"], columns=table.columns,
+            hyperparameters=tuple(self.study.space.columns), policies=table.policies,
+            worst=table.worst, curves=table.curves, certificates=certificates,
+            certified=tuple(certified[entry] for entry in self.safety), options=self.options,
+            version=__version__, seconds=dict(self.clock.seconds), complete=complete,
             sources=tuple(self.sources),
-        )
+        )  # fmt: skip
 
     def _rows(self, number: int, configuration: _Configuration, run: int) -> list[Row]:
         training = self.runs.runs[run]

@@ -101,20 +101,13 @@ class Study(InNotebook):
         check_fraction("p", p, error=StudyError)
         steps = {check_count("a checkpoint", at, error=StudyError) for at in checkpoints}
         values = {
-            "name": name,
-            "space": space,
-            "trainer": trainer,
-            "problem": problem,
-            "checkpoints": tuple(sorted(steps)),
-            "seeds": seeds,
-            "p": p,
-            "curve": curve,
+            "name": name, "space": space, "trainer": trainer, "problem": problem,
+            "checkpoints": tuple(sorted(steps)), "seeds": seeds, "p": p, "curve": curve,
             "description": description,
             "made_in": made_here() if made_in is None else tuple(made_in),
             "training_seeds": _seeds(seeds),
-            "curve_formula": None if curve is None else check_curve(curve),
-            "_problems": {},
-        }
+            "curve_formula": None if curve is None else check_curve(curve), "_problems": {},
+        }  # fmt: skip
         for attribute, value in values.items():
             object.__setattr__(self, attribute, value)
 
