@@ -62,20 +62,11 @@ _MAX_ROWS = 12
 @arguments.PICTURES
 @fail_on(unsafe="unless a policy is shown to be safe")
 def sweep(
-    target: str | None,
-    configurations: int | None,
-    options: tuple[str, ...],
-    nominal: tuple[str, ...],
-    max_seconds: float | None,
-    cache: Path | None,
-    resume: Path | None,
-    even_if_changed: bool,
-    folder: Path | None,
-    cluster: str | None,
-    pictures: bool,
-    fail_on: Gate | None,
-    **given: Any,
-) -> None:
+    target: str | None, configurations: int | None, options: tuple[str, ...],
+    nominal: tuple[str, ...], max_seconds: float | None, cache: Path | None, resume: Path | None,
+    even_if_changed: bool, folder: Path | None, cluster: str | None, pictures: bool,
+    fail_on: Gate | None, **given: Any,
+) -> None:  # fmt: skip
     """Train configurations of the study TARGET (specs/FILE.py:NAME), certify their policies."""
     from verifai_jax import RunOn, Stop, Study
     from verifai_jax.addons.training.sweeps._sweep import sweep as run_sweep

@@ -36,23 +36,13 @@ from verifai_jax.statistics.stopping import Stop
 
 @suggests_options
 def sweep(
-    study: Study,
-    search: str | Search | OptunaSampler = "halton",
-    configurations: int = 32,
-    *,
-    seed: int = 0,
-    certification: Certification | None = None,
-    halving: Halving | None = None,
-    batch: int | None = None,
-    episodes: int = EPISODES,
-    stop: Stop | None = None,
-    folder: str | Path | None = None,
-    run_on: RunOn | None = None,
-    note: Mapping[str, Any] | None = None,
-    callbacks: Iterable[Callback] = (),
-    progress: bool | None = None,
-    even_if_changed: bool = False,
-) -> Sweep:
+    study: Study, search: str | Search | OptunaSampler = "halton", configurations: int = 32, *,
+    seed: int = 0, certification: Certification | None = None, halving: Halving | None = None,
+    batch: int | None = None, episodes: int = EPISODES, stop: Stop | None = None,
+    folder: str | Path | None = None, run_on: RunOn | None = None,
+    note: Mapping[str, Any] | None = None, callbacks: Iterable[Callback] = (),
+    progress: bool | None = None, even_if_changed: bool = False,
+) -> Sweep:  # fmt: skip
     """Train configurations of a study's hyper-parameters and certify their policies.
 
     A row of the result is a policy: a configuration, trained with one seed, at one checkpoint. The

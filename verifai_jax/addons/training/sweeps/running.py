@@ -373,26 +373,20 @@ class RunningSweep:
             status = record.TRAINED if configuration.stopped != rung else record.STOPPED
             rows.append(
                 Row(
-                    configuration=number,
-                    seed=training.seed,
-                    steps=steps,
+                    configuration=number, seed=training.seed, steps=steps,
                     values=configuration.values,
-                    status=status if checkpoint.finite else record.NONFINITE,
-                    entry=(run, rung),
+                    status=status if checkpoint.finite else record.NONFINITE, entry=(run, rung),
                     checkpoint=checkpoint,
                     nominal_return=self.returns.get((run, rung), float("nan")),
                     safety=self.safety.get((run, rung)),
                 )
-            )
+            )  # fmt: skip
         if run in self.runs.errors:
             rows.append(
                 Row(
-                    configuration=number,
-                    seed=training.seed,
-                    steps=training.checkpoints[-1],
-                    values=configuration.values,
-                    status=record.error_status(self.runs.errors[run]),
+                    configuration=number, seed=training.seed, steps=training.checkpoints[-1],
+                    values=configuration.values, status=record.error_status(self.runs.errors[run]),
                     entry=(run, -1),
                 )
-            )
+            )  # fmt: skip
         return rows

@@ -72,18 +72,11 @@ class Study(InNotebook):
     _problems: dict[str, Problem] = field(init=False, repr=False)
 
     def __init__(
-        self,
-        name: str,
-        space: FeatureSpace | Mapping[str, Domain],
-        trainer: Trainer,
-        problem: Callable[[Policy], Problem],
-        checkpoints: Sequence[int] = (),
-        seeds: int | Sequence[int] = 1,
-        p: float = 0.01,
-        curve: Formula | str | None = None,
-        description: str = "",
-        made_in: Sequence[Maker] | None = None,
-    ) -> None:
+        self, name: str, space: FeatureSpace | Mapping[str, Domain], trainer: Trainer,
+        problem: Callable[[Policy], Problem], checkpoints: Sequence[int] = (),
+        seeds: int | Sequence[int] = 1, p: float = 0.01, curve: Formula | str | None = None,
+        description: str = "", made_in: Sequence[Maker] | None = None,
+    ) -> None:  # fmt: skip
         if not isinstance(name, str) or not name.strip():
             raise StudyError(f"a study needs a name; got {name!r}")
         if isinstance(space, Mapping):
