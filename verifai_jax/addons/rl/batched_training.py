@@ -22,7 +22,7 @@ from typing import NamedTuple, TypeAlias
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Float, Int, Integer, PyTree
+from jaxtyping import Array, ArrayLike, Float, Int, Integer, Key, PyTree
 
 from verifai_jax.addons.rl.algorithm import Algorithm, AlgorithmState, check_fit
 from verifai_jax.addons.rl.task.task import Task
@@ -320,6 +320,15 @@ def policy_structure(configuration: Configuration) -> tuple[Hashable, Hashable, 
     task, algorithm = numbers_of(configuration.task), numbers_of(configuration.algorithm)
     shapes = tuple((leaf.shape, leaf.dtype.str) for leaf in task[0] + algorithm[0])
     return StaticTask(configuration.task), algorithm[1], shapes
+
+
+def untrained_policy(algorithm: Algorithm, task: Task) -> Policy:
+    """Return the shapes and dtypes of the policies that an algorithm learns; nothing compiles."""
+
+    def initial(key: Key[Array, ""]) -> Policy:
+        return algorithm.policy(task, algorithm.init(task, key, 1))
+
+    return jax.eval_shape(initial, jax.eval_shape(lambda: jax.random.key(0)))
 
 
 def _structure_of(configuration: Configuration) -> _Structure:

@@ -412,11 +412,7 @@ class Sweep(Reported):
         changed = changed_since(self.changes(), None, "the sweep")
         return f"{changed}\n{text}" if changed else text
 
-    def __str__(self) -> str:
-        return self.summary()
-
-    def __repr__(self) -> str:
-        return self.summary()
+    __str__ = __repr__ = summary
 
     def _repr_html_(self) -> str:
         return format_html(self.findings)
