@@ -15,7 +15,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, Key, PyTree, Shaped
 
 from verifai_jax.addons.rl.advantage import advantages
-from verifai_jax.addons.rl.algorithm import Number, Progress, check_values, static_field
+from verifai_jax.addons.rl.algorithm import Number, Progress, Vectorised, check_values, static_field
 from verifai_jax.addons.rl.experience import (
     Episodes,
     Transition,
@@ -40,7 +40,7 @@ from verifai_jax.systems.policy import Layers, Policy, network, new_layers, scal
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
-class PPO:
+class PPO(Vectorised):
     """Proximal policy optimisation, for discrete and continuous actions, with its hyper-parameters.
 
     - `learning_rate`: the learning rate of Adam; falls linearly to 0 over the training if `anneal`.
@@ -74,11 +74,6 @@ class PPO:
     normalise: bool = static_field(False)
     anneal: bool = static_field(True)
 
-    @property
-    def steps_per_update(self) -> int:
-        """Number of environment steps in one update."""
-        return self.environments * self.horizon
-
     def check(self) -> None:
         """Refuse invalid hyper-parameters.
 
@@ -90,13 +85,7 @@ class PPO:
         check_values(self, fractions, lambda value: 0 <= float(value) <= 1, "between 0 and 1")
         weights = ("entropy", "value_weight")
         check_values(self, weights, lambda value: float(value) >= 0, "at least 0")
-        counts = ("environments", "horizon", "epochs", "minibatches")
-        check_values(self, counts, lambda value: value >= 1, "at least 1")
-        steps = self.steps_per_update
-        wanted = f"a divisor of environments * horizon = {steps}"
-        check_values(self, ["minibatches"], lambda value: steps % value == 0, wanted)
-        widths = ("hidden", "value_hidden")
-        check_values(self, widths, lambda value: all(w >= 1 for w in value), "positive widths")
+        self.check_shapes("epochs", "minibatches")
 
     def init(self, task: Task, key: Key[Array, ""], updates: int | Int[Array, ""]) -> "PPOState":
         """Make the state before the first of `updates` updates."""

@@ -20,7 +20,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, Key, PyTree
 
 from verifai_jax.addons.rl.advantage import Ends
-from verifai_jax.addons.rl.algorithm import Number, Progress, check_values, static_field
+from verifai_jax.addons.rl.algorithm import Number, Progress, Vectorised, check_values, static_field
 from verifai_jax.addons.rl.experience import (
     Episodes,
     Transition,
@@ -40,12 +40,12 @@ from verifai_jax.addons.rl.on_policy import minibatch_epochs, minibatch_network
 from verifai_jax.addons.rl.optimizer import adam, annealed
 from verifai_jax.addons.rl.task.task import Task
 from verifai_jax.systems.actions import Discrete
-from verifai_jax.systems.policy import ACTIVATIONS, Layers, Policy, network, new_layers
+from verifai_jax.systems.policy import Layers, Policy, network, new_layers
 
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
-class PQN:
+class PQN(Vectorised):
     """Parallelised Q network, for discrete actions, with its hyper-parameters.
 
     - `learning_rate`: the learning rate of Adam; falls linearly to 0 over the training if `anneal`.
@@ -84,11 +84,6 @@ class PQN:
     normalise: bool = static_field(True)
     anneal: bool = static_field(True)
 
-    @property
-    def steps_per_update(self) -> int:
-        """Number of environment steps in one update."""
-        return self.environments * self.horizon
-
     def check(self) -> None:
         """Refuse invalid hyper-parameters.
 
@@ -99,15 +94,7 @@ class PQN:
         fractions = ("discount", "q_lambda", "epsilon_start", "epsilon_end")
         check_values(self, fractions, lambda value: 0 <= float(value) <= 1, "between 0 and 1")
         check_values(self, ["hold"], lambda value: float(value) >= 1, "at least 1")
-        counts = ("environments", "horizon", "epochs", "minibatches")
-        check_values(self, counts, lambda value: value >= 1, "at least 1")
-        steps = self.steps_per_update
-        wanted = f"a divisor of environments * horizon = {steps}"
-        check_values(self, ["minibatches"], lambda value: steps % value == 0, wanted)
-        widths = lambda value: all(w >= 1 for w in value)  # noqa: E731
-        check_values(self, ["hidden"], widths, "positive widths")
-        known = " or ".join(ACTIVATIONS)
-        check_values(self, ["activation"], lambda value: value in ACTIVATIONS, known)
+        self.check_shapes("epochs", "minibatches")
 
     def init(self, task: Task, key: Key[Array, ""], updates: int | Int[Array, ""]) -> "PQNState":
         """Make the state before the first of `updates` updates."""

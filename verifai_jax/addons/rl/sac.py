@@ -19,7 +19,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, Key, PyTree
 
 from verifai_jax.addons.rl import experience
-from verifai_jax.addons.rl.algorithm import Number, Progress, check_values, static_field
+from verifai_jax.addons.rl.algorithm import Number, Progress, Vectorised, check_values, static_field
 from verifai_jax.addons.rl.observations import (
     ObservationStatistics,
     mean_and_scale,
@@ -37,7 +37,6 @@ from verifai_jax.addons.rl.replay_buffer import (
 from verifai_jax.addons.rl.task.task import Task
 from verifai_jax.systems.actions import Continuous
 from verifai_jax.systems.policy import (
-    ACTIVATIONS,
     Layers,
     Policy,
     network,
@@ -54,7 +53,7 @@ Outside these bounds a Gaussian after tanh is nearly constant, or takes almost o
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
-class SAC:
+class SAC(Vectorised):
     """Soft actor-critic, for continuous actions, with its hyper-parameters.
 
     - `learning_rate`: the learning rate of Adam, for the policy, the critics and the temperature;
@@ -100,11 +99,6 @@ class SAC:
     normalise: bool = static_field(False)
     anneal: bool = static_field(False)
 
-    @property
-    def steps_per_update(self) -> int:
-        """Number of environment steps in one update."""
-        return self.environments * self.horizon
-
     def check(self) -> None:
         """Refuse invalid hyper-parameters.
 
@@ -120,14 +114,9 @@ class SAC:
             self, ["correlation"], lambda value: 0 <= float(value) < 1, "at least 0 and below 1"
         )
         check_values(self, ["warmup"], lambda value: int(value) >= 0, "at least 0")
-        counts = ("environments", "horizon", "learnings", "batch", "capacity")
-        check_values(self, counts, lambda value: value >= 1, "at least 1")
+        self.check_shapes("learnings", "batch", "capacity")
         wanted = f"a multiple of environments = {self.environments}"
         check_values(self, ["capacity"], lambda value: value % self.environments == 0, wanted)
-        widths = ("hidden", "value_hidden")
-        check_values(self, widths, lambda value: all(w >= 1 for w in value), "positive widths")
-        known = " or ".join(ACTIVATIONS)
-        check_values(self, ["activation"], lambda value: value in ACTIVATIONS, known)
 
     def init(self, task: Task, key: Key[Array, ""], updates: int | Int[Array, ""]) -> "SACState":
         """Make the state before the first of `updates` updates."""

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -364,29 +365,18 @@ class RunningSweep:
         )  # fmt: skip
 
     def _rows(self, number: int, configuration: _Configuration, run: int) -> list[Row]:
-        training = self.runs.runs[run]
-        rows: list[Row] = []
+        training, rows = self.runs.runs[run], []
+        one = partial(Row, number, training.seed, values=configuration.values)
         for rung, steps in enumerate(training.checkpoints):
-            checkpoint = self.runs.checkpoint(run, rung)
+            checkpoint, entry = self.runs.checkpoint(run, rung), (run, rung)
             if checkpoint is None:
                 continue
             status = record.TRAINED if configuration.stopped != rung else record.STOPPED
-            rows.append(
-                Row(
-                    configuration=number, seed=training.seed, steps=steps,
-                    values=configuration.values,
-                    status=status if checkpoint.finite else record.NONFINITE, entry=(run, rung),
-                    checkpoint=checkpoint,
-                    nominal_return=self.returns.get((run, rung), float("nan")),
-                    safety=self.safety.get((run, rung)),
-                )
-            )  # fmt: skip
+            status = status if checkpoint.finite else record.NONFINITE
+            value, safety = self.returns.get(entry, float("nan")), self.safety.get(entry)
+            known = {"checkpoint": checkpoint, "nominal_return": value, "safety": safety}
+            rows.append(one(steps, status=status, entry=entry, **known))
         if run in self.runs.errors:
-            rows.append(
-                Row(
-                    configuration=number, seed=training.seed, steps=training.checkpoints[-1],
-                    values=configuration.values, status=record.error_status(self.runs.errors[run]),
-                    entry=(run, -1),
-                )
-            )  # fmt: skip
+            status = record.error_status(self.runs.errors[run])
+            rows.append(one(training.checkpoints[-1], status=status, entry=(run, -1)))
         return rows
