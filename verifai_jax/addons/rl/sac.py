@@ -269,10 +269,9 @@ def act(
     # A new episode begins with noise of its own.
     rho = jnp.where(transition.over, 0.0, sac.correlation)[:, None]
     after = state._replace(
-        episodes=episodes,
-        buffer=add(state.buffer, new),
+        episodes=episodes, buffer=add(state.buffer, new),
         noise=rho * state.noise + jnp.sqrt(1 - rho**2) * noise,
-    )
+    )  # fmt: skip
     return after, transition, observation
 
 

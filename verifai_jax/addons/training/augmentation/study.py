@@ -252,13 +252,12 @@ class Seed:
         wrongness: Float[np.ndarray, " n"], weights: Weights | None,
     ) -> "Finished":  # fmt: skip
         entry: dict[str, Any] = {
-            "status": NOT_FINITE if numbers is None else TRAINED,
-            "added": len(addition.rows),
+            "status": NOT_FINITE if numbers is None else TRAINED, "added": len(addition.rows),
             "wrong_added": float((wrongness > 0).mean()) if len(wrongness) else math.nan,
             "rendered": addition.rendered,
             **(dict.fromkeys(self.study.metrics, math.nan) if numbers is None else numbers),
             "why": addition.why,
-        }
+        }  # fmt: skip
         arrays = {name: np.asarray(value) for name, value in entry.items()}
         return Finished(arrays, addition.rows.assign(wrongness=wrongness), weights)
 

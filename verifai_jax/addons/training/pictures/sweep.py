@@ -25,10 +25,9 @@ from verifai_jax.statistics.confidence_sequences import verdict_kind
 if TYPE_CHECKING:
     import pandas as pd
 LOOKS = {
-    "safe": (style.SAFE, "o"),
-    "undecided": (style.WITHOUT_VERDICT, "D"),
+    "safe": (style.SAFE, "o"), "undecided": (style.WITHOUT_VERDICT, "D"),
     "unsafe": (style.FAILING, "X"),
-}
+}  # fmt: skip
 """Colour and marker of each verdict."""
 RETURN = "#31688e"
 """Colour of the return."""

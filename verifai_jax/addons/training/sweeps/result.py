@@ -61,10 +61,9 @@ if TYPE_CHECKING:
     from optuna.storages import BaseStorage
 
 PICTURES = {
-    "overview": ("sweep", "plot_sweep"),
-    "parallel": ("configurations", "plot_parallel"),
+    "overview": ("sweep", "plot_sweep"), "parallel": ("configurations", "plot_parallel"),
     "slices": ("configurations", "plot_slices"),
-}
+}  # fmt: skip
 """Modules and functions of the kinds of picture."""
 CERTIFICATE = (
     "verdict", "failures", "simulations", "failure_low", "failure_high", "nominal_return"

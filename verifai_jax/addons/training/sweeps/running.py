@@ -227,11 +227,10 @@ class RunningSweep:
         number = next(n for n, one in enumerate(self.configurations) if run in one.runs)
         self.calls += 1
         about = {
-            "configuration": number,
-            "training_seed": training.seed,
+            "configuration": number, "training_seed": training.seed,
             "environment_steps": training.checkpoints[rung],
             "training_return": checkpoint.training_return,
-        }
+        }  # fmt: skip
         notify(self.callbacks, self.calls, {**about, **values})
 
     def _return_name(self, run: int, rung: int) -> str:
