@@ -6,7 +6,13 @@ import numpy as np
 import pytest
 
 from verifai_jax.addons.rl import Discrete
-from verifai_jax.addons.rl.experience import advance, observation_size, progress, start_episodes
+from verifai_jax.addons.rl.experience import (
+    advance,
+    observation_size,
+    progress,
+    start_episodes,
+    step_keys,
+)
 from verifai_jax.addons.rl.observations import (
     ObservationStatistics,
     mean_and_scale,
@@ -40,15 +46,14 @@ class Count:
 
 @jax.jit
 def six_steps(task, action):
-    def step(episodes, key):
+    def step(episodes, keys):
         observation = jax.vmap(task.observe)(episodes.state)
-        episodes, transition = advance(task, episodes, action, key)
+        episodes, transition = advance(task, episodes, action, keys)
         return episodes, (observation, transition)
 
     start = start_episodes(task, jax.random.key(0), 3)
-    episodes, (observed, transition) = jax.lax.scan(
-        step, start, jax.random.split(jax.random.key(1), 6)
-    )
+    keys = step_keys(jax.random.key(1), 6, 3)
+    episodes, (observed, transition) = jax.lax.scan(step, start, keys)
     return episodes, observed, transition, progress(transition)
 
 

@@ -52,15 +52,10 @@ class Training:
 
 @shows_progress("training", "steps")
 def train(
-    task: Task,
-    algorithm: Algorithm | None = None,
-    *,
-    seed: int = 0,
-    steps: int = 200_000,
-    checkpoints: Sequence[int] = (),
-    callbacks: Iterable[Callback] = (),
+    task: Task, algorithm: Algorithm | None = None, *, seed: int = 0, steps: int = 200_000,
+    checkpoints: Sequence[int] = (), callbacks: Iterable[Callback] = (),
     progress: bool | None = None,
-) -> Training:
+) -> Training:  # fmt: skip
     """Train a policy on a task.
 
     The same seed gives the same policy on the same machine. It compiles once for each task and

@@ -21,9 +21,9 @@ class Ends(NamedTuple):
 
 
 def advantages(
-    reward: Float[Array, " time"], value: Float[Array, " time"], next_value: Float[Array, " time"],
-    ends: Ends, discount: Number, gae_lambda: Number,
-) -> Float[Array, " time"]:  # fmt: skip
+    reward: Float[Array, "time *lanes"], value: Float[Array, "time *lanes"],
+    next_value: Float[Array, "time *lanes"], ends: Ends, discount: Number, gae_lambda: Number,
+) -> Float[Array, "time *lanes"]:  # fmt: skip
     """Estimate the advantage of each action; advantage plus `value` is the critic's target.
 
     **Arguments:**
@@ -42,10 +42,11 @@ def advantages(
     same_episode = 1.0 - (ends.terminated | ends.truncated)
 
     def backwards(
-        later: Float[Array, ""], step: tuple[Float[Array, ""], Float[Array, ""]]
-    ) -> tuple[Float[Array, ""], Float[Array, ""]]:
+        later: Float[Array, "*lanes"], step: tuple[Float[Array, "*lanes"], Float[Array, "*lanes"]]
+    ) -> tuple[Float[Array, "*lanes"], Float[Array, "*lanes"]]:
         delta, same_episode = step
         advantage = delta + discount * gae_lambda * same_episode * later
         return advantage, advantage
 
-    return jax.lax.scan(backwards, jnp.zeros(()), (delta, same_episode), reverse=True, unroll=16)[1]
+    steps, last = (delta, same_episode), jnp.zeros_like(delta[0])
+    return jax.lax.scan(backwards, last, steps, reverse=True, unroll=16)[1]

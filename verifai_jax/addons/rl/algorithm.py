@@ -18,7 +18,7 @@ from typing import Any, ClassVar, NamedTuple, Protocol, TypeAlias, TypeVar, runt
 from jaxtyping import Array, Float, Int, Key, Num, PyTree
 
 from verifai_jax.addons.rl.task.task import Task
-from verifai_jax.systems.policy import Policy
+from verifai_jax.systems.policy import ACTIVATIONS, Policy
 
 T = TypeVar("T")
 Number = Num[Array, ""] | float | int
@@ -107,6 +107,30 @@ def check_values(
             good = holds(value)
         if not good:
             raise ValueError(f"{type(algorithm).__name__}'s {name} must be {wanted}; got {value}")
+
+
+class Vectorised:
+    """An algorithm whose update takes `horizon` steps of each of its `environments`."""
+
+    environments: int
+    horizon: int
+
+    @property
+    def steps_per_update(self) -> int:
+        """Number of environment steps in one update."""
+        return self.environments * self.horizon
+
+    def check_shapes(self, *counts: str) -> None:
+        """Refuse numbers below 1 (those named too), minibatches that do not divide, and widths."""
+        numbers = ("environments", "horizon", *counts)
+        check_values(self, numbers, lambda value: value >= 1, "at least 1")
+        steps, rest = self.steps_per_update, [n for n in counts if n == "minibatches"]
+        wanted = f"a divisor of environments * horizon = {steps}"
+        check_values(self, rest, lambda value: steps % value == 0, wanted)
+        widths = [name for name in ("hidden", "value_hidden") if hasattr(self, name)]
+        check_values(self, widths, lambda value: all(w >= 1 for w in value), "positive widths")
+        named = [name for name in ("activation",) if hasattr(self, name)]
+        check_values(self, named, lambda value: value in ACTIVATIONS, " or ".join(ACTIVATIONS))
 
 
 def check_fit(algorithm: Algorithm, task: Task) -> None:

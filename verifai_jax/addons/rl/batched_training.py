@@ -22,11 +22,11 @@ from typing import NamedTuple, TypeAlias
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Float, Int, Integer, PyTree
+from jaxtyping import Array, ArrayLike, Float, Int, Integer, Key, PyTree
 
 from verifai_jax.addons.rl.algorithm import Algorithm, AlgorithmState, check_fit
 from verifai_jax.addons.rl.task.task import Task
-from verifai_jax.core.compute.compilation import KEPT, jit_each, power_of_two
+from verifai_jax.core.compute.compilation import KEPT, jit_each, known_options, power_of_two
 from verifai_jax.core.compute.devices import (
     Device,
     enable_compile_cache,
@@ -39,6 +39,12 @@ RUNS_PER_ACCELERATOR = 64
 """Training runs under one `vmap` on an accelerator; a CPU core is busy with one."""
 SLICE_SECONDS = 2.0
 """Approximate maximum seconds of a call of compiled code; interrupts act between calls."""
+_SEQUENTIAL = {
+    "xla_cpu_scheduler_type": "CPU_SCHEDULER_TYPE_MEMORY_OPTIMIZED",
+    "xla_disable_hlo_passes": "cpu-parallel-task-assigner",
+}
+"""Without handing microseconds of work to other threads, which took a third of the processor time;
+the cores are busy with other trainings."""
 PyTreeDef: TypeAlias = jax.tree_util.PyTreeDef  # pyright: ignore[reportInvalidTypeForm]
 """The structure of a pytree; type checkers take JAX's name of the class for a variable."""
 Shapes = tuple[tuple[tuple[int, ...], str], ...]
@@ -213,7 +219,9 @@ class BatchedTraining:
             updates = np.array([self.configurations[n].updates for n in filled], np.int32)
             states, curves = _start(*arguments, seeds, updates)
         program = _advance_updates(*arguments[:3])
-        compiled = program.lower(*arguments[3:], states, curves, np.int32(0), np.int32(0)).compile()
+        lowered = program.lower(*arguments[3:], states, curves, np.int32(0), np.int32(0))
+        on_cpu = self.devices[0].platform == "cpu"
+        compiled = lowered.compile(compiler_options=_sequential() if on_cpu else None)
         seconds = 0.0
         while done < until:
             # Short at first, until it is known how long an update takes.
@@ -314,6 +322,15 @@ def policy_structure(configuration: Configuration) -> tuple[Hashable, Hashable, 
     return StaticTask(configuration.task), algorithm[1], shapes
 
 
+def untrained_policy(algorithm: Algorithm, task: Task) -> Policy:
+    """Return the shapes and dtypes of the policies that an algorithm learns; nothing compiles."""
+
+    def initial(key: Key[Array, ""]) -> Policy:
+        return algorithm.policy(task, algorithm.init(task, key, 1))
+
+    return jax.eval_shape(initial, jax.eval_shape(lambda: jax.random.key(0)))
+
+
 def _structure_of(configuration: Configuration) -> _Structure:
     # A power of two: runs of other lengths share the program.
     capacity = max(64, power_of_two(configuration.updates))
@@ -341,6 +358,11 @@ def _over_lanes(layout: _Layout, one: Callable[..., PyTree], shared: int) -> Cal
         return spread_over_devices(on_device, split, layout.devices)(*arguments)
 
     return spread
+
+
+@lru_cache(1)
+def _sequential() -> dict[str, str]:
+    return known_options(_SEQUENTIAL)
 
 
 @jit_each(3)

@@ -1,7 +1,8 @@
 """Environments side by side, each with a new episode as soon as its last one ends.
 
     episodes = start_episodes(task, key, environments=8)
-    episodes, transition = advance(task, episodes, actions, key)
+    keys = step_keys(key, horizon=128, environments=8)
+    episodes, transition = advance(task, episodes, actions, keys[0])
     progress(transitions)                      # the episodes that ended in an update
 
 A transition keeps the observation after its step and *before* the reset. The value of an episode
@@ -54,8 +55,20 @@ class Transition(NamedTuple):
 
 def start_episodes(task: Task, key: Key[Array, ""], environments: int) -> Episodes:
     """Start an episode in each of this many environments."""
-    state = jax.vmap(task.reset)(jax.random.split(key, environments))
-    return Episodes(state, jnp.zeros(environments, jnp.int32), jnp.zeros(environments))
+    return _start(task, jax.random.split(key, environments))
+
+
+def _start(task: Task, keys: Key[Array, " environments"]) -> Episodes:
+    state = jax.vmap(task.reset)(keys)
+    return Episodes(state, jnp.zeros(len(keys), jnp.int32), jnp.zeros(len(keys)))
+
+
+def step_keys(key: Key[Array, ""], horizon: int, environments: int) -> Key[Array, "h e 2"]:
+    """Return the random keys for `horizon` calls of `advance`.
+
+    All at once: in a loop, random bits of a few lanes would cost as much as the network.
+    """
+    return jax.random.split(key, (horizon, environments, 2))
 
 
 def observation_size(task: Task, episodes: Episodes) -> int:
@@ -64,20 +77,18 @@ def observation_size(task: Task, episodes: Episodes) -> int:
 
 
 def advance(
-    task: Task, episodes: Episodes, action: Shaped[Array, "environments ..."], key: Key[Array, ""]
-) -> tuple[Episodes, Transition]:
+    task: Task, episodes: Episodes, action: Shaped[Array, "environments ..."],
+    keys: Key[Array, "environments 2"],
+) -> tuple[Episodes, Transition]:  # fmt: skip
     """Take one step of each environment.
 
     **Arguments:**
     - `episodes`: the episodes before the step.
     - `action`: the action of each environment, in the form of `task.step`.
-    - `key`: a random key for this step of all environments.
+    - `keys`: random keys of `step_keys` for this step and the reset that may follow.
     **Returns:** the episodes after the step, with new ones where it ended one; the transition.
     """
-    step_key, reset_key = jax.random.split(key)
-    environments = len(episodes.age)
-    step_keys = jax.random.split(step_key, environments)
-    state, reward, terminated = jax.vmap(task.step)(step_keys, episodes.state, action)
+    state, reward, terminated = jax.vmap(task.step)(keys[:, 0], episodes.state, action)
     reward = jnp.asarray(reward, jnp.float32)
     age, total = episodes.age + 1, episodes.total + reward
     ends = Ends(terminated, age >= task.time_limit)
@@ -85,7 +96,7 @@ def advance(
     transition = Transition(reward, jax.vmap(task.observe)(state), ends, total)
 
     def reset() -> Episodes:
-        fresh = start_episodes(task, reset_key, environments)
+        fresh = _start(task, keys[:, 1])
 
         def select(new: Shaped[Array, "..."], old: Shaped[Array, "..."]) -> Shaped[Array, "..."]:
             over = transition.over.reshape(-1, *[1] * (old.ndim - 1))

@@ -14,14 +14,16 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, Key, PyTree, Shaped
 
-from verifai_jax.addons.rl.advantage import Ends, advantages
-from verifai_jax.addons.rl.algorithm import Number, Progress, check_values, static_field
+from verifai_jax.addons.rl.advantage import advantages
+from verifai_jax.addons.rl.algorithm import Number, Progress, Vectorised, check_values, static_field
 from verifai_jax.addons.rl.experience import (
     Episodes,
     Transition,
+    advance,
     observation_size,
     progress,
     start_episodes,
+    step_keys,
 )
 from verifai_jax.addons.rl.observations import (
     ObservationStatistics,
@@ -29,16 +31,16 @@ from verifai_jax.addons.rl.observations import (
     normalise,
     update,
 )
-from verifai_jax.addons.rl.on_policy import minibatch_epochs
+from verifai_jax.addons.rl.on_policy import minibatch_epochs, minibatch_network
 from verifai_jax.addons.rl.optimizer import adam, annealed
-from verifai_jax.addons.rl.task.task import State, Task
+from verifai_jax.addons.rl.task.task import Task
 from verifai_jax.systems.actions import Action, Continuous, Discrete
 from verifai_jax.systems.policy import Layers, Policy, network, new_layers, scale_to_range
 
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
-class PPO:
+class PPO(Vectorised):
     """Proximal policy optimisation, for discrete and continuous actions, with its hyper-parameters.
 
     - `learning_rate`: the learning rate of Adam; falls linearly to 0 over the training if `anneal`.
@@ -72,11 +74,6 @@ class PPO:
     normalise: bool = static_field(False)
     anneal: bool = static_field(True)
 
-    @property
-    def steps_per_update(self) -> int:
-        """Number of environment steps in one update."""
-        return self.environments * self.horizon
-
     def check(self) -> None:
         """Refuse invalid hyper-parameters.
 
@@ -88,13 +85,7 @@ class PPO:
         check_values(self, fractions, lambda value: 0 <= float(value) <= 1, "between 0 and 1")
         weights = ("entropy", "value_weight")
         check_values(self, weights, lambda value: float(value) >= 0, "at least 0")
-        counts = ("environments", "horizon", "epochs", "minibatches")
-        check_values(self, counts, lambda value: value >= 1, "at least 1")
-        steps = self.steps_per_update
-        wanted = f"a divisor of environments * horizon = {steps}"
-        check_values(self, ["minibatches"], lambda value: steps % value == 0, wanted)
-        widths = ("hidden", "value_hidden")
-        check_values(self, widths, lambda value: all(w >= 1 for w in value), "positive widths")
+        self.check_shapes("epochs", "minibatches")
 
     def init(self, task: Task, key: Key[Array, ""], updates: int | Int[Array, ""]) -> "PPOState":
         """Make the state before the first of `updates` updates."""
@@ -171,7 +162,7 @@ class PPOState(NamedTuple):
 
 
 class Experience(NamedTuple):
-    """Steps of the environments, `[environments, horizon]`.
+    """Steps of the environments, `[horizon, environments]`.
 
     - `observation`: the policy's input.
     - `action`: an index, or a vector scaled to [-1, 1].
@@ -205,82 +196,59 @@ class Minibatch(NamedTuple):
 def _collect(
     ppo: PPO, task: Task, state: PPOState, key: Key[Array, ""]
 ) -> tuple[Episodes, Experience]:
-    """Collect experience `[environments, horizon]`, with a new episode where one ends."""
-    log_std = state.weights.log_std
+    """Collect experience `[horizon, environments]`, with a new episode where one ends."""
+    log_std, action = state.weights.log_std, task.action
+    noise_key, step_key = jax.random.split(key)
+    shape = (ppo.horizon, ppo.environments, state.weights.policy[-1][1].shape[0])
+    draw = jax.random.gumbel if isinstance(action, Discrete) else jax.random.normal
 
     def step(
-        episode: tuple[State, Int[Array, ""], Float[Array, ""]],
-        drawn: tuple[Float[Array, " outputs"], Key[Array, ""], Key[Array, ""]],
-    ) -> tuple[tuple[State, Int[Array, ""], Float[Array, ""]], Experience]:
-        before, age, total = episode
-        noise, step_key, reset_key = drawn
-        observation = task.observe(before)
-        outputs = network(
-            state.weights.policy, normalise(state.statistics, observation, ppo.normalise)
-        )
-        action = _explore(task.action, outputs, log_std, noise)
-        taken = action if isinstance(task.action, Discrete) else scale_to_range(task.action, action)
-        after, reward, terminated = task.step(step_key, before, taken)
-        age, total = age + 1, total + reward
-        ends = Ends(terminated, age >= task.time_limit)
-        over = ends.terminated | ends.truncated
-        experience = Experience(
-            observation=observation,
-            action=action,
-            outputs=outputs,
-            transition=Transition(
-                jnp.asarray(reward, jnp.float32), task.observe(after), ends, total
-            ),
-        )
-        fresh = (task.reset(reset_key), jnp.int32(0), jnp.zeros(()))
-        return jax.tree.map(
-            lambda new, old: jnp.where(over, new, old), fresh, (after, age, total)
-        ), experience
+        episodes: Episodes,
+        drawn: tuple[Float[Array, "environments outputs"], Key[Array, "environments 2"]],
+    ) -> tuple[Episodes, Experience]:
+        noise, keys = drawn
+        # Without the barrier XLA would make the first product of parts of the state, slowly.
+        observation = jax.lax.optimization_barrier(jax.vmap(task.observe)(episodes.state))
+        normalised = normalise(state.statistics, observation, ppo.normalise)
+        outputs = network(state.weights.policy, normalised)
+        if isinstance(action, Discrete):
+            chosen = taken = jnp.argmax(noise + outputs, axis=-1).astype(jnp.int32)
+        else:
+            assert log_std is not None
+            chosen = outputs + jnp.exp(log_std) * noise
+            taken = scale_to_range(action, chosen)
+        episodes, transition = advance(task, episodes, taken, keys)
+        return episodes, Experience(observation, chosen, outputs, transition)
 
-    def draw(
-        key: Key[Array, ""],
-    ) -> tuple[Float[Array, " outputs"], Key[Array, ""], Key[Array, ""]]:
-        action_key, step_key, reset_key = jax.random.split(key, 3)
-        return _noise(task.action, action_key), step_key, reset_key
-
-    def one_environment(
-        episode: tuple[State, Int[Array, ""], Float[Array, ""]], key: Key[Array, ""]
-    ) -> tuple[tuple[State, Int[Array, ""], Float[Array, ""]], Experience]:
-        # All at once: random bits of a few lanes at a time would cost as much as the network.
-        drawn = jax.vmap(draw)(jax.random.split(key, ppo.horizon))
-        return jax.lax.scan(step, episode, drawn)
-
-    keys = jax.random.split(key, ppo.environments)
-    episodes = (state.episodes.state, state.episodes.age, state.episodes.total)
-    episodes, experience = jax.vmap(one_environment)(episodes, keys)
-    return Episodes(*episodes), experience
+    keys = step_keys(step_key, ppo.horizon, ppo.environments)
+    return jax.lax.scan(step, state.episodes, (draw(noise_key, shape), keys))
 
 
 def _learn(
     ppo: PPO, task: Task, state: PPOState, experience: Experience, key: Key[Array, ""]
 ) -> tuple[Weights, PyTree]:
     """Take a few epochs of clipped policy and value steps on one stretch of experience."""
-    normalised = jax.vmap(jax.vmap(lambda o: normalise(state.statistics, o, ppo.normalise)))
-    transition = experience.transition
-    observation = normalised(experience.observation)
-    next_observation = normalised(transition.next_observation)
-    critic = jax.vmap(jax.vmap(lambda o: network(state.weights.critic, o)[0]))
-    value = critic(observation)
-    estimate = jax.vmap(advantages, in_axes=(0, 0, 0, 0, None, None))
-    advantage = estimate(
-        transition.reward, value, critic(next_observation), transition.ends, ppo.discount,
-        ppo.gae_lambda,
-    )  # fmt: skip
-    log_std = state.weights.log_std
-    log_probability = jax.vmap(jax.vmap(lambda o, a: _log_probability(task.action, o, log_std, a)))(
-        experience.outputs, experience.action
+    transition, action = experience.transition, task.action
+    observation = normalise(state.statistics, experience.observation, ppo.normalise)
+    next_observation = normalise(state.statistics, transition.next_observation, ppo.normalise)
+    value, next_value = (
+        minibatch_network(state.weights.critic, seen.reshape(-1, seen.shape[-1])).reshape(
+            transition.reward.shape
+        )
+        for seen in (observation, next_observation)
+    )
+    advantage = advantages(
+        transition.reward, value, next_value, transition.ends, ppo.discount, ppo.gae_lambda
     )
     batch = Minibatch(
-        observation=observation, action=experience.action, log_probability=log_probability,
+        observation=observation, action=experience.action,
+        log_probability=_log_probability(
+            action, experience.outputs, state.weights.log_std, experience.action
+        ),
         advantage=advantage, target=advantage + value,
     )  # fmt: skip
     return minibatch_epochs(
-        lambda weights, part: _loss(weights, ppo, task.action, part),
+        lambda weights, part: _loss(weights, ppo, action, part),
         (state.weights, state.moments), batch, key, adam(ppo.max_gradient),
         annealed(ppo.learning_rate, state.done, state.updates, ppo.anneal), ppo.epochs,
         ppo.minibatches,
@@ -288,57 +256,37 @@ def _learn(
 
 
 def _loss(weights: Weights, ppo: PPO, action: Action, part: Minibatch) -> Float[Array, ""]:
-    outputs = jax.vmap(lambda o: network(weights.policy, o))(part.observation)
-    value = jax.vmap(lambda o: network(weights.critic, o)[0])(part.observation)
-    log_probability = jax.vmap(lambda o, a: _log_probability(action, o, weights.log_std, a))(
-        outputs, part.action
-    )
+    outputs = minibatch_network(weights.policy, part.observation)
+    value = minibatch_network(weights.critic, part.observation)[:, 0]
+    log_probability = _log_probability(action, outputs, weights.log_std, part.action)
     advantage = part.advantage
     advantage = (advantage - jnp.mean(advantage)) / (jnp.std(advantage) + 1e-8)
     ratio = jnp.exp(log_probability - part.log_probability)
     clipped = jnp.clip(ratio, 1 - ppo.clip, 1 + ppo.clip)
     surrogate = jnp.mean(jnp.minimum(ratio * advantage, clipped * advantage))  # eq. 7
     value_error = jnp.mean(jnp.square(value - part.target)) / 2
-    entropy = jnp.mean(jax.vmap(lambda o: _entropy(action, o, weights.log_std))(outputs))
+    entropy = jnp.mean(_entropy(action, outputs, weights.log_std))
     return -surrogate + ppo.value_weight * value_error - ppo.entropy * entropy  # eq. 9
 
 
-def _noise(action: Action, key: Key[Array, ""]) -> Float[Array, " outputs"]:
-    """Draw the noise of an action, which does not depend on the network."""
-    if isinstance(action, Discrete):
-        return jax.random.gumbel(key, (action.n,))
-    return jax.random.normal(key, (action.size,))
-
-
-def _explore(
-    action: Action, outputs: Float[Array, " outputs"], log_std: Float[Array, " outputs"] | None,
-    noise: Float[Array, " outputs"],
-) -> Shaped[Array, "..."]:  # fmt: skip
-    """Draw from the distribution that the outputs describe (Gumbel-max if discrete)."""
-    if isinstance(action, Discrete):
-        return jnp.argmax(noise + outputs).astype(jnp.int32)
-    assert log_std is not None
-    return outputs + jnp.exp(log_std) * noise
-
-
 def _log_probability(
-    action: Action, outputs: Float[Array, " outputs"], log_std: Float[Array, " outputs"] | None,
-    taken: Shaped[Array, "..."],
-) -> Float[Array, ""]:  # fmt: skip
+    action: Action, outputs: Float[Array, "*rows outputs"],
+    log_std: Float[Array, " outputs"] | None, taken: Shaped[Array, "..."],
+) -> Float[Array, "*rows"]:  # fmt: skip
     if isinstance(action, Discrete):
         # A choice instead of an index, whose derivative would scatter row by row.
-        chosen = jnp.arange(action.n) == taken
-        return jnp.sum(jnp.where(chosen, jax.nn.log_softmax(outputs), 0.0))
+        chosen = jnp.arange(action.n) == taken[..., None]
+        return jnp.sum(jnp.where(chosen, jax.nn.log_softmax(outputs), 0.0), axis=-1)
     assert log_std is not None
     standard = (taken - outputs) / jnp.exp(log_std)
-    return -jnp.sum(jnp.square(standard) / 2 + log_std + jnp.log(2 * jnp.pi) / 2)
+    return -jnp.sum(jnp.square(standard) / 2 + log_std + jnp.log(2 * jnp.pi) / 2, axis=-1)
 
 
 def _entropy(
-    action: Action, outputs: Float[Array, " outputs"], log_std: Float[Array, " outputs"] | None
-) -> Float[Array, ""]:
+    action: Action, outputs: Float[Array, "*rows outputs"], log_std: Float[Array, " outputs"] | None
+) -> Float[Array, "*#rows"]:
     if isinstance(action, Continuous):
         assert log_std is not None
         return jnp.sum(log_std + (jnp.log(2 * jnp.pi) + 1) / 2)
     log_probability = jax.nn.log_softmax(outputs)
-    return -jnp.sum(jnp.exp(log_probability) * log_probability)
+    return -jnp.sum(jnp.exp(log_probability) * log_probability, axis=-1)

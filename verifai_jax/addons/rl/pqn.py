@@ -20,7 +20,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, Key, PyTree
 
 from verifai_jax.addons.rl.advantage import Ends
-from verifai_jax.addons.rl.algorithm import Number, Progress, check_values, static_field
+from verifai_jax.addons.rl.algorithm import Number, Progress, Vectorised, check_values, static_field
 from verifai_jax.addons.rl.experience import (
     Episodes,
     Transition,
@@ -28,6 +28,7 @@ from verifai_jax.addons.rl.experience import (
     observation_size,
     progress,
     start_episodes,
+    step_keys,
 )
 from verifai_jax.addons.rl.observations import (
     ObservationStatistics,
@@ -35,16 +36,16 @@ from verifai_jax.addons.rl.observations import (
     normalise,
     update,
 )
-from verifai_jax.addons.rl.on_policy import minibatch_epochs
+from verifai_jax.addons.rl.on_policy import minibatch_epochs, minibatch_network
 from verifai_jax.addons.rl.optimizer import adam, annealed
 from verifai_jax.addons.rl.task.task import Task
 from verifai_jax.systems.actions import Discrete
-from verifai_jax.systems.policy import ACTIVATIONS, Layers, Policy, network, new_layers
+from verifai_jax.systems.policy import Layers, Policy, network, new_layers
 
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
-class PQN:
+class PQN(Vectorised):
     """Parallelised Q network, for discrete actions, with its hyper-parameters.
 
     - `learning_rate`: the learning rate of Adam; falls linearly to 0 over the training if `anneal`.
@@ -83,11 +84,6 @@ class PQN:
     normalise: bool = static_field(True)
     anneal: bool = static_field(True)
 
-    @property
-    def steps_per_update(self) -> int:
-        """Number of environment steps in one update."""
-        return self.environments * self.horizon
-
     def check(self) -> None:
         """Refuse invalid hyper-parameters.
 
@@ -98,15 +94,7 @@ class PQN:
         fractions = ("discount", "q_lambda", "epsilon_start", "epsilon_end")
         check_values(self, fractions, lambda value: 0 <= float(value) <= 1, "between 0 and 1")
         check_values(self, ["hold"], lambda value: float(value) >= 1, "at least 1")
-        counts = ("environments", "horizon", "epochs", "minibatches")
-        check_values(self, counts, lambda value: value >= 1, "at least 1")
-        steps = self.steps_per_update
-        wanted = f"a divisor of environments * horizon = {steps}"
-        check_values(self, ["minibatches"], lambda value: steps % value == 0, wanted)
-        widths = lambda value: all(w >= 1 for w in value)  # noqa: E731
-        check_values(self, ["hidden"], widths, "positive widths")
-        known = " or ".join(ACTIVATIONS)
-        check_values(self, ["activation"], lambda value: value in ACTIVATIONS, known)
+        self.check_shapes("epochs", "minibatches")
 
     def init(self, task: Task, key: Key[Array, ""], updates: int | Int[Array, ""]) -> "PQNState":
         """Make the state before the first of `updates` updates."""
@@ -233,20 +221,22 @@ def _collect(
 
     def step(
         carry: tuple[Episodes, Int[Array, " environments"]],
-        drawn: tuple[Float[Array, " environments"], Int[Array, " environments"], Key[Array, ""]],
+        drawn: tuple[
+            Float[Array, " environments"], Int[Array, " environments"], Key[Array, "environments 2"]
+        ],
     ) -> tuple[tuple[Episodes, Int[Array, " environments"]], Experience]:
         episodes, held = carry
-        chance, option, key = drawn
-        observation = jax.vmap(task.observe)(episodes.state)
+        chance, option, keys = drawn
+        observation = jax.lax.optimization_barrier(jax.vmap(task.observe)(episodes.state))
         normalised = normalise(state.statistics, observation, pqn.normalise)
         greedy = jnp.argmax(network(state.layers, normalised, pqn.activation), axis=-1)
         held = next_held(held, chance, option, keep, start)
         action = jnp.where(held >= 0, held, greedy.astype(jnp.int32))
-        episodes, transition = advance(task, episodes, action, key)
+        episodes, transition = advance(task, episodes, action, keys)
         held = jnp.where(transition.over, -1, held)
         return (episodes, held), Experience(observation, action, transition)
 
-    keys = jax.random.split(step_key, pqn.horizon)
+    keys = step_keys(step_key, pqn.horizon, pqn.environments)
     carry = (state.episodes, state.held)
     (episodes, held), experience = jax.lax.scan(step, carry, (chances, options, keys))
     return episodes, held, experience
@@ -298,7 +288,7 @@ def _learn(
 
 
 def _loss(layers: Layers, pqn: PQN, part: Minibatch) -> Float[Array, ""]:
-    values = network(layers, part.observation, pqn.activation)
+    values = minibatch_network(layers, part.observation, pqn.activation)
     # A choice instead of an index, whose derivative would scatter row by row.
     chosen = jnp.arange(values.shape[-1]) == part.action[:, None]
     value = jnp.sum(jnp.where(chosen, values, 0.0), axis=-1)

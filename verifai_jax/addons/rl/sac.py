@@ -19,7 +19,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, Key, PyTree
 
 from verifai_jax.addons.rl import experience
-from verifai_jax.addons.rl.algorithm import Number, Progress, check_values, static_field
+from verifai_jax.addons.rl.algorithm import Number, Progress, Vectorised, check_values, static_field
 from verifai_jax.addons.rl.observations import (
     ObservationStatistics,
     mean_and_scale,
@@ -37,7 +37,6 @@ from verifai_jax.addons.rl.replay_buffer import (
 from verifai_jax.addons.rl.task.task import Task
 from verifai_jax.systems.actions import Continuous
 from verifai_jax.systems.policy import (
-    ACTIVATIONS,
     Layers,
     Policy,
     network,
@@ -54,7 +53,7 @@ Outside these bounds a Gaussian after tanh is nearly constant, or takes almost o
 
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True)
-class SAC:
+class SAC(Vectorised):
     """Soft actor-critic, for continuous actions, with its hyper-parameters.
 
     - `learning_rate`: the learning rate of Adam, for the policy, the critics and the temperature;
@@ -100,11 +99,6 @@ class SAC:
     normalise: bool = static_field(False)
     anneal: bool = static_field(False)
 
-    @property
-    def steps_per_update(self) -> int:
-        """Number of environment steps in one update."""
-        return self.environments * self.horizon
-
     def check(self) -> None:
         """Refuse invalid hyper-parameters.
 
@@ -120,14 +114,9 @@ class SAC:
             self, ["correlation"], lambda value: 0 <= float(value) < 1, "at least 0 and below 1"
         )
         check_values(self, ["warmup"], lambda value: int(value) >= 0, "at least 0")
-        counts = ("environments", "horizon", "learnings", "batch", "capacity")
-        check_values(self, counts, lambda value: value >= 1, "at least 1")
+        self.check_shapes("learnings", "batch", "capacity")
         wanted = f"a multiple of environments = {self.environments}"
         check_values(self, ["capacity"], lambda value: value % self.environments == 0, wanted)
-        widths = ("hidden", "value_hidden")
-        check_values(self, widths, lambda value: all(w >= 1 for w in value), "positive widths")
-        known = " or ".join(ACTIVATIONS)
-        check_values(self, ["activation"], lambda value: value in ACTIVATIONS, known)
 
     def init(self, task: Task, key: Key[Array, ""], updates: int | Int[Array, ""]) -> "SACState":
         """Make the state before the first of `updates` updates."""
@@ -164,11 +153,15 @@ class SAC:
             carry: "SACState",
             numbered: tuple[
                 Int[Array, ""],
-                tuple[Float[Array, "environments actions"], Key[Array, ""], Key[Array, ""]],
+                tuple[
+                    Float[Array, "environments actions"],
+                    Key[Array, "environments 2"],
+                    Key[Array, ""],
+                ],
             ],
         ) -> tuple["SACState", tuple[experience.Transition, Float[Array, "environments k"]]]:
-            number, (noise, step_key, learn_key) = numbered
-            carry, transition, observation = act(self, task, carry, noise, step_key)
+            number, (noise, keys, learn_key) = numbered
+            carry, transition, observation = act(self, task, carry, noise, keys)
             taken = (state.done * self.horizon + number + 1) * self.environments
             carry = jax.lax.cond(
                 taken >= self.warmup, lambda: _learn(self, carry, rate, learn_key), lambda: carry
@@ -179,7 +172,7 @@ class SAC:
         drawn = (
             # All random numbers of the update at once: in the loop each draw would cost its own.
             jax.random.normal(noise_key, (self.horizon, *state.noise.shape)),
-            jax.random.split(step_key, self.horizon),
+            experience.step_keys(step_key, self.horizon, self.environments),
             jax.random.split(learn_key, self.horizon),
         )
         after, (transition, observation) = jax.lax.scan(
@@ -258,7 +251,7 @@ def squash_log_prob(
 
 def act(
     sac: SAC, task: Task, state: SACState, noise: Float[Array, "environments actions"],
-    key: Key[Array, ""],
+    keys: Key[Array, "environments 2"],
 ) -> tuple[SACState, experience.Transition, Float[Array, "environments k"]]:  # fmt: skip
     """Take one step of each environment, and write the transitions to the buffer."""
     observation = jax.vmap(task.observe)(state.episodes.state)
@@ -267,7 +260,7 @@ def act(
     unit = jnp.tanh(mean + jnp.exp(log_std) * state.noise)
     assert isinstance(task.action, Continuous)
     episodes, transition = experience.advance(
-        task, state.episodes, scale_to_range(task.action, unit), key
+        task, state.episodes, scale_to_range(task.action, unit), keys
     )
     new = StoredTransitions(
         observation, transition.next_observation, unit, transition.reward,
@@ -276,10 +269,9 @@ def act(
     # A new episode begins with noise of its own.
     rho = jnp.where(transition.over, 0.0, sac.correlation)[:, None]
     after = state._replace(
-        episodes=episodes,
-        buffer=add(state.buffer, new),
+        episodes=episodes, buffer=add(state.buffer, new),
         noise=rho * state.noise + jnp.sqrt(1 - rho**2) * noise,
-    )
+    )  # fmt: skip
     return after, transition, observation
 
 

@@ -53,10 +53,9 @@ def sweep_page(sweep: Sweep, about: About, problem: object = None) -> Page:
         Claim(
             "C2",
             f"{len(safe):,} of {len(frame):,} policies fail with a probability below {limit}.",
-            ("certificates: fresh samples of the problem's prior",),
-            (MODEL, TOGETHER),
+            ("certificates: fresh samples of the problem's prior",), (MODEL, TOGETHER),
         ),
-    ]
+    ]  # fmt: skip
     names = [*sweep.hyperparameters, *(name for name in COLUMNS if name in frame.columns)]
     best = [*safe.index, *(i for i in frame.index if i not in safe.index)][:MAX_ROWS]
     rows: list[Any] = [

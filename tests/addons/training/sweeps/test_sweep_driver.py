@@ -334,6 +334,27 @@ def test_halving_keeps_the_best_by_return():
     np.testing.assert_array_equal(merged["nominal_return_x"], merged["nominal_return_y"])
 
 
+def test_only_configurations_that_are_shown_to_be_unsafe_end():
+    result = sweep(
+        drifting(), configurations=8, certification=vj.Certification(samples=64),
+        halving=Halving(reduction=1, p=0.3),
+    )  # fmt: skip
+    table, stopped = result.table, result.table["status"] == "stopped"
+    assert set(table.loc[stopped, "steps"]) <= {32, 64}
+    assert 0 < stopped.sum() < 8
+    rates = quick_certificates(
+        None, [result.policy(i) for i in table.index], p=0.3, seed=99, remember=lambda _, f: f(),
+        certification=vj.Certification(samples=20_000),
+    ).rows  # fmt: skip
+    true = np.array([one.failures / one.simulations for one in rates])
+    assert np.all(true[stopped] > 0.3)
+    # The verdict is only open near p.
+    going = ~stopped & (table["steps"] < 128)
+    assert np.all(true[going] < 0.6)
+    ended = set(table.loc[stopped, "configuration"])
+    assert set(table.loc[table["steps"] == 128, "configuration"]) == set(range(8)) - ended
+
+
 @pytest.mark.thorough
 def test_a_search_is_told_how_bad_the_policies_are(monkeypatch):
     told = []
@@ -489,5 +510,7 @@ def test_options_are_refused_first(monkeypatch):
         sweep(drifting({"steps": vj.Categorical(64, 128)}), halving=Halving())
     with pytest.raises(ValueError, match="reduction must be greater than 1; got 1"):
         Halving(1)
+    with pytest.raises(ValueError, match="p must lie between 0 and 1"):
+        Halving(1, p=1.5)
     with pytest.raises(UnknownNameError, match="unknown criterion of halving 'retrun'"):
         Halving(by="retrun")

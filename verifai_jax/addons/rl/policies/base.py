@@ -29,13 +29,12 @@ Compute = Callable[[PyTree, PyTree, PyTree], tuple[Any, PyTree]]
 """A pure function `(weights, observation, memory) -> (outputs, memory)`."""
 Arrays = Mapping[str, np.ndarray]
 ACTIONS = {
-    "outputs": "the outputs themselves",
-    "argmax": "the index of the greatest output",
+    "outputs": "the outputs themselves", "argmax": "the index of the greatest output",
     "positive": "1 where an output is positive, else 0",
     "clip": "the outputs, clipped to low..high",
     "scale": "the outputs, in units of half the range low..high around its middle, clipped",
     "tanh": "tanh of the outputs, in the same units",
-}
+}  # fmt: skip
 """Ways of turning outputs into an action, by name."""
 
 

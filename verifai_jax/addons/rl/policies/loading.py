@@ -57,22 +57,14 @@ FORMATS = (".zip", ".onnx", ".safetensors", ".pt", ".pth", ".npz")
 
 @suggests_options
 def policy(
-    source: Any,
-    *,
-    observation: ArrayLike | None = None,
+    source: Any, *, observation: ArrayLike | None = None,
     normalise: str | Path | tuple[ArrayLike, ArrayLike] | Normaliser | None = None,
-    action: str | None = None,
-    low: ArrayLike | None = None,
-    high: ArrayLike | None = None,
-    activation: str | None = None,
-    network: Network | None = None,
-    layers: Sequence[str] | None = None,
-    output: str | None = None,
-    memory: Mapping[str, str] | None = None,
-    ignore: Sequence[str] = (),
-    stack: int = 1,
+    action: str | None = None, low: ArrayLike | None = None, high: ArrayLike | None = None,
+    activation: str | None = None, network: Network | None = None,
+    layers: Sequence[str] | None = None, output: str | None = None,
+    memory: Mapping[str, str] | None = None, ignore: Sequence[str] = (), stack: int = 1,
     batched: bool = False,
-) -> Policy | OwnPolicy:
+) -> Policy | OwnPolicy:  # fmt: skip
     """Load a policy trained in any framework, as a pure JAX function with its weights.
 
     **Arguments:**

@@ -186,7 +186,6 @@ def _rnn_step(node: Node, f: Any, at: Array, carry: Any, r: Array, bias: Array) 
 
 _STEPS: dict[str, tuple[int, tuple[str, ...], Callable[..., Any]]] = {
     "LSTM": (4, ("Sigmoid", "Tanh", "Tanh"), _lstm_step),
-    "GRU": (3, ("Sigmoid", "Tanh"), _gru_step),
-    "RNN": (1, ("Tanh",), _rnn_step),
-}
+    "GRU": (3, ("Sigmoid", "Tanh"), _gru_step), "RNN": (1, ("Tanh",), _rnn_step),
+}  # fmt: skip
 """The number of gates, the usual activations, and one step of each recurrent layer."""

@@ -123,26 +123,20 @@ _OPERATIONS: dict[str, Callable[[_Stack, Any], object]] = {
     **dict.fromkeys(("LIST", "FROZENSET"), lambda s, a: s.append(s.since_mark())),
     **dict.fromkeys(("APPENDS", "ADDITEMS"), lambda s, a: s.add(s.since_mark())),
     **dict.fromkeys(("REDUCE", "NEWOBJ"), lambda s, a: s.call(*s.take(2))),
-    "MEMOIZE": lambda s, a: s.remember(len(s.memo)),
-    "MARK": lambda s, a: s.append(_MARK),
-    "POP": lambda s, a: s.pop(),
-    "NONE": lambda s, a: s.append(None),
-    "NEWTRUE": lambda s, a: s.append(True),
-    "NEWFALSE": lambda s, a: s.append(False),
-    "EMPTY_DICT": lambda s, a: s.append({}),
-    "EMPTY_TUPLE": lambda s, a: s.append(()),
+    "MEMOIZE": lambda s, a: s.remember(len(s.memo)), "MARK": lambda s, a: s.append(_MARK),
+    "POP": lambda s, a: s.pop(), "NONE": lambda s, a: s.append(None),
+    "NEWTRUE": lambda s, a: s.append(True), "NEWFALSE": lambda s, a: s.append(False),
+    "EMPTY_DICT": lambda s, a: s.append({}), "EMPTY_TUPLE": lambda s, a: s.append(()),
     **{f"TUPLE{n}": lambda s, a, n=n: s.append(tuple(s.take(n))) for n in (1, 2, 3)},
     "TUPLE": lambda s, a: s.append(tuple(s.since_mark())),
     "DICT": lambda s, a: s.append(dict(_pairs(s.since_mark()))),
-    "APPEND": lambda s, a: s.add(s.take(1)),
-    "SETITEM": lambda s, a: s.set(s.take(2)),
+    "APPEND": lambda s, a: s.add(s.take(1)), "SETITEM": lambda s, a: s.set(s.take(2)),
     "SETITEMS": lambda s, a: s.set(s.since_mark()),
     "GLOBAL": lambda s, a: s.append(Name(*a.split(" ", 1))),
     "STACK_GLOBAL": lambda s, a: s.append(Name(*s.take(2))),
-    "NEWOBJ_EX": lambda s, a: s.append(_named(*s.take(3))),
-    "BUILD": lambda s, a: s.build(),
+    "NEWOBJ_EX": lambda s, a: s.append(_named(*s.take(3))), "BUILD": lambda s, a: s.build(),
     "BINPERSID": lambda s, a: s.append(Persistent(s.pop())),
-}
+}  # fmt: skip
 """The action of each operation on the stack; an operation not listed pushes its argument."""
 
 

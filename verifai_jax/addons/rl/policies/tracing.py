@@ -339,10 +339,9 @@ class _Translation:
         if any(any(options["padding"][i]) or options["window_strides"][i] != 1 for i in still):
             raise NotImplementedError
         attributes: dict[str, Any] = {
-            "kernel_shape": kernel,
-            "strides": tuple(options["window_strides"][i] for i in moved),
+            "kernel_shape": kernel, "strides": tuple(options["window_strides"][i] for i in moved),
             "pads": tuple(options["padding"][i][k] for k in (0, 1) for i in moved),
-        }
+        }  # fmt: skip
         if any(options["window_dilation"][i] != 1 for i in moved):
             attributes["dilations"] = tuple(options["window_dilation"][i] for i in moved)
         image = self.node("Transpose", [x], perm=order)

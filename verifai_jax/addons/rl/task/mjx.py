@@ -143,18 +143,11 @@ class MjxTask:
 
 @suggests_options
 def mjx_task(
-    model: object,
-    *,
-    control_period: float,
-    time_limit: int,
-    reward: Reward,
-    observe: Observe | None = None,
-    initial: Initial | None = None,
-    terminate: Terminate | None = None,
-    action: Action | None = None,
-    control: Control | None = None,
-    vary: Vary | None = None,
-) -> MjxTask:
+    model: object, *, control_period: float, time_limit: int, reward: Reward,
+    observe: Observe | None = None, initial: Initial | None = None,
+    terminate: Terminate | None = None, action: Action | None = None,
+    control: Control | None = None, vary: Vary | None = None,
+) -> MjxTask:  # fmt: skip
     """Make a `Task` from a MuJoCo model.
 
     **Arguments:**

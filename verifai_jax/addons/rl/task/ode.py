@@ -116,16 +116,10 @@ class OdeTask:
 
 @suggests_options
 def ode_task(
-    loop: Ode,
-    action: Action,
-    *,
-    reward: Reward,
-    control: Control | None = None,
-    observe: Observe | None = None,
-    features: Mapping[str, ArrayLike] | DrawFeatures | None = None,
-    time_limit: int | None = None,
-    weights: Mapping[str, float] | None = None,
-) -> OdeTask:
+    loop: Ode, action: Action, *, reward: Reward, control: Control | None = None,
+    observe: Observe | None = None, features: Mapping[str, ArrayLike] | DrawFeatures | None = None,
+    time_limit: int | None = None, weights: Mapping[str, float] | None = None,
+) -> OdeTask:  # fmt: skip
     """Make a `Task` from an `ode`, with its start, dynamics, step, control period and end.
 
     The loop's own controller is not used.

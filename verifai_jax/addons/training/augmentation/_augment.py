@@ -43,23 +43,12 @@ DEFAULT_ARMS = ("none", "random", "counterexamples")
 @suggests_options
 @reproducible_settings()
 def augment(
-    task: SupervisedTask,
-    arms: Sequence[str] | str | None = None,
-    *,
-    initial: int = 1000,
-    added: int = 200,
-    steps: tuple[int, int] = (600, 300),
-    search: str | Search = "uniform",
-    budget: int | None = None,
-    seeds: int = 5,
-    seed: int = 0,
-    test: int = 4096,
-    hard: int = 400,
-    confidence: float = 0.95,
-    folder: str | Path | None = None,
-    progress: bool | None = None,
+    task: SupervisedTask, arms: Sequence[str] | str | None = None, *, initial: int = 1000,
+    added: int = 200, steps: tuple[int, int] = (600, 300), search: str | Search = "uniform",
+    budget: int | None = None, seeds: int = 5, seed: int = 0, test: int = 4096, hard: int = 400,
+    confidence: float = 0.95, folder: str | Path | None = None, progress: bool | None = None,
     even_if_changed: bool = False,
-) -> Augmentation:
+) -> Augmentation:  # fmt: skip
     """Compare ways to add training data over several seeds, with paired data, weights and tests.
 
     All arms train the same base network further, with the same number of steps:

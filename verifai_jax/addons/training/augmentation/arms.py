@@ -151,17 +151,10 @@ def rules_kept(base: Base) -> Addition:
 
 
 ARMS: dict[str, Arm] = {
-    "none": none,
-    "random": random,
-    "standard": standard,
-    "counterexamples": counterexamples,
-    "table_random": table_random,
-    "table_closest": table_closest,
-    "table_pca": table_pca,
-    "rules": rules_,
-    "pca_kept": pca_kept,
-    "rules_kept": rules_kept,
-}
+    "none": none, "random": random, "standard": standard, "counterexamples": counterexamples,
+    "table_random": table_random, "table_closest": table_closest, "table_pca": table_pca,
+    "rules": rules_, "pca_kept": pca_kept, "rules_kept": rules_kept,
+}  # fmt: skip
 """Arms by name."""
 FROM_TABLE = tuple(name for name in ARMS if name not in ("none", "random", "standard"))
 """Arms that need the error table."""

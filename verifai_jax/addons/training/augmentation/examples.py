@@ -52,10 +52,9 @@ class Examples:
         if not len(other):
             return self
         inputs, labels = jax.tree.map(
-            lambda *leaves: np.concatenate(leaves),
-            (self.inputs, self.labels),
+            lambda *leaves: np.concatenate(leaves), (self.inputs, self.labels),
             (other.inputs, other.labels),
-        )
+        )  # fmt: skip
         return Examples(pd.concat([self.rows, other.rows], ignore_index=True), inputs, labels)
 
 

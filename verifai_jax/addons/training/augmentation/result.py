@@ -177,8 +177,4 @@ class Augmentation(InNotebook):
             (made / SUMMARY).write_text(f"{self.summary()}\n", encoding="utf-8")
         return path
 
-    def __str__(self) -> str:
-        return self.summary()
-
-    def __repr__(self) -> str:
-        return self.summary()
+    __str__ = __repr__ = summary

@@ -115,17 +115,11 @@ class Study:
         options["search"] = repr(plan.search)
         options["hard"] = 0 if hard is None else len(decode_frame(hard))
         return Augmentation(
-            task=self.task,
-            arms=tuple(arms),
-            table=pd.DataFrame(self.rows),
+            task=self.task, arms=tuple(arms), table=pd.DataFrame(self.rows),
             added=pd.concat(added, ignore_index=True) if added else pd.DataFrame(),
-            error_tables=self.tables,
-            weights=self.weights,
-            options=options,
-            confidence=confidence,
-            complete=complete,
-            version=__version__,
-        )
+            error_tables=self.tables, weights=self.weights, options=options, confidence=confidence,
+            complete=complete, version=__version__,
+        )  # fmt: skip
 
     @property
     def metrics(self) -> tuple[str, ...]:
@@ -236,14 +230,10 @@ class Seed:
             return self._finished(None, Addition(_no_rows(self.task), 0, why), np.zeros(0), None)
         nothing = _no_rows(self.task).assign(rho=0.0, violated=False, status="ok")
         base = Base(
-            task=self.task,
-            workshop=self.workshop,
-            weights=self.base,
-            initial=self.initial,
-            table=self.table if arm in FROM_TABLE else nothing,
-            added=self.plan.added,
+            task=self.task, workshop=self.workshop, weights=self.base, initial=self.initial,
+            table=self.table if arm in FROM_TABLE else nothing, added=self.plan.added,
             key=self.key(keys.CHOICE),
-        )
+        )  # fmt: skip
         addition = ARMS[arm](base)
         examples = self.workshop.render(addition.rows)
         if addition.transformed:
@@ -262,13 +252,12 @@ class Seed:
         wrongness: Float[np.ndarray, " n"], weights: Weights | None,
     ) -> "Finished":  # fmt: skip
         entry: dict[str, Any] = {
-            "status": NOT_FINITE if numbers is None else TRAINED,
-            "added": len(addition.rows),
+            "status": NOT_FINITE if numbers is None else TRAINED, "added": len(addition.rows),
             "wrong_added": float((wrongness > 0).mean()) if len(wrongness) else math.nan,
             "rendered": addition.rendered,
             **(dict.fromkeys(self.study.metrics, math.nan) if numbers is None else numbers),
             "why": addition.why,
-        }
+        }  # fmt: skip
         arrays = {name: np.asarray(value) for name, value in entry.items()}
         return Finished(arrays, addition.rows.assign(wrongness=wrongness), weights)
 

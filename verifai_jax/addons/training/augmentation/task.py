@@ -94,40 +94,25 @@ class SupervisedTask:
     black_box: bool = False
 
     def __init__(
-        self,
-        name: str,
-        space: FeatureSpace | Mapping[str, Domain],
-        render: Callable[[Features], Any],
-        label: Callable[[Features], Any],
+        self, name: str, space: FeatureSpace | Mapping[str, Domain],
+        render: Callable[[Features], Any], label: Callable[[Features], Any],
         train: Callable[[Inputs, Labels, Weights | None, int, Key[Array, ""]], Weights],
-        predict: Callable[[Weights, Inputs], Any],
-        wrongness: Callable[[Any, Any], Any],
-        present: Callable[[Any], Any] | None = None,
-        detected: Callable[[Any], Any] | None = None,
+        predict: Callable[[Weights, Inputs], Any], wrongness: Callable[[Any, Any], Any],
+        present: Callable[[Any], Any] | None = None, detected: Callable[[Any], Any] | None = None,
         transform: Transformation | None = None,
         training_space: FeatureSpace | Mapping[str, Domain] | None = None,
         measures: Mapping[str, Callable[[Weights, Key[Array, ""]], float]] | None = None,
-        lanes: int = 16,
-        black_box: bool = False,
-    ) -> None:
+        lanes: int = 16, black_box: bool = False,
+    ) -> None:  # fmt: skip
         if not isinstance(name, str) or not name.strip():
             raise TaskError(f"a supervised task needs a name; got {name!r}")
         values: dict[str, Any] = {
-            "name": name,
-            "space": _as_space("space", space),
-            "render": render,
-            "label": label,
-            "train": train,
-            "predict": predict,
-            "wrongness": wrongness,
-            "present": present,
-            "detected": detected,
-            "transform": transform,
-            "training_space": training_space,
-            "measures": dict(measures or {}),
-            "lanes": check_count("lanes", lanes, error=TaskError),
+            "name": name, "space": _as_space("space", space), "render": render, "label": label,
+            "train": train, "predict": predict, "wrongness": wrongness, "present": present,
+            "detected": detected, "transform": transform, "training_space": training_space,
+            "measures": dict(measures or {}), "lanes": check_count("lanes", lanes, error=TaskError),
             "black_box": bool(black_box),
-        }
+        }  # fmt: skip
         taken = next((name for name in values["space"].columns if name in _RESERVED), None)
         if taken is not None:
             raise TaskError(

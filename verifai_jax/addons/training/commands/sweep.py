@@ -62,20 +62,11 @@ _MAX_ROWS = 12
 @arguments.PICTURES
 @fail_on(unsafe="unless a policy is shown to be safe")
 def sweep(
-    target: str | None,
-    configurations: int | None,
-    options: tuple[str, ...],
-    nominal: tuple[str, ...],
-    max_seconds: float | None,
-    cache: Path | None,
-    resume: Path | None,
-    even_if_changed: bool,
-    folder: Path | None,
-    cluster: str | None,
-    pictures: bool,
-    fail_on: Gate | None,
-    **given: Any,
-) -> None:
+    target: str | None, configurations: int | None, options: tuple[str, ...],
+    nominal: tuple[str, ...], max_seconds: float | None, cache: Path | None, resume: Path | None,
+    even_if_changed: bool, folder: Path | None, cluster: str | None, pictures: bool,
+    fail_on: Gate | None, **given: Any,
+) -> None:  # fmt: skip
     """Train configurations of the study TARGET (specs/FILE.py:NAME), certify their policies."""
     from verifai_jax import RunOn, Stop, Study
     from verifai_jax.addons.training.sweeps._sweep import sweep as run_sweep
@@ -102,12 +93,9 @@ def sweep(
         )
     # Read by a later --resume.
     note = {
-        "target": target,
-        "configurations": configurations,
-        "given": given,
-        "options": list(options),
-        "nominal": list(nominal),
-    }
+        "target": target, "configurations": configurations, "given": given,
+        "options": list(options), "nominal": list(nominal),
+    }  # fmt: skip
     keywords = _keywords(given, options)
     goes_on = partial(
         _resuming, target=target, cache=cache, max_seconds=max_seconds, cluster=cluster
@@ -120,15 +108,10 @@ def sweep(
         ):
             folder = path
             result = run_sweep(
-                study,
-                configurations=configurations,
-                folder=folder if cache is None else cache,
-                stop=Stop(seconds=max_seconds),
-                note=note,
-                run_on=RunOn(executor=executor),
-                even_if_changed=even_if_changed,
-                **keywords,
-            )
+                study, configurations=configurations, folder=folder if cache is None else cache,
+                stop=Stop(seconds=max_seconds), note=note, run_on=RunOn(executor=executor),
+                even_if_changed=even_if_changed, **keywords,
+            )  # fmt: skip
             record = replace(result.record, options={**result.record.options, "target": target})
             result = replace(result, record=record)
             say(result)
@@ -141,14 +124,10 @@ def sweep(
         raise
     say(f"  table        {folder / 'table.parquet'}")
     give_result(
-        study=study.name,
-        target=target,
-        policies=result.table,
-        safe=[int(row) for row in result.safe.index],
-        complete=record.complete,
-        seconds=record.seconds,
-        folder=folder,
-    )
+        study=study.name, target=target, policies=result.table,
+        safe=[int(row) for row in result.safe.index], complete=record.complete,
+        seconds=record.seconds, folder=folder,
+    )  # fmt: skip
     if pictures and record.certified:
         draw(result, folder / "sweep.png")
     if not record.complete:

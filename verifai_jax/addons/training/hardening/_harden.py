@@ -99,23 +99,13 @@ class Plan:
 @reproducible_settings()
 @shows_progress("hardening")
 def harden(
-    study: Study | Trainer | object,
-    problem: Callable[[Any], Problem] | None = None,
-    *,
-    hyperparameters: Mapping[str, object] | None = None,
-    rounds: int = 8,
-    steps: int | None = None,
-    further: FurtherTraining | None = None,
-    p: float | None = None,
-    certification: Certification | None = None,
-    episodes: int = 256,
-    baseline: bool = False,
-    seed: int = 0,
-    stop: Stop | None = None,
-    folder: str | Path | None = None,
-    even_if_changed: bool = False,
-    progress: bool | None = None,
-) -> Hardening:
+    study: Study | Trainer | object, problem: Callable[[Any], Problem] | None = None, *,
+    hyperparameters: Mapping[str, object] | None = None, rounds: int = 8, steps: int | None = None,
+    further: FurtherTraining | None = None, p: float | None = None,
+    certification: Certification | None = None, episodes: int = 256, baseline: bool = False,
+    seed: int = 0, stop: Stop | None = None, folder: str | Path | None = None,
+    even_if_changed: bool = False, progress: bool | None = None,
+) -> Hardening:  # fmt: skip
     """Train a policy, then train it further on its failures until it is certified.
 
     The first training uses the task's own episodes. Then each round attacks and certifies the

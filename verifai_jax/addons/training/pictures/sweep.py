@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import Bool, Float
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
@@ -25,10 +25,9 @@ from verifai_jax.statistics.confidence_sequences import verdict_kind
 if TYPE_CHECKING:
     import pandas as pd
 LOOKS = {
-    "safe": (style.SAFE, "o"),
-    "undecided": (style.WITHOUT_VERDICT, "D"),
+    "safe": (style.SAFE, "o"), "undecided": (style.WITHOUT_VERDICT, "D"),
     "unsafe": (style.FAILING, "X"),
-}
+}  # fmt: skip
 """Colour and marker of each verdict."""
 RETURN = "#31688e"
 """Colour of the return."""
@@ -91,17 +90,10 @@ def _draw_safety(axes: Axes, sweep: Sweep) -> None:
             if weight == 1.0:
                 _draw_intervals(axes, rows, colour, 0.35 if crowded else 0.6)
             axes.scatter(
-                rows["nominal_return"],
-                rows["failure_rate"],
-                c=colour,
-                marker=marker,
-                s=26 if crowded else 42,
-                alpha=weight,
-                edgecolors="white",
-                linewidths=0.6,
-                label=f"{verdict}{when} ({len(rows)})",
-                zorder=2 + weight,
-            )
+                rows["nominal_return"], rows["failure_rate"], c=colour, marker=marker,
+                s=26 if crowded else 42, alpha=weight, edgecolors="white", linewidths=0.6,
+                label=f"{verdict}{when} ({len(rows)})", zorder=2 + weight,
+            )  # fmt: skip
     front = shown.loc[shown.index.isin(sweep.pareto().index)].sort_values("nominal_return")
     axes.scatter(
         front["nominal_return"], front["failure_rate"], facecolors="none", edgecolors=style.BOUND,
@@ -128,15 +120,10 @@ def _draw_safety(axes: Axes, sweep: Sweep) -> None:
 def _draw_intervals(axes: Axes, rows: "pd.DataFrame", colour: str, alpha: float) -> None:
     rate = rows["failure_rate"]
     axes.errorbar(
-        rows["nominal_return"],
-        rate,
-        yerr=[rate - rows["failure_low"], rows["failure_high"] - rate],
-        fmt="none",
-        ecolor=colour,
-        elinewidth=0.9,
-        alpha=alpha,
-        zorder=1,
-    )
+        rows["nominal_return"], rate,
+        yerr=[rate - rows["failure_low"], rows["failure_high"] - rate], fmt="none", ecolor=colour,
+        elinewidth=0.9, alpha=alpha, zorder=1,
+    )  # fmt: skip
 
 
 def _legend_below(axes: Axes, columns: int) -> None:
@@ -210,28 +197,17 @@ def _draw_curves(axes: Axes, sweep: Sweep, rows: list[int]) -> None:
         trace, steps = sweep.curve(end), int(entry["steps"])
         clock, values = np.asarray(trace.clock()), np.asarray(trace["return"])
         axes.plot(
-            clock / 1000,
-            values,
-            color=colour,
-            marker=marker,
-            markevery=max(1, len(clock) // 8),
-            markersize=4,
-            linewidth=1.5,
-            linestyle="--" if again else "-",
+            clock / 1000, values, color=colour, marker=marker, markevery=max(1, len(clock) // 8),
+            markersize=4, linewidth=1.5, linestyle="--" if again else "-",
             label=f"row {row}, {verdict}: {_failures(entry)}",
-        )
+        )  # fmt: skip
         if end != row:
             at = min(int(np.searchsorted(clock, steps)), len(clock) - 1)
             axes.plot(
-                clock[at] / 1000,
-                values[at],
-                color=colour,
-                marker="*",
-                markersize=12,
-                markeredgecolor=style.BOUND,
-                linestyle="none",
+                clock[at] / 1000, values[at], color=colour, marker="*", markersize=12,
+                markeredgecolor=style.BOUND, linestyle="none",
                 label=f"row {row}: checkpoint at {steps:,} steps",
-            )
+            )  # fmt: skip
     axes.set_xlabel("environment steps in thousands")
     axes.set_ylabel("mean return of training episodes")
     axes.set_title("Learning curves", fontsize=10)
@@ -248,35 +224,17 @@ def _failures(row: Mapping[str, Any]) -> str:
 def _draw_shares(axes: Axes, importance: HyperparameterImportance) -> None:
     """Draw the share of the variance that each hyper-parameter explains."""
     targets = [target for target in importance.scores if importance.is_reliable(target)]
-    targets = targets or list(importance.scores)
-    shown = importance.table.head(MAX_BARS)
-    height, position = 0.76 / len(targets), np.arange(len(shown))
-    for k, target in enumerate(targets):
-        colour, what, hatch = BARS[target]
-        at = position + (k - (len(targets) - 1) / 2) * height
-        axes.barh(
-            at,
-            shown[f"{target}_total"].to_numpy(float),
-            height * 0.9,
-            color=colour,
-            hatch=hatch,
-            edgecolor="white",
-            linewidth=0,
-            label=f"{what} (model: R² {importance.scores[target]:z.2f})",
-        )
+    targets, shown = targets or list(importance.scores), importance.table.head(MAX_BARS)
+    for target, at, height in _draw_bars(axes, shown, targets, "total", importance.scores):
         alone = shown[f"{target}_first"].to_numpy(float)
         axes.vlines(
             alone, at - 0.45 * height, at + 0.45 * height, color=style.BOUND, linewidth=1.6,
-            label="without interactions" if k == len(targets) - 1 else "",
+            label="without interactions" if target == targets[-1] else "",
         )  # fmt: skip
-    axes.set_yticks(position, [style.wrap_name(str(name), 18) for name in shown.index])
-    axes.invert_yaxis()
     axes.set_xlim(0, 1.02)
     axes.set_xticks([0, 0.25, 0.5, 0.75, 1], ["0", "25 %", "50 %", "75 %", "100 %"])
     axes.set_xlabel("share of the variance, with interactions")
     axes.set_title("Importance", fontsize=10)
-    style.tidy(axes)
-    axes.grid(visible=False, axis="y")
     _legend_below(axes, 1)
 
 
@@ -285,30 +243,34 @@ def _draw_trends(axes: Axes, importance: HyperparameterImportance) -> None:
     names = [f"{target}_trend" for target in importance.scores]
     shown = importance.table.loc[importance.table[names].notna().any(axis=1)]
     order = shown[names].abs().max(axis=1).sort_values(ascending=False, kind="stable").index
-    shown = shown.loc[order[:MAX_BARS]]
-    height, position = 0.76 / len(names), np.arange(len(shown))
     chance = max(importance.chance.values())
     axes.axvspan(
         -chance, chance, color=style.WITHOUT_VERDICT, alpha=0.18, linewidth=0, label="by chance"
     )
-    for k, target in enumerate(importance.scores):
-        colour, what, hatch = BARS[target]
-        axes.barh(
-            position + (k - (len(names) - 1) / 2) * height,
-            shown[f"{target}_trend"].to_numpy(float),
-            height * 0.9,
-            color=colour,
-            hatch=hatch,
-            edgecolor="white",
-            linewidth=0,
-            label=what,
-        )
+    _draw_bars(axes, shown.loc[order[:MAX_BARS]], list(importance.scores), "trend", {})
     axes.axvline(0, color=style.BOUND, linewidth=0.8)
-    axes.set_yticks(position, [style.wrap_name(str(name), 18) for name in shown.index])
-    axes.invert_yaxis()
     axes.set_xlim(-1, 1)
     axes.set_xlabel("rank correlation with each alone")
     axes.set_title("Correlations (no model predicts)", fontsize=10)
+    _legend_below(axes, 3)
+
+
+def _draw_bars(
+    axes: Axes, shown: "pd.DataFrame", targets: list[str], column: str, scores: Mapping[str, float]
+) -> list[tuple[str, Float[np.ndarray, " rows"], float]]:
+    """Draw a bar for each hyper-parameter and target; return each target's places and height."""
+    height, position, drawn = 0.76 / len(targets), np.arange(len(shown)), []
+    for k, target in enumerate(targets):
+        colour, what, hatch = BARS[target]
+        told = f"{what} (model: R² {scores[target]:z.2f})" if scores else what
+        at, widths = position + (k - (len(targets) - 1) / 2) * height, shown[f"{target}_{column}"]
+        axes.barh(
+            at, widths.to_numpy(float), height * 0.9, color=colour, hatch=hatch, edgecolor="white",
+            linewidth=0, label=told,
+        )  # fmt: skip
+        drawn.append((target, at, height))
+    axes.set_yticks(position, [style.wrap_name(str(name), 18) for name in shown.index])
+    axes.invert_yaxis()
     style.tidy(axes)
     axes.grid(visible=False, axis="y")
-    _legend_below(axes, 3)
+    return drawn

@@ -6,6 +6,8 @@ sweep.best, sweep.safe, sweep.importance()
 
 from verifai_jax.addons.training.sweeps._sweep import sweep as sweep
 from verifai_jax.addons.training.sweeps.curves import curve_robustness as curve_robustness
+from verifai_jax.addons.training.sweeps.exported import TrainedConfiguration as TrainedConfiguration
+from verifai_jax.addons.training.sweeps.exported import load_configuration as load_configuration
 from verifai_jax.addons.training.sweeps.halving import Halving as Halving
 from verifai_jax.addons.training.sweeps.optuna import OptunaSampler as OptunaSampler
 from verifai_jax.addons.training.sweeps.record import SweepRecord as SweepRecord

@@ -9,6 +9,7 @@ with the same folder, it reads the finished ones, computes the rest, and gives t
 """
 
 from collections.abc import Iterable, Mapping
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -35,23 +36,13 @@ from verifai_jax.statistics.stopping import Stop
 
 @suggests_options
 def sweep(
-    study: Study,
-    search: str | Search | OptunaSampler = "halton",
-    configurations: int = 32,
-    *,
-    seed: int = 0,
-    certification: Certification | None = None,
-    halving: Halving | None = None,
-    batch: int | None = None,
-    episodes: int = EPISODES,
-    stop: Stop | None = None,
-    folder: str | Path | None = None,
-    run_on: RunOn | None = None,
-    note: Mapping[str, Any] | None = None,
-    callbacks: Iterable[Callback] = (),
-    progress: bool | None = None,
-    even_if_changed: bool = False,
-) -> Sweep:
+    study: Study, search: str | Search | OptunaSampler = "halton", configurations: int = 32, *,
+    seed: int = 0, certification: Certification | None = None, halving: Halving | None = None,
+    batch: int | None = None, episodes: int = EPISODES, stop: Stop | None = None,
+    folder: str | Path | None = None, run_on: RunOn | None = None,
+    note: Mapping[str, Any] | None = None, callbacks: Iterable[Callback] = (),
+    progress: bool | None = None, even_if_changed: bool = False,
+) -> Sweep:  # fmt: skip
     """Train configurations of a study's hyper-parameters and certify their policies.
 
     A row of the result is a policy: a configuration, trained with one seed, at one checkpoint. The
@@ -98,16 +89,12 @@ def sweep(
     )
     attack = certified.attack
     options: dict[str, Any] = {
-        "search": proposer.to_json(),
-        "seed": seed,
-        "samples": certified.samples,
-        "confidence": certified.confidence,
-        "budget": certified.budget,
+        "search": proposer.to_json(), "seed": seed, "samples": certified.samples,
+        "confidence": certified.confidence, "budget": certified.budget,
         "attack": attack if isinstance(attack, str) else repr(attack),
         "attack_simulations": certified.attack_simulations,
-        "halving": None if halving is None else {"reduction": halving.reduction, "by": halving.by},
-        "episodes": episodes,
-    }
+        "halving": None if halving is None else _given(halving), "episodes": episodes,
+    }  # fmt: skip
     if proposer.learns:
         # Its proposals depend on both.
         options |= {"configurations": configurations, "batch": proposer.batch}
@@ -122,6 +109,11 @@ def sweep(
             sources=sources,
         )  # fmt: skip
         return Sweep(running.run(proposer), study, reuse=cache.reuse())
+
+
+def _given(halving: Halving) -> dict[str, Any]:
+    """Return the options of a halving as they are recorded, without those that are left out."""
+    return {name: value for name, value in asdict(halving).items() if value is not None}
 
 
 def check_options(

@@ -1,6 +1,7 @@
 """Successive halving: at each checkpoint only the best configurations continue to train.
 
     sweep(study, configurations=64, halving=Halving(reduction=3))
+    sweep(study, configurations=64, halving=Halving(reduction=1, p=0.5))    # the unsafe ones end
 
 Source: Jamieson and Talwalkar, Non-stochastic best arm identification and hyperparameter
 optimization (2016), figure 1; Li et al., A system for massively parallel hyperparameter tuning
@@ -11,6 +12,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 
+from verifai_jax.core.messages.checks import check_fraction
 from verifai_jax.core.messages.errors import check_names
 
 RETURN, SAFETY = "return", "safety"
@@ -23,20 +25,30 @@ class Halving:
 
     **Arguments:**
     - `reduction`: greater than 1; the share 1/reduction of the configurations continues, rounded
-      up.
+      up. It may be 1 if `p` is given.
     - `by`: the criterion. `"return"` is the nominal return at the checkpoint; `"safety"` is the
       failure rate of the closed loop in a few simulations, then the worst robustness, then the
       return.
-    **Raises:** `ValueError` for a reduction of 1 or less; `UnknownNameError` for another criterion.
+    - `p`: a configuration also ends at a checkpoint if a certificate shows that the policies of all
+      its seeds fail there with a greater probability than this. The intervals hold whenever
+      sampling stops, for all policies and checkpoints together, with the confidence of the sweep's
+      `Certification`. A policy that fails now may be safe after more training, so choose what no
+      training overcomes in the steps that are left.
+    **Raises:** `ValueError` for a reduction of 1 or less, and for a `p` that is no probability;
+    `UnknownNameError` for another criterion.
     """
 
     reduction: float = 3.0
     by: str = RETURN
+    p: float | None = None
 
     def __post_init__(self) -> None:
         number = isinstance(self.reduction, int | float) and not isinstance(self.reduction, bool)
-        if not (number and 1 < self.reduction < math.inf):
+        ends = self.p is not None and self.reduction == 1
+        if not (number and (ends or 1 < self.reduction < math.inf)):
             raise ValueError(f"reduction must be greater than 1; got {self.reduction!r}")
+        if self.p is not None:
+            check_fraction("p", self.p)
         check_names("criterion of halving", [self.by], (RETURN, SAFETY))
 
     def survivors(self, configurations: int) -> int:

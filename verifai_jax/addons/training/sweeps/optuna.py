@@ -20,6 +20,7 @@ from verifai_jax.addons.training.sweeps.hyperparameters import (
 from verifai_jax.addons.training.sweeps.optuna_distributions import (
     optuna_distribution,
     plain_choice,
+    quiet_study,
 )
 from verifai_jax.core.messages.errors import MissingExtra, require, unknown_name
 from verifai_jax.features import FeatureSpace
@@ -30,13 +31,9 @@ if TYPE_CHECKING:
     from optuna.samplers import BaseSampler
     from optuna.trial import Trial
 _SAMPLERS = {
-    "tpe": "TPESampler",
-    "random": "RandomSampler",
-    "cmaes": "CmaEsSampler",
-    "gp": "GPSampler",
-    "nsgaii": "NSGAIISampler",
-    "qmc": "QMCSampler",
-}
+    "tpe": "TPESampler", "random": "RandomSampler", "cmaes": "CmaEsSampler", "gp": "GPSampler",
+    "nsgaii": "NSGAIISampler", "qmc": "QMCSampler",
+}  # fmt: skip
 """Classes of Optuna's samplers, by the names that are used here."""
 _MAX_REFUSED = 1000
 """Trials in a row that the constraint may refuse before proposals end."""
@@ -100,12 +97,7 @@ class OptunaProposer:
         optuna = require("optuna", "optuna")
         self._failed = optuna.trial.TrialState.FAIL
         self._distributions = _distributions(space)
-        before = optuna.logging.get_verbosity()
-        optuna.logging.set_verbosity(optuna.logging.WARNING)
-        try:
-            self._study = optuna.create_study(sampler=sampler)
-        finally:
-            optuna.logging.set_verbosity(before)
+        self._study = quiet_study(sampler=sampler)
         self._trials: list[Trial] = []
 
     def propose(self, maximum: int) -> list[Hyperparameters]:

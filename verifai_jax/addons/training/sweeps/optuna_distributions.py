@@ -1,6 +1,6 @@
 """The domains of hyper-parameters as Optuna's distributions. Needs the extra `optuna`."""
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -8,6 +8,7 @@ from verifai_jax.core.messages.errors import require
 from verifai_jax.features.domain import Domain
 
 if TYPE_CHECKING:
+    import optuna
     from optuna.distributions import BaseDistribution
 
 
@@ -26,6 +27,17 @@ def optuna_distribution(domain: Domain | None) -> "BaseDistribution | None":
     if tuning.scale == "integer":
         return distributions.IntDistribution(int(low), int(high))
     return distributions.FloatDistribution(float(low), float(high), log=tuning.scale == "log")
+
+
+def quiet_study(**options: Any) -> "optuna.Study":
+    """Create a study of Optuna without a line in its log."""
+    optuna = require("optuna", "optuna")
+    before = optuna.logging.get_verbosity()
+    optuna.logging.set_verbosity(optuna.logging.WARNING)
+    try:
+        return optuna.create_study(**options)
+    finally:
+        optuna.logging.set_verbosity(before)
 
 
 def plain_choice(choice: object) -> bool | int | float | str | None:

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from verifai_jax.addons.training.sweeps.optuna_distributions import optuna_distribution
+from verifai_jax.addons.training.sweeps.optuna_distributions import optuna_distribution, quiet_study
 from verifai_jax.addons.training.sweeps.record import STOPPED, algorithm_uses
 from verifai_jax.core.messages.errors import require
 from verifai_jax.features import FeatureSpace
@@ -56,12 +56,7 @@ def export_to_optuna(
     **Raises:** `MissingExtra` without Optuna.
     """
     optuna = require("optuna", "optuna")
-    verbosity = optuna.logging.get_verbosity()
-    optuna.logging.set_verbosity(optuna.logging.WARNING)
-    try:
-        study = optuna.create_study(study_name=name, storage=storage, directions=list(DIRECTIONS))
-    finally:
-        optuna.logging.set_verbosity(verbosity)
+    study = quiet_study(study_name=name, storage=storage, directions=list(DIRECTIONS))
     study.set_user_attr("metrics", list(METRICS))
     domains = {} if space is None else space.domains
     distributions: dict[str, BaseDistribution] = {}
@@ -115,12 +110,10 @@ def _trial(
     parameters = {n: _clamp(as_scalar(row[n]), d) for n, d in distributions.items()}
     parameters = {n: v for n, v in parameters.items() if v == v}
     return optuna.trial.create_trial(
-        state=state,
-        values=values if complete else None,
-        params=parameters,
+        state=state, values=values if complete else None, params=parameters,
         distributions={n: d for n, d in distributions.items() if n in parameters},
         user_attrs={"configuration": number, **attributes},
-    )
+    )  # fmt: skip
 
 
 def _clamp(value: object, distribution: "BaseDistribution") -> object:

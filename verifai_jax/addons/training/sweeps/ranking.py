@@ -81,23 +81,19 @@ def group_by_configuration(table: "pd.DataFrame", hyperparameters: Sequence[str]
         best = min(ranked, key=rank_of.__getitem__, default=-1)
         rows.append(
             {
-                "configuration": number,
-                "steps": last["steps"].max(),
-                **{name: last[name].iloc[0] for name in names},
-                "seeds": len(last),
-                "seeds_safe": int(is_safe(last).sum()),
-                "verdict": _worst_verdict(last),
+                "configuration": number, "steps": last["steps"].max(),
+                **{name: last[name].iloc[0] for name in names}, "seeds": len(last),
+                "seeds_safe": int(is_safe(last).sum()), "verdict": _worst_verdict(last),
                 "nominal_return": last["nominal_return"].mean(),
                 "failure_rate": last["failure_rate"].mean(),
                 "failure_rate_worst": last["failure_rate"].max(),
                 "failure_high": last["failure_high"].max(skipna=False),
                 "training_seconds": last["training_seconds"].sum(),
                 "status": ", ".join(dict.fromkeys(str(status) for status in last["status"])),
-                "best_row": best,
-                "best_steps": table.loc[best, "steps"] if best >= 0 else -1,
+                "best_row": best, "best_steps": table.loc[best, "steps"] if best >= 0 else -1,
                 "best_verdict": table.loc[best, "verdict"] if best >= 0 else "",
             }
-        )
+        )  # fmt: skip
     return pd.DataFrame(rows).set_index("configuration") if rows else pd.DataFrame()
 
 

@@ -19,6 +19,7 @@ from jaxtyping import Float, Int
 
 from verifai_jax.addons.training.sweeps import storage
 from verifai_jax.addons.training.sweeps.curves import check_curve, curve_robustness, curve_trace
+from verifai_jax.addons.training.sweeps.exported import TrainedConfiguration, weights_of
 from verifai_jax.addons.training.sweeps.importance import (
     HyperparameterImportance,
     hyperparameter_importance,
@@ -38,15 +39,18 @@ from verifai_jax.addons.training.sweeps.summary import (
     format_html,
     format_summary,
 )
-from verifai_jax.addons.training.sweeps.trainer import ALGORITHM
-from verifai_jax.core.display.figure import Drawn, Reported
-from verifai_jax.core.messages.errors import suggests_options
+from verifai_jax.addons.training.sweeps.trainer import ALGORITHM, STEPS
+from verifai_jax.core.compute.devices import describe_processor
+from verifai_jax.core.display.figure import Figure, Reported
+from verifai_jax.core.display.lazy import lazy_import
+from verifai_jax.core.messages.errors import check_names, suggests_options
 from verifai_jax.core.user_code.sources import Change, list_changes
 from verifai_jax.core.user_code.targets import load_target
 from verifai_jax.core.values.trace import Trace
 from verifai_jax.falsification._falsify import falsify
 from verifai_jax.falsification.model_changes import changed_since, model_changes
 from verifai_jax.features import FeatureSpace
+from verifai_jax.features.domain import as_scalar
 from verifai_jax.mtl import Formula
 from verifai_jax.problem.problem import Problem
 from verifai_jax.search import Search
@@ -56,9 +60,19 @@ if TYPE_CHECKING:
     import pandas as pd
     from optuna.storages import BaseStorage
 
+PICTURES = {
+    "overview": ("sweep", "plot_sweep"), "parallel": ("configurations", "plot_parallel"),
+    "slices": ("configurations", "plot_slices"),
+}  # fmt: skip
+"""Modules and functions of the kinds of picture."""
+CERTIFICATE = (
+    "verdict", "failures", "simulations", "failure_low", "failure_high", "nominal_return"
+)  # fmt: skip
+"""Columns that an exported configuration has."""
+
 
 @dataclass(frozen=True, eq=False)
-class Sweep(Drawn, Reported):
+class Sweep(Reported):
     """The policies of a sweep with their returns and certificates, as `sweep` returns them.
 
     **Fields:**
@@ -74,8 +88,6 @@ class Sweep(Drawn, Reported):
     """
 
     _report = "verifai_jax.addons.training.sweep_report", "sweep_page"
-    _picture = "verifai_jax.addons.training.pictures.sweep", "plot_sweep"
-    """Return against failure probability, learning curves and importances."""
     record: SweepRecord
     study: Study | None = None
     space: FeatureSpace | None = None
@@ -106,6 +118,20 @@ class Sweep(Drawn, Reported):
         """Failure probability below which a policy is called safe, if known."""
         p = self.record.options.get("p", None if self.study is None else self.study.p)
         return None if p is None else float(p)
+
+    def plot(self, path: str | Path | None = None, kind: str = "overview") -> Figure:
+        """Draw the sweep.
+
+        **Arguments:**
+        - `path`: file to which the picture is written, if given.
+        - `kind`: `"overview"`, the front of return and failure rate with learning curves and
+          importances; `"parallel"`, parallel coordinates of the configurations; `"slices"`, the
+          failure rate over each hyper-parameter.
+        **Returns:** the Matplotlib figure.
+        """
+        check_names("kind of picture", [kind], PICTURES)
+        module, function = PICTURES[kind]
+        return lazy_import(f"verifai_jax.addons.training.pictures.{module}", function)(self, path)
 
     @cached_property
     def table(self) -> "pd.DataFrame":
@@ -221,6 +247,47 @@ class Sweep(Drawn, Reported):
         return front.sort_values(
             ["failure_high", "nominal_return", "steps"], ascending=[True, False, True]
         )
+
+    def configuration(self, i: int | np.integer | None = None) -> TrainedConfiguration:
+        """Return the configuration of row `i` with its policy, by default of the best row.
+
+        **Raises:** the errors of `policy` and `best`.
+        """
+        i = int(str(self.best.name)) if i is None else self._row(i)
+        policy, table = self.policy(i), self.table
+        row: Any = table.loc[i].to_dict()
+        values = {n: as_scalar(row[n]) for n in self.hyperparameters}
+        if STEPS in values:  # The table has those of the checkpoint.
+            same = (table["configuration"] == row["configuration"]) & (table["seed"] == row["seed"])
+            values[STEPS] = int(table.loc[same, STEPS].max())
+        return TrainedConfiguration(
+            study=self.name, hyperparameters=values, seed=int(row["seed"]),
+            steps=int(row[STEPS]), certificate={n: as_scalar(row[n]) for n in CERTIFICATE},
+            weights=weights_of(policy), version=self.record.version,
+            processor=describe_processor(), policy=policy,
+        )  # fmt: skip
+
+    def export(self, folder: str | Path, i: int | np.integer | None = None) -> Path:
+        """Write row `i`, by default the best, to a folder: JSON, and its policy as ONNX.
+
+        `sweeps.load_configuration` reads it.
+
+        **Raises:** the errors of `configuration`; `MissingExtra` without the package onnx.
+        """
+        return self.configuration(i).export(folder)
+
+    def trials_dataframe(self) -> "pd.DataFrame":
+        """Return one row for each configuration, with the columns of Optuna's `trials_dataframe`.
+
+        `values_0` is the upper end of the failure probability, `values_1` the nominal return.
+        """
+        groups = self.configurations
+        renamed = {name: f"params_{name}" for name in self.hyperparameters}
+        values = {"failure_high": "values_0", "nominal_return": "values_1"}
+        table = groups[[*values, *renamed]].rename(columns={**values, **renamed})
+        table.insert(0, "number", range(len(table)))
+        told = {"verdict": "user_attrs_verdict", "status": "state"}
+        return table.join(groups[[*told]].rename(columns=told)).reset_index(drop=True)
 
     @suggests_options
     def importance(self, *, repeats: int = 5, seed: int = 0) -> HyperparameterImportance:
@@ -344,11 +411,7 @@ class Sweep(Drawn, Reported):
         changed = changed_since(self.changes(), None, "the sweep")
         return f"{changed}\n{text}" if changed else text
 
-    def __str__(self) -> str:
-        return self.summary()
-
-    def __repr__(self) -> str:
-        return self.summary()
+    __str__ = __repr__ = summary
 
     def _repr_html_(self) -> str:
         return format_html(self.findings)

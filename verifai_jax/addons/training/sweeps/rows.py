@@ -87,17 +87,12 @@ def _cells(row: Row, study: Study) -> dict[str, object]:
     if study.curve_formula is not None and checkpoint is not None:
         curve = curve_robustness(study.curve_formula, *checkpoint.curve)
     return {
-        **row.values,
-        "configuration": row.configuration,
-        "seed": row.seed,
-        "steps": row.steps,
+        **row.values, "configuration": row.configuration, "seed": row.seed, "steps": row.steps,
         "status": row.status,
         "training_return": nan if checkpoint is None else checkpoint.training_return,
-        "nominal_return": row.nominal_return,
-        **columns_of(safety),
-        "curve_robustness": curve,
+        "nominal_return": row.nominal_return, **columns_of(safety), "curve_robustness": curve,
         "training_seconds": nan if checkpoint is None else checkpoint.seconds,
-    }
+    }  # fmt: skip
 
 
 def columns_of(certificate: Certificate | None) -> dict[str, Any]:
@@ -110,13 +105,10 @@ def columns_of(certificate: Certificate | None) -> dict[str, Any]:
         return {**columns, "failure_high": nan, "worst_robustness": worst, "verdict": ""}
     return {
         "failures": certificate.failures + certificate.not_finite,
-        "simulations": certificate.simulations,
-        "failure_rate": rate.estimate,
-        "failure_low": rate.low,
-        "failure_high": rate.high,
-        "worst_robustness": certificate.worst_robustness,
-        "verdict": certificate.verdict,
-    }
+        "simulations": certificate.simulations, "failure_rate": rate.estimate,
+        "failure_low": rate.low, "failure_high": rate.high,
+        "worst_robustness": certificate.worst_robustness, "verdict": certificate.verdict,
+    }  # fmt: skip
 
 
 def _hyperparameter_column(entries: Sequence[object]) -> Shaped[np.ndarray, " rows"]:

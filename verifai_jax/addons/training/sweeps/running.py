@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -28,6 +29,7 @@ from verifai_jax.core.store.cache import Cache
 from verifai_jax.core.store.log import Arrays
 from verifai_jax.core.user_code.callbacks import Callback, notify
 from verifai_jax.evaluation.run_on import RunOn
+from verifai_jax.statistics.confidence_sequences import verdict_kind
 
 SCREENING = 64
 """Samples of a policy, and simulations of the attack on it, by which a search or halving chooses.
@@ -39,6 +41,14 @@ FOR_TRAINING = 2 / 3
 """Share of the seconds after which no training begins, to leave time to certify."""
 _LAST = 10**9
 """Number of a checkpoint beyond the last one of every training."""
+
+
+def runs_of(
+    study: Study, cache: Cache, clock: Clock, executor: Executor | None = None
+) -> TrainingRuns:
+    """Return the training runs of a study, by its algorithms or its function."""
+    kind = FunctionRuns if isinstance(study.trainer, FunctionTrainer) else TrainingRuns
+    return kind(study, cache, clock, executor)
 
 
 @dataclass(eq=False)
@@ -75,9 +85,7 @@ class RunningSweep:
     safety: dict[tuple[int, int], Certificate] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        by_function = isinstance(self.study.trainer, FunctionTrainer)
-        kind = FunctionRuns if by_function else TrainingRuns
-        self.runs = kind(self.study, self.cache, self.clock, self.executor)
+        self.runs = runs_of(self.study, self.cache, self.clock, self.executor)
 
     def run(self, proposer: Proposer) -> record.SweepRecord:
         """Train and certify, or as much of it as time allows."""
@@ -135,12 +143,45 @@ class RunningSweep:
             self.runs.train(self._runs_of(numbers), rung, further=rung < last)
             self._measure_returns(self._runs_of(numbers))
             if rung < last:
-                values = self._halving_objectives(self.halving.by, numbers, rung)
+                left = self._without_unsafe(numbers, rung, self.halving.p, last)
+                values = self._halving_objectives(self.halving.by, left, rung)
                 selected = self.halving.select(values)
-                for number in set(values) - set(selected):
+                for number in set(numbers) - set(selected):
                     self.configurations[number].stopped = rung
                     self.runs.forget(self.configurations[number].runs)
                 numbers = selected
+
+    def _without_unsafe(
+        self, numbers: Sequence[int], rung: int, p: float | None, rungs: int
+    ) -> list[int]:
+        """Return the configurations that are not shown to fail more often than `p` at a rung."""
+        groups = {number: self._entries_of(number, rung) for number in numbers}
+        entries = [entry for group in groups.values() for entry in group if self._is_finite(entry)]
+        if p is None or not entries:
+            return list(numbers)
+        # All rungs together have the confidence of the sweep; each has samples of its own.
+        confidence = 1 - (1 - self.certified.confidence) / rungs
+        found = self._quick_certificates(entries, [2, rung], p, confidence)
+        unsafe = {entry for entry, one in found.items() if verdict_kind(one.verdict) == "unsafe"}
+        never = {entry for group in groups.values() for entry in group if entry not in found}
+        return [number for number in numbers if not {*groups[number]} <= unsafe | never]
+
+    def _quick_certificates(
+        self, entries: Sequence[tuple[int, int]], stream: Sequence[int], p: float, confidence: float
+    ) -> dict[tuple[int, int], Certificate]:
+        """Certify policies by few simulations, to choose among configurations."""
+        # Other samples than those of the certificates.
+        words = np.random.SeedSequence([self.options["seed"], *stream]).generate_state(1)
+        samples = min(SCREENING, self.options["samples"])
+        screening = replace(
+            self.certified, samples=samples, budget=samples * len(entries), confidence=confidence,
+            attack_simulations=min(SCREENING, self.options["attack_simulations"]),
+        )  # fmt: skip
+        policies = [self._policy(entry) for entry in entries]
+        certificates = self._certify_policies(policies, screening, int(words[0]), p, progress=None)
+        # A half-finished screening would change the proposals of a resumed sweep.
+        end_if_interrupted(certificates.stopped)
+        return dict(zip(entries, certificates.rows, strict=True))
 
     def _runs_of(self, numbers: Sequence[int]) -> list[int]:
         return [run for number in numbers for run in self.configurations[number].runs]
@@ -186,11 +227,10 @@ class RunningSweep:
         number = next(n for n, one in enumerate(self.configurations) if run in one.runs)
         self.calls += 1
         about = {
-            "configuration": number,
-            "training_seed": training.seed,
+            "configuration": number, "training_seed": training.seed,
             "environment_steps": training.checkpoints[rung],
             "training_return": checkpoint.training_return,
-        }
+        }  # fmt: skip
         notify(self.callbacks, self.calls, {**about, **values})
 
     def _return_name(self, run: int, rung: int) -> str:
@@ -240,20 +280,9 @@ class RunningSweep:
         returns = [self.returns[entry] for entry in finite]
         if self.return_range is None and returns:
             self.return_range = min(returns), max(returns)
-        samples = min(SCREENING, self.options["samples"])
         safety: dict[tuple[int, int], Certificate] = {}
         if finite:
-            # Other samples than those of the certificates.
-            seed = int(np.random.SeedSequence([self.options["seed"], 1]).generate_state(1)[0])
-            policies = [self._policy(entry) for entry in finite]
-            screening = replace(
-                self.certified, samples=samples, budget=samples * len(policies),
-                attack_simulations=min(SCREENING, self.options["attack_simulations"]),
-            )  # fmt: skip
-            certificates = self._certify_policies(policies, screening, seed, progress=None)
-            # A half-finished screening would change the proposals of a resumed sweep.
-            end_if_interrupted(certificates.stopped)
-            safety = dict(zip(finite, certificates.rows, strict=True))
+            safety = self._quick_certificates(finite, [1], self.study.p, self.certified.confidence)
         objectives: dict[int, float | None] = {}
         for number, group in entries.items():
             values = [self._objective(entry, safety.get(entry)) for entry in group]
@@ -286,8 +315,9 @@ class RunningSweep:
             self._measure_returns(list(dict.fromkeys(run for run, _ in entries)))
             policies = [self._policy(entry) for entry in entries]
             certificates = self._certify_policies(
-                policies, self.certified, self.options["seed"], progress=self.clock.show
-            )
+                policies, self.certified, self.options["seed"], self.study.p,
+                progress=self.clock.show,
+            )  # fmt: skip
         self.safety = dict(zip(entries, certificates.rows, strict=True))
         for entry, safety in self.safety.items():
             numbers = columns_of(safety)
@@ -297,7 +327,7 @@ class RunningSweep:
 
     def _certify_policies(
         self, policies: Sequence[record.TrainedPolicy], certification: Certification, seed: int,
-        progress: Callable[[int, int, str], None] | None,
+        p: float, progress: Callable[[int, int, str], None] | None,
     ) -> Certificates:  # fmt: skip
         def remember(name: str, compute: Callable[[], Arrays]) -> Arrays:
             try:
@@ -308,7 +338,7 @@ class RunningSweep:
             return self.cache.remember(f"certify/{name}", compute)
 
         return certify(
-            self.study.problem, policies, p=self.study.p, certification=certification, seed=seed,
+            self.study.problem, policies, p=p, certification=certification, seed=seed,
             remember=remember, run_on=RunOn(executor=self.executor), progress=progress,
         )  # fmt: skip
 
@@ -325,52 +355,27 @@ class RunningSweep:
                     rows.append(row)
         table = tabulate(rows, self.study)
         return record.SweepRecord(
-            study=self.study.name,
-            seed=self.options["seed"],
-            columns=table.columns,
-            hyperparameters=tuple(self.study.space.columns),
-            policies=table.policies,
-            worst=table.worst,
-            curves=table.curves,
-            certificates=certificates,
-            certified=tuple(certified[entry] for entry in self.safety),
-            options=self.options,
-            version=__version__,
-            seconds=dict(self.clock.seconds),
-            complete=complete,
+            study=self.study.name, seed=self.options["seed"], columns=table.columns,
+            hyperparameters=tuple(self.study.space.columns), policies=table.policies,
+            worst=table.worst, curves=table.curves, certificates=certificates,
+            certified=tuple(certified[entry] for entry in self.safety), options=self.options,
+            version=__version__, seconds=dict(self.clock.seconds), complete=complete,
             sources=tuple(self.sources),
-        )
+        )  # fmt: skip
 
     def _rows(self, number: int, configuration: _Configuration, run: int) -> list[Row]:
-        training = self.runs.runs[run]
-        rows: list[Row] = []
+        training, rows = self.runs.runs[run], []
+        one = partial(Row, number, training.seed, values=configuration.values)
         for rung, steps in enumerate(training.checkpoints):
-            checkpoint = self.runs.checkpoint(run, rung)
+            checkpoint, entry = self.runs.checkpoint(run, rung), (run, rung)
             if checkpoint is None:
                 continue
             status = record.TRAINED if configuration.stopped != rung else record.STOPPED
-            rows.append(
-                Row(
-                    configuration=number,
-                    seed=training.seed,
-                    steps=steps,
-                    values=configuration.values,
-                    status=status if checkpoint.finite else record.NONFINITE,
-                    entry=(run, rung),
-                    checkpoint=checkpoint,
-                    nominal_return=self.returns.get((run, rung), float("nan")),
-                    safety=self.safety.get((run, rung)),
-                )
-            )
+            status = status if checkpoint.finite else record.NONFINITE
+            value, safety = self.returns.get(entry, float("nan")), self.safety.get(entry)
+            known = {"checkpoint": checkpoint, "nominal_return": value, "safety": safety}
+            rows.append(one(steps, status=status, entry=entry, **known))
         if run in self.runs.errors:
-            rows.append(
-                Row(
-                    configuration=number,
-                    seed=training.seed,
-                    steps=training.checkpoints[-1],
-                    values=configuration.values,
-                    status=record.error_status(self.runs.errors[run]),
-                    entry=(run, -1),
-                )
-            )
+            status = record.error_status(self.runs.errors[run])
+            rows.append(one(training.checkpoints[-1], status=status, entry=(run, -1)))
         return rows

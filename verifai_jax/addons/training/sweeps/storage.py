@@ -229,16 +229,13 @@ def _read_record(folder: Path, description: Mapping[str, Any]) -> SweepRecord:
         policies.append(load(file) if file.exists() else None)
     return SweepRecord(
         columns={str(name): table[name].to_numpy() for name in table.columns},
-        policies=tuple(policies),
-        worst=tuple(description["worst"]),
-        curves=curves,
-        certificates=None,
-        complete=bool(description["complete"]),
+        policies=tuple(policies), worst=tuple(description["worst"]), curves=curves,
+        certificates=None, complete=bool(description["complete"]),
         hyperparameters=tuple(description["hyperparameters"]),
         certified=tuple(description["certified"]),
         sources=tuple(Sources.from_json(each).to_json() for each in description["sources"]),
         **{name: description[name] for name in ("study", "seed", "options", "version", "seconds")},
-    )
+    )  # fmt: skip
 
 
 def _mixed_columns(table: "pd.DataFrame") -> list[str]:

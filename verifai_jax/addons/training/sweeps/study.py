@@ -72,18 +72,11 @@ class Study(InNotebook):
     _problems: dict[str, Problem] = field(init=False, repr=False)
 
     def __init__(
-        self,
-        name: str,
-        space: FeatureSpace | Mapping[str, Domain],
-        trainer: Trainer,
-        problem: Callable[[Policy], Problem],
-        checkpoints: Sequence[int] = (),
-        seeds: int | Sequence[int] = 1,
-        p: float = 0.01,
-        curve: Formula | str | None = None,
-        description: str = "",
-        made_in: Sequence[Maker] | None = None,
-    ) -> None:
+        self, name: str, space: FeatureSpace | Mapping[str, Domain], trainer: Trainer,
+        problem: Callable[[Policy], Problem], checkpoints: Sequence[int] = (),
+        seeds: int | Sequence[int] = 1, p: float = 0.01, curve: Formula | str | None = None,
+        description: str = "", made_in: Sequence[Maker] | None = None,
+    ) -> None:  # fmt: skip
         if not isinstance(name, str) or not name.strip():
             raise StudyError(f"a study needs a name; got {name!r}")
         if isinstance(space, Mapping):
@@ -101,20 +94,13 @@ class Study(InNotebook):
         check_fraction("p", p, error=StudyError)
         steps = {check_count("a checkpoint", at, error=StudyError) for at in checkpoints}
         values = {
-            "name": name,
-            "space": space,
-            "trainer": trainer,
-            "problem": problem,
-            "checkpoints": tuple(sorted(steps)),
-            "seeds": seeds,
-            "p": p,
-            "curve": curve,
+            "name": name, "space": space, "trainer": trainer, "problem": problem,
+            "checkpoints": tuple(sorted(steps)), "seeds": seeds, "p": p, "curve": curve,
             "description": description,
             "made_in": made_here() if made_in is None else tuple(made_in),
             "training_seeds": _seeds(seeds),
-            "curve_formula": None if curve is None else check_curve(curve),
-            "_problems": {},
-        }
+            "curve_formula": None if curve is None else check_curve(curve), "_problems": {},
+        }  # fmt: skip
         for attribute, value in values.items():
             object.__setattr__(self, attribute, value)
 

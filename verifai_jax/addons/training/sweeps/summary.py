@@ -24,10 +24,8 @@ MAX_ROWS = 8
 _VIEWS = ".table .safe .best .configurations .pareto() .importance() .plot() .problem(row)"
 """Views of the result that the summary points to."""
 _WORK = {
-    "train": "training checkpoint",
-    "return": "nominal return",
-    "certify": "block of simulations",
-}
+    "train": "training checkpoint", "return": "nominal return", "certify": "block of simulations",
+}  # fmt: skip
 """What each kind of cached work is called in a summary."""
 _CSS = {"safe": "#3a9e7d", "unsafe": "#d1495b"}
 """Colours of verdicts in a notebook, those of the pictures; others are grey."""

@@ -17,11 +17,10 @@ from typing import Any, TypeAlias, cast
 
 import jax
 import numpy as np
-from jaxtyping import Array, Key
 
 from verifai_jax.addons.rl import algorithms
 from verifai_jax.addons.rl.algorithm import Algorithm
-from verifai_jax.addons.rl.batched_training import Configuration
+from verifai_jax.addons.rl.batched_training import Configuration, untrained_policy
 from verifai_jax.addons.rl.policies import policy as load
 from verifai_jax.addons.rl.ppo import PPO
 from verifai_jax.addons.rl.task.task import Task
@@ -193,12 +192,7 @@ class Trainer:
 
         Nothing compiles.
         """
-        algorithm = self.by_name[name]
-
-        def initial_policy(key: Key[Array, ""]) -> Policy:
-            return algorithm.policy(self.task, algorithm.init(self.task, key, 1))
-
-        shapes = jax.eval_shape(initial_policy, jax.eval_shape(lambda: jax.random.key(0)))
+        shapes = untrained_policy(self.by_name[name], self.task)
         return jax.tree.map(lambda leaf: np.zeros(leaf.shape, leaf.dtype), shapes)
 
     def algorithms_in(self, space: FeatureSpace) -> tuple[str, ...]:

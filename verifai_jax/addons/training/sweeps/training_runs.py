@@ -16,10 +16,14 @@ from typing import Any
 
 import jax
 import numpy as np
-from jaxtyping import Array, Key
 
 from verifai_jax.addons.clusters.executors import Shipment, gather, ship
-from verifai_jax.addons.rl.batched_training import BatchedTraining, Configuration, policy_structure
+from verifai_jax.addons.rl.batched_training import (
+    BatchedTraining,
+    Configuration,
+    policy_structure,
+    untrained_policy,
+)
 from verifai_jax.addons.training.sweeps.clock import Clock, OutOfTime
 from verifai_jax.addons.training.sweeps.fingerprint import digest
 from verifai_jax.addons.training.sweeps.hyperparameters import Hyperparameters
@@ -277,13 +281,7 @@ class TrainingRuns:
         if structure not in self._policy_structures:
             configuration = self.runs[number].configuration
             assert configuration is not None
-            algorithm, task = configuration.algorithm, configuration.task
-
-            def initial_policy(key: Key[Array, ""]) -> Policy:
-                return algorithm.policy(task, algorithm.init(task, key, 1))
-
-            key = jax.eval_shape(lambda: jax.random.key(0))
-            shapes = jax.eval_shape(initial_policy, key)
+            shapes = untrained_policy(configuration.algorithm, configuration.task)
             self._policy_structures[structure] = jax.tree.structure(shapes)
         return self._policy_structures[structure]
 

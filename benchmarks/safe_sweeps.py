@@ -1,0 +1,324 @@
+"""Certified-safe configurations per processor hour, beside Optuna with rejax and Monte Carlo.
+
+    python benchmarks/safe_sweeps.py cartpole --configurations 32
+    python benchmarks/safe_sweeps.py mountain_car lane_keeping --sides ours halving stopping
+    python benchmarks/safe_sweeps.py cartpole --check 100000        # counts ten certificates again
+
+Each side gets the same space of hyper-parameters, steps, network and number of configurations. The
+sides are
+
+- `ours`: `vj.sweep`, with its attack and its certificates;
+- `halving`: the same with successive halving by nominal return;
+- `stopping`: the same, where only configurations end whose checkpoint is shown to be unsafe;
+- `rejax`: Optuna's TPE proposes for the best nominal return, rejax trains with hyper-parameters as
+  arguments of one program, and each policy is simulated in one program at independent samples, as
+  many as show it to be safe if none fails or one in four hundred does, with Clopper-Pearson bounds
+  that hold together (Bonferroni). It needs `pip install optuna rejax gymnax`, and is left out in
+  words without them.
+
+Times are of this process's processors. Each side runs once before, with two configurations and
+other seeds, so that programs are compiled; what that took is printed apart. `first` is the
+processor time until the first configuration was trained that is safe in the end, on average over
+the order of the configurations, with the certificates of all up to there.
+"""
+
+import argparse
+import dataclasses
+import functools
+import math
+import time
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import verifai_jax as vj
+from benchmarks.hardening import lane_with
+from envs.cartpole_task import CartPoleTask
+from envs.lane_keeping import LaneKeepingTask
+from envs.mountain_car import MountainCarTask
+from specs.cartpole import balance_with
+from specs.mountain_car import climb_with, trained_on
+from verifai_jax.addons.rl import PPO, Continuous, Discrete, Policy, evaluate
+from verifai_jax.statistics.binomial import upper_bound
+
+HIDDEN = (64, 64)
+CONFIDENCE, P = 0.95, 0.01
+OPTIMISER = {
+    "learning_rate": vj.LogUniform(3e-4, 1e-2),
+    "discount": vj.Box(0.95, 0.999),
+    "gae_lambda": vj.Box(0.9, 1.0),
+    "clip": vj.Box(0.1, 0.4),
+    "entropy": vj.Box(0.0, 0.02),
+}
+THEIR_NAMES = {"discount": "gamma", "clip": "clip_eps", "entropy": "ent_coef"}
+
+
+@dataclasses.dataclass(frozen=True)
+class Case:
+    """A task to train on, the one that returns are measured on, and the closed loop to certify."""
+
+    task: Any
+    nominal: Any
+    problem: Callable[[Any], vj.Problem]
+    steps: int
+    ranges: dict[str, Any]
+    settings: dict[str, Any]
+
+    def study(self) -> vj.Study:
+        """Return the study of our side."""
+        ppo = PPO(anneal=False, hidden=HIDDEN, value_hidden=HIDDEN, **self.settings)
+        return vj.Study(
+            "safe_sweeps",
+            space=OPTIMISER | self.ranges,
+            trainer=vj.Trainer(self.task, ppo, steps=self.steps, nominal=self.nominal),
+            problem=self.problem,
+            p=P,
+            checkpoints=(self.steps // 4, self.steps // 2),
+        )
+
+
+CASES = {
+    "cartpole": Case(
+        CartPoleTask(length_range=0.0, x0_range=0.05),
+        CartPoleTask(),
+        balance_with,
+        32_768,
+        {"length_range": vj.Box(0.0, 2.0), "x0_range": vj.Box(0.05, 1.0)},
+        {},
+    ),
+    "mountain_car": Case(
+        trained_on(10.0),
+        MountainCarTask(),
+        climb_with,
+        131_072,
+        {"potential": vj.Box(1.0, 100.0)},
+        {"environments": 16, "normalise": True},
+    ),
+    "lane_keeping": Case(
+        LaneKeepingTask(varied=True), LaneKeepingTask(varied=True), lane_with, 131_072, {}, {}
+    ),
+}
+
+
+@dataclasses.dataclass
+class Outcome:
+    """What a side found, and the processor seconds of its stages."""
+
+    safe: list[bool]
+    seconds: dict[str, float]
+    policies: list[Any]
+    first: float
+
+
+def our_side(case: Case, configurations: int, seed: int, *, halving: Any) -> Outcome:
+    """Sweep with this package."""
+    study = case.study()
+    if halving is None:
+        study = vj.Study(
+            study.name, study.space, study.trainer, study.problem, p=P
+        )  # Its checkpoints would only be more policies to certify.
+    before = time.process_time()
+    result = vj.sweep(study, configurations=configurations, seed=seed, halving=halving)
+    total = time.process_time() - before
+    walls = result.record.seconds
+    seconds = {name: total * wall / sum(walls.values()) for name, wall in walls.items()}
+    table = result.table
+    last = table.loc[table.groupby("configuration")["steps"].idxmax()]
+    safe = last["verdict"].str.startswith("safe").tolist()
+    counts = {"attack": 256 * len(table), "samples": int(table["simulations"].sum())}
+    share = counts["attack"] / max(1, sum(counts.values()))
+    certifying = seconds.pop("certifying", 0.0)
+    seconds |= {"attacking": share * certifying, "certifying": (1 - share) * certifying}
+    return Outcome(safe, seconds, [result.policy(i) for i in last.index], until_first(safe, total))
+
+
+def until_first(safe: list[bool], total: float) -> float:
+    """Return the expected cost until the first safe configuration, in a random order."""
+    found = sum(safe)
+    return total * (len(safe) + 1) / (found + 1) / len(safe) if found else math.inf
+
+
+def environment_of(case: Case) -> Any:
+    """Return the task as an environment of gymnax' form, whose parameters are the task."""
+    from gymnax.environments import spaces  # pyright: ignore[reportMissingImports]
+
+    class Environment:
+        default_params = case.task
+
+        def action_space(self, task: Any) -> Any:
+            kind = case.task.action
+            if isinstance(kind, Discrete):
+                return spaces.Discrete(kind.n)
+            return spaces.Box(kind.low, kind.high, (kind.size,))
+
+        def observation_space(self, task: Any) -> Any:
+            size = jax.eval_shape(
+                lambda k: case.task.observe(case.task.reset(k)), jax.random.key(0)
+            )
+            return spaces.Box(-jnp.inf, jnp.inf, size.shape)
+
+        def reset(self, key: Any, task: Any) -> Any:
+            state = task.reset(key)
+            return task.observe(state), (state, jnp.int32(0))
+
+        def step(self, key: Any, state: Any, action: Any, task: Any) -> Any:
+            before, age = state
+            step_key, reset_key = jax.random.split(key)
+            after, reward, over = task.step(step_key, before, action)
+            over = over | (age + 1 >= task.time_limit)
+            fresh = self.reset(reset_key, task)
+            both = (task.observe(after), (after, age + 1))
+            chosen = jax.tree.map(lambda new, old: jnp.where(over, new, old), fresh, both)
+            return *chosen, jnp.asarray(reward, jnp.float32), over, {}
+
+    return Environment()
+
+
+class RejaxSide:
+    """Optuna, rejax and Monte Carlo, whose programs are compiled once for all configurations."""
+
+    def __init__(self, case: Case) -> None:
+        import optuna
+        import rejax  # pyright: ignore[reportMissingImports]
+
+        optuna.logging.set_verbosity(optuna.logging.WARNING)
+        self.case, self.optuna = case, optuna
+        ours = PPO(**case.settings)
+        self.algorithm = rejax.PPO.create(
+            env=environment_of(case),
+            env_params=case.task,
+            num_envs=ours.environments,
+            num_steps=ours.horizon,
+            num_epochs=ours.epochs,
+            num_minibatches=ours.minibatches,
+            max_grad_norm=ours.max_gradient,
+            normalize_observations=ours.normalise,
+            agent_kwargs={"hidden_layer_sizes": HIDDEN, "activation": "tanh"},
+            total_timesteps=case.steps,
+            eval_freq=case.steps,
+            skip_initial_evaluation=True,
+        ).replace(eval_callback=lambda *_: ())
+
+        def train(algorithm: Any, key: Any) -> Any:
+            state, _ = algorithm.train(key)
+            return state.actor_ts.params["params"], state.obs_rms_state
+
+        self.train = jax.jit(train)
+        self.simulate = jax.jit(
+            lambda policy, points: jax.vmap(case.problem(policy).objective())(points)
+        )
+
+    def policy(self, weights: Any, statistics: Any) -> Policy:
+        """Return rejax' network as a policy of ours."""
+        kind = self.case.task.action
+        last = weights["action_logits" if isinstance(kind, Discrete) else "action_mean"]
+        dense = [*weights["features"].values(), last]
+        layers = [(one["kernel"], one["bias"]) for one in dense]
+        if isinstance(kind, Continuous):
+            middle, half = (kind.high + kind.low) / 2, (kind.high - kind.low) / 2
+            layers[-1] = (layers[-1][0] / half, (layers[-1][1] - middle) / half)
+        mean = scale = None
+        if self.case.settings.get("normalise"):
+            mean, scale = statistics.mean, jnp.sqrt(statistics.var + 1e-8)
+        return Policy(tuple(layers), mean, scale, None, kind)
+
+    def run(self, configurations: int, seed: int) -> Outcome:
+        """Propose, train, and certify each policy."""
+        sampler = self.optuna.samplers.TPESampler(seed=seed)
+        study = self.optuna.create_study(direction="maximize", sampler=sampler)
+        seconds = {"training": 0.0, "certifying": 0.0}
+        policies = []
+        began = time.process_time()
+        for number in range(configurations):
+            trial = study.ask()
+            values = {}
+            for name, domain in (OPTIMISER | self.case.ranges).items():
+                log = isinstance(domain, vj.LogUniform)
+                low, high = domain.tuning.low, domain.tuning.high
+                values[name] = trial.suggest_float(name, low, high, log=log)
+            task = dataclasses.replace(
+                self.case.task, **{n: jnp.float32(values[n]) for n in self.case.ranges}
+            )
+            named = {THEIR_NAMES.get(n, n): jnp.float32(values[n]) for n in OPTIMISER}
+            algorithm = self.algorithm.replace(env_params=task, **named)
+            policy = self.policy(*self.train(algorithm, jax.random.key(1000 * seed + number)))
+            study.tell(trial, float(evaluate(self.case.nominal, policy, episodes=20).mean()))
+            policies.append(policy)
+        seconds["training"] = time.process_time() - began
+        began = time.process_time()
+        safe = [self.certified(policy, seed, configurations) for policy in policies]
+        seconds["certifying"] = time.process_time() - began
+        return Outcome(safe, seconds, policies, until_first(safe, sum(seconds.values())))
+
+    def certified(self, policy: Policy, seed: int, among: int) -> bool:
+        """Return whether independent samples show the policy to be safe."""
+        confidence = 1 - (1 - CONFIDENCE) / among
+        count = 64
+        while upper_bound(count // 400, count, confidence) >= P:
+            count += 64
+        points = np.random.default_rng([seed, 7]).random(
+            (count, self.case.problem(policy).space.dim), np.float32
+        )
+        failures = int(np.sum(~(np.asarray(self.simulate(policy, points)) >= 0)))
+        return upper_bound(failures, count, confidence) < P
+
+
+def failure_rate(case: Case, policy: Any, count: int) -> float:
+    """Count failures among fresh simulations that decided nothing."""
+    run = vj.falsify(
+        case.problem(policy), "uniform", count, seed=10**6, confirm=False, progress=False
+    )
+    return len(run.table.violating) / count
+
+
+def main() -> None:
+    """Print what each side finds in an hour of a processor."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("cases", nargs="+", choices=list(CASES))
+    sides = ["ours", "halving", "stopping", "rejax"]
+    parser.add_argument("--sides", nargs="+", choices=sides, default=sides)
+    parser.add_argument("--configurations", type=int, default=32)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--check", type=int, default=0, help="fresh simulations of a certificate")
+    chosen = parser.parse_args()
+    halvings = {
+        "ours": None,
+        "halving": vj.Halving(reduction=3),
+        "stopping": vj.Halving(reduction=1, p=0.9),
+    }
+    for name in chosen.cases:
+        case = CASES[name]
+        print(f"{name}: {chosen.configurations} configurations of {case.steps:,} steps")
+        for side in chosen.sides:
+            if side == "rejax":
+                try:
+                    run = RejaxSide(case).run
+                except ImportError as error:
+                    print(f"  {side}: left out, {error}")
+                    continue
+            else:
+                run = functools.partial(our_side, case, halving=halvings[side])
+            before = time.process_time()
+            run(2, chosen.seed + 999)
+            compiling = time.process_time() - before
+            found = run(chosen.configurations, chosen.seed)
+            total = sum(found.seconds.values())
+            parts = ", ".join(f"{s:.1f} s {n}" for n, s in found.seconds.items())
+            print(
+                f"  {side:9} {sum(found.safe)} safe in {total:.1f} CPU s ({parts}): "
+                f"{3600 * sum(found.safe) / total:,.0f} an hour; first after {found.first:.1f} s; "
+                f"{compiling:.0f} s before, compiling",
+                flush=True,
+            )
+            if chosen.check:
+                safe = [p for p, good in zip(found.policies, found.safe, strict=True) if good][:10]
+                rates = [failure_rate(case, policy, chosen.check) for policy in safe]
+                wrong = sum(rate >= P for rate in rates)
+                print(f"    of {len(safe)} certificates counted again {wrong} are wrong: {rates}")
+
+
+if __name__ == "__main__":
+    main()

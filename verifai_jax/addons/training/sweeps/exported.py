@@ -1,0 +1,115 @@
+"""A configuration of a sweep with its policy, in a folder that other programs can read.
+
+sweep.export("best")                            # best/configuration.json, best/policy.onnx
+best = load_configuration("best")
+best.hyperparameters, best.policy.act(observation), best.certificate["verdict"]
+best.train(study)                               # trained again, to the same bits
+"""
+
+import logging
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+from jaxtyping import PyTree
+
+from verifai_jax._version import __version__
+from verifai_jax.addons.rl.policies import policy as load
+from verifai_jax.addons.training.sweeps.clock import Clock
+from verifai_jax.addons.training.sweeps.record import TrainedPolicy
+from verifai_jax.addons.training.sweeps.running import runs_of
+from verifai_jax.addons.training.sweeps.study import Study, StudyError
+from verifai_jax.core.compute.devices import describe_processor
+from verifai_jax.core.store import files
+from verifai_jax.core.store.cache import Cache
+from verifai_jax.core.store.locks import write_lock
+from verifai_jax.core.store.replacements import replacing_all
+
+CONFIGURATION, POLICY = "configuration.json", "policy.onnx"
+log = logging.getLogger("verifai_jax.sweeps")
+
+
+@dataclass(frozen=True, eq=False)
+class TrainedConfiguration:
+    """A configuration that was trained: all that is needed to train it again, and its policy.
+
+    - `study`: the name of the study.
+    - `hyperparameters`: their values, with `steps` if it was swept: those of the whole training.
+    - `seed`, `steps`: the training seed, and the environment steps of the policy.
+    - `certificate`: `verdict`, `failures`, `simulations`, the ends of the interval, and the nominal
+      return.
+    - `weights`: the checksum of the policy's numbers.
+    - `version`, `processor`: what determines the last digits of a training.
+    - `policy`: the policy.
+    """
+
+    study: str
+    hyperparameters: dict[str, Any]
+    seed: int
+    steps: int
+    certificate: dict[str, Any]
+    weights: int
+    version: str
+    processor: str
+    policy: TrainedPolicy = field(repr=False)
+
+    def export(self, folder: str | Path) -> Path:
+        """Write the configuration as JSON and its policy as ONNX; return the folder.
+
+        **Raises:** `MissingExtra` without the package onnx; `OSError` if the file system refuses.
+        """
+        folder = Path(folder)
+        with write_lock(folder), replacing_all(folder, (POLICY, CONFIGURATION)) as made:
+            self.policy.save(made / POLICY)
+            told = {name: value for name, value in vars(self).items() if name != "policy"}
+            files.write_record(made / CONFIGURATION, files.plain(told))
+        return folder
+
+    def train(self, study: Study) -> TrainedPolicy:
+        """Train the configuration again with its study, which has the trainer.
+
+        Where version and processor are the same the policy is the same, to the last bit; if it is
+        not, a warning says so.
+
+        **Raises:** `StudyError` for a study of another name or without a checkpoint at `steps`, and
+        with the reason if the training fails.
+        """
+        if study.name != self.study:
+            raise StudyError(f"the configuration is of {self.study!r}; got study {study.name!r}")
+        runs = runs_of(study, Cache(), Clock(study.name, None, False))
+        number = runs.add(self.hyperparameters, self.seed)
+        checkpoints = runs.runs[number].checkpoints
+        if self.steps not in checkpoints:
+            raise StudyError(f"its policy is that of {self.steps} steps; got {checkpoints}")
+        runs.train([number], checkpoints.index(self.steps))
+        trained = runs.checkpoint(number, checkpoints.index(self.steps))
+        if trained is None:
+            raise StudyError(f"the configuration does not train: {runs.errors[number]}")
+        if weights_of(trained.policy) != self.weights:
+            there = f"{self.processor}, version {self.version}"
+            here = f"{describe_processor()}, version {__version__}"
+            log.warning("the policy of %s has other numbers here: %s", there, here)
+        return trained.policy
+
+
+def weights_of(policy: PyTree) -> int:
+    """Return the checksum of all numbers of a policy."""
+    total = 0
+    for leaf in jax.tree.leaves(policy):
+        total = files.checksum(np.ascontiguousarray(leaf).tobytes(), total)
+    return total
+
+
+def load_configuration(folder: str | Path) -> TrainedConfiguration:
+    """Read a configuration that `Sweep.export` has written. The files never name code.
+
+    **Raises:** `FileNotFoundError` for a folder without one; `DamagedError` for one that has
+    changed since; the errors of `vj.policy`.
+    """
+    record = files.read_record(Path(folder) / CONFIGURATION)
+    try:
+        return TrainedConfiguration(**record, policy=load(Path(folder) / POLICY))
+    except TypeError as error:
+        raise files.DamagedError(f"{folder} has no configuration of a sweep: {error}") from error
