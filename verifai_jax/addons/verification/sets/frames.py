@@ -92,13 +92,14 @@ def framed(carry: Sequence[Form | Whole], boxes: int, features: int) -> list[For
 
 
 def of_layer(units: Form, features: int) -> Form:
-    """Return the numbers of a layer, an array with one axis, with each radius as a symbol."""
+    """Return the numbers of a layer with each radius as a symbol."""
     outer, bounded = units.frame, np.isfinite(units.radius)
     first = features if outer is None else outer.stop
-    count = units.shape[0]
+    count = int(np.prod(units.shape, dtype=np.int64))
     if first + count > MANY or units.radius[bounded].sum() <= WORTH * units.spread[bounded].sum():
         return units
-    own = np.where(bounded, units.radius, 0.0)[None] * np.eye(count)[:, None]
+    each = np.eye(count).reshape(count, 1, *units.shape)
+    own = np.where(bounded, units.radius, 0.0)[None] * each
     old = padded(units, first)
     old = np.broadcast_to(old, (first, *np.broadcast_shapes(old.shape[1:], own.shape[1:])))
     return Form(
