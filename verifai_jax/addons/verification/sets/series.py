@@ -1,0 +1,283 @@
+"""Taylor series of the solutions of a differential equation, on sets.
+
+    rates = Rates(program, order=4)                     # of a time and a state, as JAX traced it
+    found = rates(interpreter, shared, [time, *state], 3)
+    found[k][i]                                         # set of the k-th coefficient of rate i
+
+The operations of the rates become nodes, each once. Of each node the coefficients follow from those
+of its operands: sums and rearrangements act on each order alone, products are convolutions, and of
+a function the coefficients follow from those of its derivative, which JAX gives as more nodes:
+`k y[k] = sum_i i x[i] f'(x)[k - i]`.
+
+Source: R. Moore, Methods and applications of interval analysis, SIAM (1979), section 3.4.
+"""
+
+import functools
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from verifai_jax.addons.verification.sets.elementwise import levelled
+from verifai_jax.addons.verification.sets.form import (
+    Form,
+    add,
+    interval_product,
+    negative,
+    product,
+    rounding,
+    scaled,
+    spanned,
+)
+from verifai_jax.addons.verification.sets.functions import FUNCTIONS, quotient
+from verifai_jax.addons.verification.sets.interpreter import (
+    Equation,
+    Interpreter,
+    Program,
+    Value,
+    as_form,
+    constant,
+)
+from verifai_jax.core.compute.jaxprs import called, run_through
+
+CURVED = frozenset({
+    "acos", "acosh", "asin", "asinh", "atan", "atan2", "atanh", "cos", "cosh", "erf", "erfc", "exp",
+    "expm1", "integer_pow", "log", "log1p", "logistic", "pow", "rsqrt", "sin", "sinh", "sqrt",
+    "square", "tan", "tanh",
+})  # fmt: skip
+"""Functions with derivatives of all orders, which JAX knows."""
+LINEAR = frozenset({
+    "add", "add_any", "broadcast_in_dim", "concatenate", "copy", "convert_element_type", "cumsum",
+    "neg", "reduce_sum", "reshape", "rev", "slice", "split", "squeeze", "stack", "sub", "transpose",
+    "unstack",
+})  # fmt: skip
+"""Operations that are linear in all of their operands together."""
+SMOOTH = CURVED | LINEAR | {"div", "dot_general", "mul"}
+CHOOSING = {"select_n": (1, None), "dynamic_slice": (0, 1), "gather": (0, 1)}
+"""Operations that are linear in these operands alone; the others choose among them."""
+
+
+class Node(NamedTuple):
+    """One result of an operation, or without one an input; it may depend on time and state."""
+
+    step: Equation | None
+    operands: tuple[int, ...]
+    number: int
+    varies: bool
+
+
+class Rates:
+    """The rates of a differential equation as nodes, with coefficients up to an order.
+
+    Its program has the shared operands, which do not vary, as constants, and a time and a state as
+    inputs.
+    """
+
+    def __init__(self, program: Program, order: int) -> None:
+        self.order, self.nodes, self.numbers = order, list[Node](), dict[int, tuple]()
+        self._known: dict[tuple, list[int]] = {}
+        self._slopes: dict[int, list[tuple[int, int]]] = {}
+        shared = [self._new(None, (), i, False) for i in range(len(program.constvars))]
+        self.moving = [self._new(None, (), i, True) for i in range(len(program.invars))]
+        self.results = run_through(program, shared, self.moving, self._literal, self._added)
+        self.need = dict[int, int]()
+        """Greatest orders of nodes that coefficients of the results need."""
+        asked = [(result, order) for result in self.results]
+        while asked:
+            node, least = asked.pop()
+            if least <= self.need.get(node, -1):
+                continue
+            self.need[node] = least
+            asked += [(operand, least) for operand in self.nodes[node].operands]
+            asked += [(slope, least - 1) for _, slope in self.slopes(node)] if least else []
+
+    def _new(self, step: Equation | None, operands: tuple, number: int, varies: bool) -> int:
+        self.nodes.append(Node(step, operands, number, varies))
+        return len(self.nodes) - 1
+
+    def _literal(self, each: jax.extend.core.Literal) -> int:
+        return self._constant(each.val, each.aval.dtype)
+
+    def _constant(self, value: object, dtype: np.dtype) -> int:
+        key = ("number", np.asarray(value).tobytes(), np.shape(value), str(dtype))
+        if key not in self._known:
+            self._known[key] = [self._new(None, (), -1, False)]
+            self.numbers[self._known[key][0]] = value, dtype
+        return self._known[key][0]
+
+    def _added(self, step: Equation, operands: Sequence[int]) -> list[int]:
+        inner, name = called(step), step.primitive.name
+        if inner is not None:
+            consts = [self._constant(c, np.asarray(c).dtype) for c in getattr(inner, "consts", ())]
+            inner = getattr(inner, "jaxpr", inner)
+            return run_through(inner, consts, operands, self._literal, self._added)
+        if name == "integer_pow" and step.params["y"] == 1:
+            return [*operands]
+        ones = [self.numbers.get(each, (0.0,))[0] for each in operands]
+        if name == "mul" and any(np.ndim(one) == 0 and one == 1 for one in ones):
+            # What derivatives of functions multiply by.
+            return [operands[0] if np.ndim(ones[1]) == 0 and ones[1] == 1 else operands[1]]
+        if name == "square" or (name == "integer_pow" and step.params["y"] == 2):
+            operands = [*operands, *operands]
+        key = step.primitive, str(step.params), *operands
+        if key not in self._known:
+            varies = any(self.nodes[each].varies for each in operands)
+            self._known[key] = [
+                self._new(step, tuple(operands), i, varies) for i in range(len(step.outvars))
+            ]
+        return self._known[key]
+
+    def slopes(self, number: int) -> list[tuple[int, int]]:
+        """Return the operands of a function that vary, each with the derivative by it."""
+        node = self.nodes[number]
+        step = node.step
+        if step is None or not node.varies or step.primitive.name not in CURVED:
+            return []
+        if number not in self._slopes and len(set(node.operands)) == len(node.operands):
+            forms = [jax.ShapeDtypeStruct(v.aval.shape, v.aval.dtype) for v in step.invars]
+            found = self._slopes[number] = list[tuple[int, int]]()
+            for i, operand in enumerate(node.operands):
+                if not self.nodes[operand].varies:
+                    continue
+
+                def slope(*values: jax.Array, i: int = i) -> jax.Array:
+                    def of(x: jax.Array) -> jax.Array:
+                        return step.primitive.bind(*values[:i], x, *values[i + 1 :], **step.params)
+
+                    return jax.jvp(of, (values[i],), (jnp.ones_like(values[i]),))[1]
+
+                closed = jax.make_jaxpr(slope)(*forms)
+                consts = [self._constant(c, np.asarray(c).dtype) for c in closed.consts]
+                found += zip([operand], run_through(
+                    closed.jaxpr, consts, node.operands, self._literal, self._added
+                ), strict=True)  # fmt: skip
+        return self._slopes.get(number, [])
+
+    def __call__(
+        self, t: Interpreter, shared: Sequence[Value], moving: Sequence[Form], order: int
+    ) -> list[list[Form]]:
+        """Return the coefficients of the rates at a time and a state, from order 0 on."""
+        known: dict[tuple[int, int], Value | None] = {}
+        for number, (value, dtype) in self.numbers.items():
+            known[number, 0] = constant(value, dtype)
+        for number, node in enumerate(self.nodes):
+            if node.step is None and number not in self.numbers:
+                known[number, 0] = (moving if node.varies else shared)[node.number]
+        results = list[list[Form]]()
+        for k in range(order + 1):
+            for i, number in enumerate(self.moving):
+                if k == 1 and not i:
+                    known[number, 1] = constant(np.ones(moving[0].shape), moving[0].dtype)
+                elif k and i:
+                    rate = known[self.results[i - 1], k - 1]
+                    known[number, k] = rate and scaled(as_form(rate), np.array(1 / k))
+            for number, node in enumerate(self.nodes):
+                wanted = self.need.get(number, -1) - self.order + order >= k
+                if node.step is not None and wanted and (node.varies or not k):
+                    known[number, k] = self._coefficient(t, number, k, known)
+            results.append([
+                as_form(known.get((each, k)) or _zeros(known[each, 0])) for each in self.results
+            ])  # fmt: skip
+        return results
+
+    def _coefficient(
+        self, t: Interpreter, number: int, k: int, known: dict[tuple[int, int], Value | None]
+    ) -> Value | None:
+        """Return a coefficient of a node, None if it is zero."""
+        step, operands, output, _ = self.nodes[number]
+        assert step is not None
+        name, same = step.primitive.name, len(operands) == 2 and operands[0] == operands[1]
+        if not k:
+            if same and name in ("mul", "square", "integer_pow"):
+                return FUNCTIONS["square"](as_form(known[operands[0], 0]))
+            return t.step(step, [_known(known[each, 0]) for each in operands])[output]
+        a = [known.get((operands[0], i)) for i in range(k + 1)]
+        b = [known.get((operands[-1], i)) for i in range(k + 1)]
+        if same and name in ("mul", "square", "integer_pow"):
+            found = _dotted(a[: (k + 1) // 2], b[: k // 2 : -1])
+            middle = None if k % 2 else a[k // 2]
+            middle = middle and FUNCTIONS["square"](as_form(middle))
+            return _sum([found and scaled(found, np.array(2.0)), middle])
+        if name == "mul":
+            return _dotted(a, b[::-1])
+        if name == "dot_general":
+            pairs = [(x, y) for x, y in zip(a, b[::-1], strict=True) if x and y]
+            return _sum([t.step(step, [*pair])[0] for pair in pairs])
+        if name == "div":
+            rest = _dotted([known.get((number, i)) for i in range(k)], b[:0:-1])
+            rest = _sum([a[k], rest and negative(rest)])
+            return rest and quotient(*_two(rest, b[0]))
+        if name in CURVED:
+            rates = list[tuple[Value | None, Value | None]]()
+            for operand, slope in self.slopes(number):
+                for i in range(1, k + 1):
+                    moves = known.get((operand, i))
+                    moves = moves and scaled(as_form(moves), np.array(i / k))
+                    rates.append((moves, known.get((slope, k - i))))
+            return _dotted(*zip(*rates, strict=True))
+        if name in ("add", "add_any", "sub"):
+            return _sum([a[k], b[k] and negative(as_form(b[k])) if name == "sub" else b[k]])
+        first, last = CHOOSING.get(name, (0, None))
+        numbers = [known.get((each, k)) for each in operands[first:last]]
+        if not any(numbers):
+            return None
+        values = [
+            each or _zeros(known[operand, 0])
+            for each, operand in zip(numbers, operands[first:last], strict=True)
+        ]
+        before, after = operands[:first], [] if last is None else operands[last:]
+        rest = [[_known(known[each, 0]) for each in some] for some in (before, after)]
+        return t.step(step, [*rest[0], *values, *rest[1]])[output]
+
+
+def _known(value: Value | None) -> Value:
+    assert value is not None
+    return value
+
+
+def _zeros(like: Value | None) -> Value:
+    return constant(np.zeros(_known(like).shape), _known(like).dtype)
+
+
+def _two(a: Value | None, b: Value | None) -> tuple[Form, Form]:
+    one, other = levelled([_known(a), _known(b)])
+    return as_form(one), as_form(other)
+
+
+def _dotted(first: Sequence[Value | None], second: Sequence[Value | None]) -> Form | None:
+    """Return the sum of products of two rows, of intervals without a sum of affine forms each."""
+    pairs = [_two(a, b) for a, b in zip(first, second, strict=True) if a and b]
+    if len(pairs) > 1 and _are_intervals([form for pair in pairs for form in pair]):
+        rows = [_stacked([pair[i] for pair in pairs]) for i in (0, 1)]
+        return _total(*interval_product(*rows[0], *rows[1]), pairs[0][0])
+    return _sum([product(a, b, narrow=False) for a, b in pairs])
+
+
+def _sum(terms: Sequence[Value | None]) -> Form | None:
+    """Return the sum of those that are not zero."""
+    forms = [as_form(term) for term in terms if term is not None]
+    if len(forms) > 1 and _are_intervals(forms):
+        return _total(*_stacked([as_form(form) for form in levelled([*forms])]), forms[0])
+    return functools.reduce(lambda a, b: add(*_two(a, b)), forms) if forms else None
+
+
+def _are_intervals(forms: Sequence[Form]) -> bool:
+    return all(form.slopes is None and form.low is not None for form in forms)
+
+
+def _stacked(forms: Sequence[Form]) -> tuple[np.ndarray, np.ndarray]:
+    """Return the ends of intervals, one row for each."""
+    shape = len(forms), *np.broadcast_shapes(*(form.centre.shape for form in forms))
+    ends = np.empty(shape), np.empty(shape)
+    for i, form in enumerate(forms):
+        ends[0][i], ends[1][i] = form.bounds()
+    return ends
+
+
+def _total(low: np.ndarray, high: np.ndarray, like: Form) -> Form:
+    """Return the sum of rows, whose rounding is relative to each of them."""
+    unit = 2 * (len(low) + 2) * rounding(like.dtype).unit
+    low, high = low - unit * np.abs(low), high + unit * np.abs(high)
+    return spanned(low.sum(0), high.sum(0), like.dtype)
