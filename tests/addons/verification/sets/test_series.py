@@ -45,12 +45,21 @@ def rarer(t, x):
     )  # fmt: skip
 
 
+def held(t, x):
+    """A rate that does not vary: its state is linear in time."""
+    return jnp.concatenate([x[1:], jnp.ones(1)]) * jnp.array([1.0, 1.0, 0.5])
+
+
+def constant_rates(t, x):
+    return jnp.array([1.0, 2.0, -0.5])
+
+
 def chosen(t, x):
     return jnp.where(jnp.array([True, False, True]), x * x, t * x)
 
 
 CASES = [
-    polynomial, ratio, chosen,
+    polynomial, ratio, chosen, held, constant_rates,
     *(pytest.param(each, marks=pytest.mark.thorough) for each in (turned, network, rooted, rarer)),
 ]  # fmt: skip
 

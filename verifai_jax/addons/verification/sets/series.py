@@ -171,7 +171,7 @@ class Rates:
                 if k == 1 and not i:
                     known[number, 1] = constant(np.ones(moving[0].shape), moving[0].dtype)
                 elif k and i:
-                    rate = known[self.results[i - 1], k - 1]
+                    rate = known.get((self.results[i - 1], k - 1))
                     known[number, k] = rate and scaled(as_form(rate), np.array(1 / k))
             for number, node in enumerate(self.nodes):
                 wanted = self.need.get(number, -1) - self.order + order >= k
