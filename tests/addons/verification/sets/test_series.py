@@ -45,6 +45,12 @@ def rarer(t, x):
     )  # fmt: skip
 
 
+def twice(t, x):
+    """The same number as both operands, and as the exponent."""
+    y = 1.5 + x
+    return y**y + jnp.arctan2(y, y) + (x * t) * (x * t) + jnp.square(x)
+
+
 def held(t, x):
     """A rate that does not vary: its state is linear in time."""
     return jnp.concatenate([x[1:], jnp.ones(1)]) * jnp.array([1.0, 1.0, 0.5])
@@ -60,7 +66,7 @@ def chosen(t, x):
 
 CASES = [
     polynomial, ratio, chosen, held, constant_rates,
-    *(pytest.param(each, marks=pytest.mark.thorough) for each in (turned, network, rooted, rarer)),
+    *(pytest.param(each, marks=pytest.mark.thorough) for each in (turned, network, rooted, rarer, twice)),
 ]  # fmt: skip
 
 

@@ -13,7 +13,6 @@ ordinary differential equations, Applied Mathematics and Computation 105 (1999),
 """
 
 from collections.abc import Callable, Sequence
-from functools import lru_cache
 from typing import Any
 
 import jax
@@ -26,15 +25,11 @@ from verifai_jax.addons.verification.sets.form import SLACK, Form, Reals, add, j
 from verifai_jax.addons.verification.sets.interpreter import (
     Equation,
     Interpreter,
-    MissingRule,
-    Program,
     Value,
     as_form,
     rule,
 )
-from verifai_jax.addons.verification.sets.series import CHOOSING, SMOOTH, Rates
-from verifai_jax.core.compute.jaxprs import called, run_through
-from verifai_jax.core.user_code.user_errors import source_line
+from verifai_jax.addons.verification.sets.series import Rates
 
 ORDER = 4
 """Order of the polynomials: that of the Runge-Kutta method whose step they take."""
@@ -61,10 +56,9 @@ def flow(
 
     time = jnp.asarray(time, leaves[0].dtype)
     closed = jax.make_jaxpr(rates)(time, *leaves)
-    _varying(closed.jaxpr, [True] * (1 + len(leaves)))
     results = _solution.bind(
-        *closed.consts, time, jnp.asarray(seconds, time.dtype), *leaves, program=closed.jaxpr,
-        text=str(closed.jaxpr), shared=len(closed.consts),
+        *closed.consts, time, jnp.asarray(seconds, time.dtype), *leaves,
+        rates=Rates(closed.jaxpr, ORDER), text=str(closed.jaxpr), shared=len(closed.consts),
     )  # fmt: skip
     return tree.unflatten(results[: len(leaves)]), tree.unflatten(results[len(leaves) :])
 
@@ -74,47 +68,17 @@ def _forms(*operands: Any, shared: int, **params: Any) -> list[Any]:
     return [*operands[shared + 2 :]] * 2
 
 
-def _varying(program: Program, inputs: Sequence[bool]) -> list[bool]:
-    """Return which results depend on time or state, and refuse what is not smooth in them."""
-
-    def step(each: Equation, operands: list[bool]) -> list[bool]:
-        inner, name = called(each), each.primitive.name
-        if inner is not None:
-            return _varying(getattr(inner, "jaxpr", inner), operands)
-        first, last = CHOOSING.get(name, (0, None))
-        choices = operands[:first] + ([] if last is None else operands[last:])
-        real = all(jnp.issubdtype(out.aval.dtype, jnp.floating) for out in each.outvars)
-        smooth = name in SMOOTH or (name in CHOOSING and not any(choices))
-        if any(operands) and not (smooth and real):
-            line = source_line(each.source_info.traceback)
-            raise MissingRule(
-                f"the dynamics apply {name} to the state or the time{f' ({line})' * bool(line)}, "
-                "which is not smooth, or has no Taylor series here: continuous=True needs smooth "
-                "dynamics; move switching and saturation into the controller"
-            )
-        return [any(operands)] * len(each.outvars)
-
-    constants = [False] * len(program.constvars)
-    return run_through(program, constants, inputs, lambda _: False, step)
-
-
 @rule("flow")
 def _flow(t: Interpreter, step: Equation, inputs: list[Value]) -> list[Value]:
-    shared, program, text = (step.params[name] for name in ("shared", "program", "text"))
+    shared, rates, text = (step.params[name] for name in ("shared", "rates", "text"))
     time, seconds, *state = map(as_form, inputs[shared:])
     length = float(seconds.centre.flat[0])
     # The signals of a step and its end are asked for one after the other.
     key = text, length, *map(id, inputs[:shared]), id(time), *map(id, state)
     if t.latest is None or t.latest[0] != key:
-        step_of = _Step(t, program, inputs[:shared])
+        step_of = _Step(t, rates, inputs[:shared])
         t.latest = key, inputs, step_of(time, state, length)
     return list(t.latest[2])
-
-
-@lru_cache(maxsize=64)
-def _rates(program: Program) -> Rates:
-    """Return the rates of a program as nodes; a program is a step's, and lives as long."""
-    return Rates(program, ORDER)
 
 
 class _Step:
@@ -123,8 +87,8 @@ class _Step:
     Their operands are the `shared` ones, which do not change, a time, and the arrays of a state.
     """
 
-    def __init__(self, t: Interpreter, program: Program, shared: Sequence[Value]):
-        self.t, self.rates = t, _rates(program)
+    def __init__(self, t: Interpreter, rates: Rates, shared: Sequence[Value]):
+        self.t, self.rates = t, rates
         self.boxes, self.shared = t.boxes, shared
         self.apart = [_hull(v) if isinstance(v, Form) else v for v in shared]
 

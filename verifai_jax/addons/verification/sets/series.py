@@ -1,24 +1,24 @@
 """Taylor series of the solutions of a differential equation, on sets.
 
     rates = Rates(program, order=4)                     # of a time and a state, as JAX traced it
-    found = rates(interpreter, shared, [time, *state], 3)
-    found[k][i]                                         # set of the k-th coefficient of rate i
+    rates(interpreter, shared, [time, *state], 3)[k][i] # set of the k-th coefficient of rate i
 
-The operations of the rates become nodes, each once. Of each node the coefficients follow from those
-of its operands: sums and rearrangements act on each order alone, products are convolutions, and of
-a function the coefficients follow from those of its derivative, which JAX gives as more nodes:
-`k y[k] = sum_i i x[i] f'(x)[k - i]`.
+The operations of the rates become nodes, each once. Sums and rearrangements act on coefficients of
+one order, products are convolutions, and those of a function follow from its derivative, which JAX
+gives as more nodes: `k y[k] = sum_i i x[i] f'(x)[k - i]`.
 
 Source: R. Moore, Methods and applications of interval analysis, SIAM (1979), section 3.4.
 """
 
 import functools
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import Array
+from jax.typing import ArrayLike
 
 from verifai_jax.addons.verification.sets.elementwise import levelled
 from verifai_jax.addons.verification.sets.form import (
@@ -35,12 +35,14 @@ from verifai_jax.addons.verification.sets.functions import FUNCTIONS, quotient
 from verifai_jax.addons.verification.sets.interpreter import (
     Equation,
     Interpreter,
+    MissingRule,
     Program,
     Value,
     as_form,
     constant,
 )
 from verifai_jax.core.compute.jaxprs import called, run_through
+from verifai_jax.core.user_code.user_errors import source_line
 
 CURVED = frozenset({
     "acos", "acosh", "asin", "asinh", "atan", "atan2", "atanh", "cos", "cosh", "erf", "erfc", "exp",
@@ -73,6 +75,8 @@ class Rates:
 
     Its program has the shared operands, which do not vary, as constants, and a time and a state as
     inputs.
+
+    **Raises:** `MissingRule` for rates that are not smooth, with the operation and its line.
     """
 
     def __init__(self, program: Program, order: int) -> None:
@@ -97,62 +101,82 @@ class Rates:
         self.nodes.append(Node(step, operands, number, varies))
         return len(self.nodes) - 1
 
-    def _literal(self, each: jax.extend.core.Literal) -> int:
-        return self._constant(each.val, each.aval.dtype)
-
-    def _constant(self, value: object, dtype: np.dtype) -> int:
-        key = ("number", np.asarray(value).tobytes(), np.shape(value), str(dtype))
+    def _number(self, value: ArrayLike, dtype: np.dtype) -> int:
+        key = np.asarray(value).tobytes(), np.shape(value), str(dtype)
         if key not in self._known:
             self._known[key] = [self._new(None, (), -1, False)]
             self.numbers[self._known[key][0]] = value, dtype
         return self._known[key][0]
 
+    def _through(self, closed: Program, operands: Sequence[int]) -> list[int]:
+        """Return the results of a program; one without constants may be a `Jaxpr`."""
+        consts = [self._number(c, np.asarray(c).dtype) for c in getattr(closed, "consts", ())]
+        inner = getattr(closed, "jaxpr", closed)
+        return run_through(inner, consts, operands, self._literal, self._added)
+
+    def _literal(self, each: Any) -> int:
+        return self._number(each.val, each.aval.dtype)
+
     def _added(self, step: Equation, operands: Sequence[int]) -> list[int]:
         inner, name = called(step), step.primitive.name
         if inner is not None:
-            consts = [self._constant(c, np.asarray(c).dtype) for c in getattr(inner, "consts", ())]
-            inner = getattr(inner, "jaxpr", inner)
-            return run_through(inner, consts, operands, self._literal, self._added)
+            return self._through(inner, operands)
         if name == "integer_pow" and step.params["y"] == 1:
             return [*operands]
-        ones = [self.numbers.get(each, (0.0,))[0] for each in operands]
-        if name == "mul" and any(np.ndim(one) == 0 and one == 1 for one in ones):
-            # What derivatives of functions multiply by.
-            return [operands[0] if np.ndim(ones[1]) == 0 and ones[1] == 1 else operands[1]]
+        for one, other in ((0, -1), (-1, 0)) if name == "mul" else ():
+            if np.array_equal(self.numbers.get(operands[one], (0.0,))[0], 1.0):
+                # What derivatives of functions multiply by.
+                return [operands[other]]
+        varies = [self.nodes[each].varies for each in operands]
+        if name == "pow" and varies[1]:
+            forms = [jax.ShapeDtypeStruct(v.aval.shape, v.aval.dtype) for v in step.invars]
+            return self._through(
+                jax.make_jaxpr(lambda x, y: jnp.exp(y * jnp.log(x)))(*forms), operands
+            )
+        first, last = CHOOSING.get(name, (0, None))
+        choices = varies[:first] + ([] if last is None else varies[last:])
+        real = all(jnp.issubdtype(out.aval.dtype, jnp.floating) for out in step.outvars)
+        smooth = name in SMOOTH or (name in CHOOSING and not any(choices))
+        if any(varies) and not (smooth and real):
+            line = source_line(step.source_info.traceback)
+            raise MissingRule(
+                f"the dynamics apply {name} to the state or the time{f' ({line})' * bool(line)}, "
+                "which is not smooth, or has no Taylor series here: continuous=True needs smooth "
+                "dynamics; move switching and saturation into the controller"
+            )
         if name == "square" or (name == "integer_pow" and step.params["y"] == 2):
             operands = [*operands, *operands]
         key = step.primitive, str(step.params), *operands
         if key not in self._known:
-            varies = any(self.nodes[each].varies for each in operands)
             self._known[key] = [
-                self._new(step, tuple(operands), i, varies) for i in range(len(step.outvars))
+                self._new(step, tuple(operands), i, any(varies)) for i in range(len(step.outvars))
             ]
         return self._known[key]
 
+    def _is_square(self, number: int) -> bool:
+        step, operands, *_ = self.nodes[number]
+        name = "" if step is None else step.primitive.name
+        return name in ("mul", "square", "integer_pow") and operands[1:] == operands[:1]
+
     def slopes(self, number: int) -> list[tuple[int, int]]:
         """Return the operands of a function that vary, each with the derivative by it."""
-        node = self.nodes[number]
-        step = node.step
-        if step is None or not node.varies or step.primitive.name not in CURVED:
+        step, operands, _, varies = self.nodes[number]
+        if step is None or not varies or step.primitive.name not in CURVED:
             return []
-        if number not in self._slopes and len(set(node.operands)) == len(node.operands):
+        if number not in self._slopes and not self._is_square(number):
             forms = [jax.ShapeDtypeStruct(v.aval.shape, v.aval.dtype) for v in step.invars]
-            found = self._slopes[number] = list[tuple[int, int]]()
-            for i, operand in enumerate(node.operands):
-                if not self.nodes[operand].varies:
-                    continue
+            self._slopes[number] = []
+            for i, operand in enumerate(operands):
 
-                def slope(*values: jax.Array, i: int = i) -> jax.Array:
-                    def of(x: jax.Array) -> jax.Array:
+                def slope(*values: Array, i: int = i) -> Array:
+                    def of(x: Array) -> Array:
                         return step.primitive.bind(*values[:i], x, *values[i + 1 :], **step.params)
 
                     return jax.jvp(of, (values[i],), (jnp.ones_like(values[i]),))[1]
 
-                closed = jax.make_jaxpr(slope)(*forms)
-                consts = [self._constant(c, np.asarray(c).dtype) for c in closed.consts]
-                found += zip([operand], run_through(
-                    closed.jaxpr, consts, node.operands, self._literal, self._added
-                ), strict=True)  # fmt: skip
+                if self.nodes[operand].varies:
+                    (found,) = self._through(jax.make_jaxpr(slope)(*forms), operands)
+                    self._slopes[number].append((operand, found))
         return self._slopes.get(number, [])
 
     def __call__(
@@ -188,14 +212,14 @@ class Rates:
         """Return a coefficient of a node, None if it is zero."""
         step, operands, output, _ = self.nodes[number]
         assert step is not None
-        name, same = step.primitive.name, len(operands) == 2 and operands[0] == operands[1]
+        name, square = step.primitive.name, self._is_square(number)
         if not k:
-            if same and name in ("mul", "square", "integer_pow"):
+            if square:
                 return FUNCTIONS["square"](as_form(known[operands[0], 0]))
             return t.step(step, [_known(known[each, 0]) for each in operands])[output]
         a = [known.get((operands[0], i)) for i in range(k + 1)]
         b = [known.get((operands[-1], i)) for i in range(k + 1)]
-        if same and name in ("mul", "square", "integer_pow"):
+        if square:
             found = _dotted(a[: (k + 1) // 2], b[: k // 2 : -1])
             middle = None if k % 2 else a[k // 2]
             middle = middle and FUNCTIONS["square"](as_form(middle))
