@@ -38,7 +38,6 @@ from verifai_jax.addons.verification.sets.interpreter import (
     MissingRule,
     Program,
     Value,
-    as_form,
     constant,
 )
 from verifai_jax.core.compute.jaxprs import called, run_through
@@ -184,94 +183,78 @@ class Rates:
     ) -> list[list[Form]]:
         """Return the coefficients of the rates at a time and a state, from order 0 on."""
         known: dict[tuple[int, int], Value | None] = {}
-        for number, (value, dtype) in self.numbers.items():
-            known[number, 0] = constant(value, dtype)
         for number, node in enumerate(self.nodes):
-            if node.step is None and number not in self.numbers:
+            if number in self.numbers:
+                known[number, 0] = constant(*self.numbers[number])
+            elif node.step is None:
                 known[number, 0] = (moving if node.varies else shared)[node.number]
-        results = list[list[Form]]()
+        one = constant(np.ones(moving[0].shape), moving[0].dtype)
+
+        def coefficient(number: int, k: int) -> Any:
+            """Return a coefficient, None if it is zero."""
+            return known[number, k] if self.nodes[number].varies or not k else None
+
+        def zeros(number: int) -> Value:
+            like = coefficient(number, 0)
+            return constant(np.zeros(like.shape), like.dtype)
+
+        def added(number: int, k: int) -> Value | None:
+            (step, operands, output, _), find = self.nodes[number], coefficient
+            assert step is not None
+            name, square = step.primitive.name, self._is_square(number)
+            if not k:
+                first = [find(each, 0) for each in operands]
+                return FUNCTIONS["square"](first[0]) if square else t.step(step, first)[output]
+            a, b = ([find(operands[at], i) for i in range(k + 1)] for at in (0, -1))
+            if square:
+                found = _dotted(a[: (k + 1) // 2], b[: k // 2 : -1])
+                middle = None if k % 2 else a[k // 2]
+                middle = middle and FUNCTIONS["square"](middle)
+                return _sum([found and scaled(found, np.array(2.0)), middle])
+            if name == "mul":
+                return _dotted(a, b[::-1])
+            if name == "dot_general":
+                pairs = [(x, y) for x, y in zip(a, b[::-1], strict=True) if x and y]
+                return _sum([t.step(step, [*pair])[0] for pair in pairs])
+            if name == "div":
+                rest = _dotted([find(number, i) for i in range(k)], b[:0:-1])
+                rest = _sum([a[k], rest and negative(rest)])
+                return rest and quotient(*_two(rest, b[0]))
+            if name in CURVED:
+                rates = [(find(each, i), i / k, find(slope, k - i))
+                         for each, slope in self.slopes(number) for i in range(1, k + 1)]  # fmt: skip
+                moves = [x and scaled(x, np.array(share)) for x, share, _ in rates]
+                return _dotted(moves, [slope for *_, slope in rates])
+            if name in ("add", "add_any", "sub"):
+                return _sum([a[k], negative(b[k]) if name == "sub" and b[k] else b[k]])
+            moved = range(len(operands))[slice(*CHOOSING.get(name, (0, None)))]
+            if not any(find(operands[i], k) for i in moved):
+                return None
+            return t.step(step, [
+                (find(each, k) or zeros(each)) if i in moved else find(each, 0)
+                for i, each in enumerate(operands)
+            ])[output]  # fmt: skip
+
         for k in range(order + 1):
-            for i, number in enumerate(self.moving):
-                if k == 1 and not i:
-                    known[number, 1] = constant(np.ones(moving[0].shape), moving[0].dtype)
-                elif k and i:
-                    rate = known.get((self.results[i - 1], k - 1))
-                    known[number, k] = rate and scaled(as_form(rate), np.array(1 / k))
+            if k:
+                known[self.moving[0], k] = one if k == 1 else None
+                for number, result in zip(self.moving[1:], self.results, strict=True):
+                    rate = coefficient(result, k - 1)
+                    known[number, k] = rate and scaled(rate, np.array(1 / k))
             for number, node in enumerate(self.nodes):
                 wanted = self.need.get(number, -1) - self.order + order >= k
                 if node.step is not None and wanted and (node.varies or not k):
-                    known[number, k] = self._coefficient(t, number, k, known)
-            results.append([
-                as_form(known.get((each, k)) or _zeros(known[each, 0])) for each in self.results
-            ])  # fmt: skip
-        return results
-
-    def _coefficient(
-        self, t: Interpreter, number: int, k: int, known: dict[tuple[int, int], Value | None]
-    ) -> Value | None:
-        """Return a coefficient of a node, None if it is zero."""
-        step, operands, output, _ = self.nodes[number]
-        assert step is not None
-        name, square = step.primitive.name, self._is_square(number)
-        if not k:
-            if square:
-                return FUNCTIONS["square"](as_form(known[operands[0], 0]))
-            return t.step(step, [_known(known[each, 0]) for each in operands])[output]
-        a = [known.get((operands[0], i)) for i in range(k + 1)]
-        b = [known.get((operands[-1], i)) for i in range(k + 1)]
-        if square:
-            found = _dotted(a[: (k + 1) // 2], b[: k // 2 : -1])
-            middle = None if k % 2 else a[k // 2]
-            middle = middle and FUNCTIONS["square"](as_form(middle))
-            return _sum([found and scaled(found, np.array(2.0)), middle])
-        if name == "mul":
-            return _dotted(a, b[::-1])
-        if name == "dot_general":
-            pairs = [(x, y) for x, y in zip(a, b[::-1], strict=True) if x and y]
-            return _sum([t.step(step, [*pair])[0] for pair in pairs])
-        if name == "div":
-            rest = _dotted([known.get((number, i)) for i in range(k)], b[:0:-1])
-            rest = _sum([a[k], rest and negative(rest)])
-            return rest and quotient(*_two(rest, b[0]))
-        if name in CURVED:
-            rates = list[tuple[Value | None, Value | None]]()
-            for operand, slope in self.slopes(number):
-                for i in range(1, k + 1):
-                    moves = known.get((operand, i))
-                    moves = moves and scaled(as_form(moves), np.array(i / k))
-                    rates.append((moves, known.get((slope, k - i))))
-            return _dotted(*zip(*rates, strict=True))
-        if name in ("add", "add_any", "sub"):
-            return _sum([a[k], b[k] and negative(as_form(b[k])) if name == "sub" else b[k]])
-        first, last = CHOOSING.get(name, (0, None))
-        numbers = [known.get((each, k)) for each in operands[first:last]]
-        if not any(numbers):
-            return None
-        values = [
-            each or _zeros(known[operand, 0])
-            for each, operand in zip(numbers, operands[first:last], strict=True)
-        ]
-        before, after = operands[:first], [] if last is None else operands[last:]
-        rest = [[_known(known[each, 0]) for each in some] for some in (before, after)]
-        return t.step(step, [*rest[0], *values, *rest[1]])[output]
+                    known[number, k] = added(number, k)
+        orders = range(order + 1)
+        return [[coefficient(i, k) or zeros(i) for i in self.results] for k in orders]
 
 
-def _known(value: Value | None) -> Value:
-    assert value is not None
-    return value
+def _two(a: Any, b: Any) -> Any:
+    return levelled([a, b])
 
 
-def _zeros(like: Value | None) -> Value:
-    return constant(np.zeros(_known(like).shape), _known(like).dtype)
-
-
-def _two(a: Value | None, b: Value | None) -> tuple[Form, Form]:
-    one, other = levelled([_known(a), _known(b)])
-    return as_form(one), as_form(other)
-
-
-def _dotted(first: Sequence[Value | None], second: Sequence[Value | None]) -> Form | None:
-    """Return the sum of products of two rows, of intervals without a sum of affine forms each."""
+def _dotted(first: Sequence[Any], second: Sequence[Any]) -> Form | None:
+    """Return the sum of products of two rows, in which None is zero."""
     pairs = [_two(a, b) for a, b in zip(first, second, strict=True) if a and b]
     if len(pairs) > 1 and _are_intervals([form for pair in pairs for form in pair]):
         rows = [_stacked([pair[i] for pair in pairs]) for i in (0, 1)]
@@ -279,11 +262,11 @@ def _dotted(first: Sequence[Value | None], second: Sequence[Value | None]) -> Fo
     return _sum([product(a, b, narrow=False) for a, b in pairs])
 
 
-def _sum(terms: Sequence[Value | None]) -> Form | None:
-    """Return the sum of those that are not zero."""
-    forms = [as_form(term) for term in terms if term is not None]
+def _sum(terms: Sequence[Any]) -> Form | None:
+    """Return the sum of a row."""
+    forms = [term for term in terms if term is not None]
     if len(forms) > 1 and _are_intervals(forms):
-        return _total(*_stacked([as_form(form) for form in levelled([*forms])]), forms[0])
+        return _total(*_stacked(levelled(forms)), forms[0])
     return functools.reduce(lambda a, b: add(*_two(a, b)), forms) if forms else None
 
 
@@ -291,17 +274,15 @@ def _are_intervals(forms: Sequence[Form]) -> bool:
     return all(form.slopes is None and form.low is not None for form in forms)
 
 
-def _stacked(forms: Sequence[Form]) -> tuple[np.ndarray, np.ndarray]:
-    """Return the ends of intervals, one row for each."""
-    shape = len(forms), *np.broadcast_shapes(*(form.centre.shape for form in forms))
-    ends = np.empty(shape), np.empty(shape)
-    for i, form in enumerate(forms):
-        ends[0][i], ends[1][i] = form.bounds()
-    return ends
+def _stacked(forms: Sequence[Any]) -> np.ndarray:
+    """Return the ends of intervals, a row for each."""
+    shape = np.broadcast_shapes(*(form.centre.shape for form in forms))
+    ends = [np.broadcast_to(end, shape) for form in forms for end in form.bounds()]
+    return np.stack([np.stack(ends[::2]), np.stack(ends[1::2])])
 
 
 def _total(low: np.ndarray, high: np.ndarray, like: Form) -> Form:
-    """Return the sum of rows, whose rounding is relative to each of them."""
+    """Return the sum of rows of intervals, whose rounding is relative to each of them."""
     unit = 2 * (len(low) + 2) * rounding(like.dtype).unit
     low, high = low - unit * np.abs(low), high + unit * np.abs(high)
     return spanned(low.sum(0), high.sum(0), like.dtype)
