@@ -221,10 +221,10 @@ class Rates:
                 rest = _sum([a[k], rest and negative(rest)])
                 return rest and quotient(*_two(rest, b[0]))
             if name in CURVED:
-                rates = [(find(each, i), i / k, find(slope, k - i))
-                         for each, slope in self.slopes(number) for i in range(1, k + 1)]  # fmt: skip
-                moves = [x and scaled(x, np.array(share)) for x, share, _ in rates]
-                return _dotted(moves, [slope for *_, slope in rates])
+                pairs = [(*both, i) for both in self.slopes(number) for i in range(1, k + 1)]
+                moves = [(find(each, i), np.array(i / k)) for each, _, i in pairs]
+                rates = [find(slope, k - i) for _, slope, i in pairs]
+                return _dotted([x and scaled(x, share) for x, share in moves], rates)
             if name in ("add", "add_any", "sub"):
                 return _sum([a[k], negative(b[k]) if name == "sub" and b[k] else b[k]])
             moved = range(len(operands))[slice(*CHOOSING.get(name, (0, None)))]
