@@ -207,16 +207,10 @@ def unknown(low: Reals, high: Reals) -> Reals:
 
 
 def rounded(
-    centre: Reals,
-    slopes: Reals | None,
-    radius: Reals,
-    size: Reals,
-    dtype: np.dtype,
-    ends: tuple[Reals, Reals] | None = None,
-    frame: Frame | None = None,
-    units: float = 1.0,
+    centre: Reals, slopes: Reals | None, radius: Reals, size: Reals, dtype: np.dtype,
+    ends: tuple[Reals, Reals] | None = None, frame: Frame | None = None, units: float = 1.0,
     exact: bool = False,
-) -> Form:
+) -> Form:  # fmt: skip
     """Return the result of an operation, widened by its error in so many units of rounding.
 
     So are the `ends` of its interval; what is `exact` is never rounded, such as a maximum.

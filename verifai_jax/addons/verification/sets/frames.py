@@ -79,7 +79,7 @@ def framed(carry: Sequence[Form | Whole], boxes: int, features: int) -> list[For
         own = new[:, :, part].reshape(len(new), *shape)
         # Bounded numbers get no interval: what is computed with it would cost, and is no tighter.
         limits = (None, None) if np.isfinite(pieces[1]).all() else pieces[3:]
-        out[i] = Form(*pieces[:1], own, *pieces[1:3], value.dtype, *limits, frame)
+        out[i] = Form(pieces[0], own, pieces[1], pieces[2], value.dtype, *limits, frame)
     return out
 
 

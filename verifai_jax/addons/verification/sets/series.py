@@ -180,7 +180,7 @@ class Rates:
 
     def __call__(
         self, t: Interpreter, shared: Sequence[Value], moving: Sequence[Form], order: int
-    ) -> list[list[Form]]:
+    ) -> list[list[Any]]:
         """Return the coefficients of the rates at a time and a state, from order 0 on."""
         known: dict[tuple[int, int], Value | None] = {}
         for number, node in enumerate(self.nodes):
@@ -194,7 +194,7 @@ class Rates:
             """Return a coefficient, None if it is zero."""
             return known[number, k] if self.nodes[number].varies or not k else None
 
-        def zeros(number: int) -> Value:
+        def zeros(number: int) -> Any:
             like = coefficient(number, 0)
             return constant(np.zeros(like.shape), like.dtype)
 
@@ -274,7 +274,7 @@ def _are_intervals(forms: Sequence[Form]) -> bool:
     return all(form.slopes is None and form.low is not None for form in forms)
 
 
-def _stacked(forms: Sequence[Any]) -> np.ndarray:
+def _stacked(forms: Sequence[Any]) -> Any:
     """Return the ends of intervals, a row for each."""
     shape = np.broadcast_shapes(*(form.centre.shape for form in forms))
     ends = [np.broadcast_to(end, shape) for form in forms for end in form.bounds()]
