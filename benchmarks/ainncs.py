@@ -279,7 +279,7 @@ def attitude(folder: Path) -> vj.Problem:
     return held("attitude", rates, network, start, 3.0, 0.1, f"always not ({unsafe})")
 
 
-def quadrotor(folder: Path) -> vj.Problem:
+def quadrotor(folder: Path, half: float = 0.4) -> vj.Problem:
     """Quadrotor: after five seconds it hovers at the height of one metre."""
     network = from_onnx(folder / "quadrotor.onnx")
     g, m, jx, jy, jz = 9.81, 1.4, 0.054, 0.054, 0.104
@@ -299,9 +299,14 @@ def quadrotor(folder: Path) -> vj.Problem:
             (jx - jy) / jz * p * q,
         )  # fmt: skip
 
-    start = {f"x{i}": (-0.4, 0.4) if i <= 6 else (0.0, 0.0) for i in range(1, 13)}
+    start = {f"x{i}": (-half, half) if i <= 6 else (0.0, 0.0) for i in range(1, 13)}
     spec = "always[5, 5] (x3 >= 0.94 & x3 <= 1.06)"
     return held("quadrotor", rates, network, start, 5.0, 0.1, spec)
+
+
+def quadrotor_part(folder: Path) -> vj.Problem:
+    """Three tenths of the quadrotor's initial set in each of its coordinates."""
+    return quadrotor(folder, 0.12)
 
 
 def docking(folder: Path) -> vj.Problem:
@@ -358,7 +363,8 @@ def _vcas(folder: Path, climb: float) -> vj.Problem:
 PROBLEMS: dict[str, Callable[[Path], vj.Problem]] = {
     each.__name__: each for each in (
         acc, tora, tora_relu_tanh, tora_sigmoid, unicycle, single_pendulum, single_pendulum_less,
-        double_pendulum_less, double_pendulum_more, airplane, attitude, quadrotor, docking,
+        double_pendulum_less, double_pendulum_more, airplane, attitude, quadrotor, quadrotor_part,
+        docking,
     )
 } | {
     f"vcas_{str(-climb).replace('.', '_')}": lambda folder, climb=climb: _vcas(folder, climb)

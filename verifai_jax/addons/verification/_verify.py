@@ -29,18 +29,10 @@ CONTRADICTED = (
 @suggests_options
 @shows_progress("verifying")
 def verify(
-    problem: Problem,
-    *,
-    boxes: int | None = None,
-    stop: Stop | None = None,
-    samples: int = 4096,
-    confidence: float = 0.95,
-    seed: int = 0,
-    precision: str = "float32",
-    continuous: bool = False,
-    resume: Verification | str | Path | None = None,
-    progress: bool | None = None,
-) -> Verification:
+    problem: Problem, *, boxes: int | None = None, stop: Stop | None = None, samples: int = 4096,
+    confidence: float = 0.95, seed: int = 0, precision: str = "float32", continuous: bool = False,
+    resume: Verification | str | Path | None = None, progress: bool | None = None,
+) -> Verification:  # fmt: skip
     """Divide the feature space into boxes that are proved, broken, or undecided.
 
     Each box is simulated with sets of numbers. It is *proved* if the robustness is at least zero

@@ -8,9 +8,8 @@ evaluated with sets. The bounds hold for each simulation with features between t
 corners, in real arithmetic and in the precision of the simulation.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from functools import cache
 from typing import Any, NamedTuple
 
 import jax
@@ -20,7 +19,6 @@ from jaxtyping import Array, Bool, Float, PyTree
 
 from verifai_jax.addons.verification.ranges import FeatureRanges
 from verifai_jax.addons.verification.sets import Form, Interpreter, Whole
-from verifai_jax.addons.verification.sets.functions import FUNCTIONS
 from verifai_jax.addons.verification.sets.interpreter import Value, as_form, as_whole
 from verifai_jax.core.compute.cores import available_cores
 from verifai_jax.core.compute.fingerprint import without_unused
@@ -28,7 +26,6 @@ from verifai_jax.core.compute.precision import in_precision
 from verifai_jax.evaluation.backends import resolved
 from verifai_jax.evaluation.verdicts import boolean_semantics, trace_verdict
 from verifai_jax.problem.problem import Problem, ProblemError
-from verifai_jax.systems.ode import sin_cos
 
 TOGETHER = 512
 """Boxes that are evaluated at once: the arrays of a step then fit the cache."""
@@ -124,7 +121,7 @@ class Enclosure:
         return Bounds(lowest, high.min(1), holds, truth, outside, moves)
 
     def _evaluated(self, program: Any, leaves: Sequence[Value], count: int) -> list[Value]:
-        interpreter = Interpreter(count, self.dim, _known)
+        interpreter = Interpreter(count, self.dim)
         with in_precision(self.precision):
             return interpreter(program, leaves)
 
@@ -189,35 +186,3 @@ def _program(function: Any, form: PyTree) -> Any:
     closed = jax.make_jaxpr(function)(form)
     used = without_unused(closed.jaxpr, [True] * len(closed.jaxpr.outvars))
     return closed.replace(jaxpr=used)
-
-
-def _known(program: Any) -> Callable[[list[Value]], list[Value]] | None:
-    """Return a rule for a function of this package that sets should not go into.
-
-    `sin_cos` reduces its argument by a whole number of quarter turns, which boxes have several of.
-    """
-    if len(program.in_avals) != 1 or program.consts:
-        return None
-    (form,) = program.in_avals
-    return _sin_cos if str(program) == _text_of_sin_cos(form.shape, form.dtype) else None
-
-
-@cache
-def _text_of_sin_cos(shape: tuple[int, ...], dtype: np.dtype) -> str:
-    steps = jax.make_jaxpr(sin_cos)(jax.ShapeDtypeStruct(shape, dtype)).jaxpr.eqns
-    return str(steps[0].params.get("call_jaxpr"))
-
-
-def _sin_cos(inputs: list[Value]) -> list[Value]:
-    angle = as_form(inputs[0])
-    low, high = angle.bounds()
-    results = []
-    for name in ("sin", "cos"):
-        form = FUNCTIONS[name](angle)
-        # Its error is 1.2e-7, and beyond 1e5 it is NaN.
-        form.radius = form.radius + 2.4e-7
-        if form.low is not None and form.high is not None:
-            form.low, form.high = form.low - 2.4e-7, form.high + 2.4e-7
-        form.forget((low < -1e5) | (high > 1e5))
-        results.append(form)
-    return results

@@ -11,12 +11,13 @@ Source: S. Demarchi, D. Guidotti, L. Pulina, A. Tacchella, Supporting standardiz
 networks verification with VNNLIB and CoCoNet (2023).
 """
 
+import functools
 import math
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, TypeAlias
 
 import jax.numpy as jnp
 import numpy as np
@@ -30,25 +31,13 @@ MAX_DEPTH = 100
 """Brackets within brackets, at most."""
 
 
-class Linear(NamedTuple):
-    """A sum of numbers times variables, and a number; variables are `X_0`, `Y_0` and so on."""
+Linear: TypeAlias = dict[str, float]
+"""A sum: the factors of variables, which are `X_0`, `Y_0` and so on, and a number, that of `""`."""
 
-    factors: dict[str, float]
-    offset: float
 
-    def minus(self, other: "Linear") -> "Linear":
-        """Return the difference of two sums."""
-        return self.plus(other.times(-1.0))
-
-    def plus(self, other: "Linear") -> "Linear":
-        """Return the sum of two sums."""
-        names = {*self.factors, *other.factors}
-        factors = {n: self.factors.get(n, 0.0) + other.factors.get(n, 0.0) for n in names}
-        return Linear(factors, self.offset + other.offset)
-
-    def times(self, number: float) -> "Linear":
-        """Return a multiple of the sum."""
-        return Linear({n: number * f for n, f in self.factors.items()}, number * self.offset)
+def _combined(one: Linear, other: Linear, times: float = 1.0) -> Linear:
+    """Return a sum and a multiple of another."""
+    return {n: one.get(n, 0.0) + times * other.get(n, 0.0) for n in {**one, **other}}
 
 
 @dataclass
@@ -67,11 +56,14 @@ class Case:
         values = {"X": inputs, "Y": outputs}
 
         def value(each: Linear) -> Array:
-            offset = np.float32(each.offset)
-            if float(offset) > each.offset:
+            exact = each.get("", 0.0)
+            offset = np.float32(exact)
+            if float(offset) > exact:
                 offset = np.nextafter(offset, np.float32(-np.inf))
             total = jnp.asarray(offset, outputs.dtype)
-            for name, factor in each.factors.items():
+            for name, factor in each.items():
+                if not name:
+                    continue
                 number, near = values[name[0]][int(name[2:])], float(np.float32(factor))
                 total = total + (number if factor == 1 else near * number)
                 if near != factor:
@@ -140,12 +132,12 @@ def _cases(statements: Sequence[Any]) -> list[Case]:
         ends = np.array([[-math.inf, math.inf]] * inputs)
         others = list[Linear]()
         for one in group:
-            known = {name: factor for name, factor in one.factors.items() if factor}
+            known = {name: factor for name, factor in one.items() if factor and name}
             (name, factor), *more = known.items() or [("", 0.0)]
             if more or name[:1] != "X":
                 others.append(one)
                 continue
-            number, end = int(name[2:]), -one.offset / factor
+            number, end = int(name[2:]), -one.get("", 0.0) / factor
             side, tighter = (1, min) if factor > 0 else (0, max)
             ends[number, side] = tighter(ends[number, side], end)
         if (ends[:, 0] > ends[:, 1]).any():
@@ -154,7 +146,7 @@ def _cases(statements: Sequence[Any]) -> list[Case]:
             free = np.flatnonzero(~np.isfinite(ends).all(1))[0]
             raise ValueError(f"the input X_{free} has no bound on a side")
         # A counterexample that needs no condition on outputs is any input of the box.
-        boxes.setdefault(tuple(ends.ravel()), []).append(others or [Linear({"Y_0": 0.0}, 0.0)])
+        boxes.setdefault(tuple(ends.ravel()), []).append(others or [{"": 0.0}])
     found = [(np.reshape(ends, (-1, 2)), groups) for ends, groups in boxes.items()]
     return [Case(ends[:, 0], ends[:, 1], groups) for ends, groups in found]
 
@@ -170,51 +162,38 @@ def _alternatives(condition: Any, names: Sequence[str]) -> list[list[Linear]]:
     """Return a condition as alternatives of sums that are all at most zero."""
     match condition:
         case ["and", *parts]:
-            found = list[list[Linear]]([[]])
-            for part in parts:
-                found = _joined(found, _alternatives(part, names))
-            return found
+            return functools.reduce(_joined, (_alternatives(p, names) for p in parts), [[]])
         case ["or", *parts]:
             return [group for part in parts for group in _alternatives(part, names)]
         # A strict comparison excludes less, so what is proved without the end is proved.
         case ["<=" | "<", one, other]:
-            return [[_sum(one, names).minus(_sum(other, names))]]
+            return [[_combined(_sum(one, names), _sum(other, names), -1.0)]]
         case [">=" | ">", one, other]:
-            return [[_sum(other, names).minus(_sum(one, names))]]
+            return [[_combined(_sum(other, names), _sum(one, names), -1.0)]]
         case ["=" | "==", one, other]:
-            gap = _sum(one, names).minus(_sum(other, names))
-            return [[gap, gap.times(-1.0)]]
+            gap = _combined(_sum(one, names), _sum(other, names), -1.0)
+            return [[gap, _combined({}, gap, -1.0)]]
     raise ValueError(f"{_text(condition)} is no comparison, and no `and` or `or` of comparisons")
 
 
 def _sum(term: Any, names: Sequence[str]) -> Linear:
     """Return a term as a sum."""
     if isinstance(term, str):
-        if term in names:
-            return Linear({term: 1.0}, 0.0)
         try:
-            return Linear({}, float(term))
+            return {term: 1.0} if term in names else {"": float(term)}
         except ValueError:
             raise ValueError(f"{term!r} is no number and no declared variable") from None
     parts = [_sum(part, names) for part in term[1:]]
     match term[:1]:
         case ["+"] if parts:
-            return _summed(parts)
-        case ["-"] if len(parts) == 1:
-            return parts[0].times(-1.0)
+            return functools.reduce(_combined, parts)
         case ["-"] if parts:
-            return parts[0].minus(_summed(parts[1:]))
-        case ["*"] if len(parts) == 2 and not all(part.factors for part in parts):
-            number, other = sorted(parts, key=lambda part: len(part.factors))
-            return other.times(number.offset)
+            rest = functools.reduce(_combined, parts[len(parts) > 1 :])
+            return _combined(parts[0] if len(parts) > 1 else {}, rest, -1.0)
+        case ["*"] if len(parts) == 2 and not all(set(part) - {""} for part in parts):
+            number, other = sorted(parts, key=lambda part: len(set(part) - {""}))
+            return _combined({}, other, number.get("", 0.0))
     raise ValueError(f"{_text(term)} is not a linear term")
-
-
-def _summed(parts: Sequence[Linear]) -> Linear:
-    total = Linear({}, 0.0)
-    for part in parts:
-        total = total.plus(part)
-    return total
 
 
 def _text(part: Any) -> str:

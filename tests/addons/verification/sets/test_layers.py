@@ -91,6 +91,15 @@ def test_bounds_are_as_tight_as_those_of_crown():
     assert np.mean(ratios) < 1.1
 
 
+def test_bounds_do_not_depend_on_the_shape_of_the_input():
+    """Networks in ONNX files have inputs of images: `[1, 1, 1, inputs]`."""
+    layers, random = weights(0), np.random.default_rng(0)
+    low = random.uniform(-1, 0.8, (6, 3))
+    flat = bounds(lambda x: network(layers, x), low, low + 0.2)
+    image = bounds(lambda x: network(layers, x.reshape(1, 1, 1, 3)).ravel(), low, low + 0.2)
+    np.testing.assert_allclose(image, flat, rtol=1e-12)
+
+
 def test_a_network_in_a_loop_leaves_the_symbols_of_the_loop_as_they_are():
     """A turning point stays on its circle, whatever a network without influence says of it."""
     layers = weights(0)

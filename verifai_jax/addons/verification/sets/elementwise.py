@@ -19,12 +19,15 @@ from verifai_jax.addons.verification.sets.interpreter import (
 from verifai_jax.addons.verification.sets.whole import Whole
 
 
-def _levelled(values: list[Value]) -> list[Value]:
+def levelled(values: list[Value]) -> list[Value]:
     """Return operands of one shape: numbers that stand for arrays are repeated.
 
     All parts of a set need it, since a later sum counts the slopes as often as they stand there.
     """
-    shape = np.broadcast_shapes(*(value.shape for value in values))
+    shapes = [value.shape for value in values]
+    if shapes.count(shapes[0]) == len(shapes):
+        return values
+    shape = np.broadcast_shapes(*shapes)
 
     def widen(array: np.ndarray, leading: int) -> np.ndarray:
         front, missing = array.shape[:leading], len(shape) + leading - array.ndim
@@ -46,7 +49,7 @@ def _two(t: Interpreter, step: Equation, inputs: list[Value]) -> list[Value]:
     name = step.primitive.name
     if step.invars[0] is step.invars[1] and name == "mul" and isinstance(inputs[0], Form):
         return [functions.FUNCTIONS["square"](inputs[0])]
-    a, b = _levelled(inputs)
+    a, b = levelled(inputs)
     if isinstance(a, Form):
         b = _as_real(b, a.dtype) if isinstance(b, Whole) else b
         return [_OF_TWO[name](a, b)]
@@ -88,7 +91,7 @@ def _round(t: Interpreter, step: Equation, inputs: list[Value]) -> list[Value]:
 
 @rule("clamp")
 def _clamp(t: Interpreter, step: Equation, inputs: list[Value]) -> list[Value]:
-    low, x, high = _levelled(inputs)
+    low, x, high = levelled(inputs)
     if isinstance(x, Whole):
         x = whole.OPERATIONS["max"](x, as_whole(low))
         return [whole.OPERATIONS["min"](x, as_whole(high))]
@@ -103,7 +106,7 @@ def _is_finite(t: Interpreter, step: Equation, inputs: list[Value]) -> list[Valu
 
 @rule(*whole.COMPARISONS)
 def _compare(t: Interpreter, step: Equation, inputs: list[Value]) -> list[Value]:
-    a, b = _levelled(inputs)
+    a, b = levelled(inputs)
     name = step.primitive.name
     if isinstance(a, Whole):
         b = as_whole(b)
@@ -119,7 +122,7 @@ def _compare(t: Interpreter, step: Equation, inputs: list[Value]) -> list[Value]
 @rule("lt_to", "le_to")
 def _in_total_order(t: Interpreter, step: Equation, inputs: list[Value]) -> list[Value]:
     """Compare floats in an order in which zeros have signs: only different numbers are decided."""
-    a, b = _levelled(inputs)
+    a, b = levelled(inputs)
     low, high = functions.difference(as_form(a), as_form(b)).bounds()
     return [Whole.truth(high < 0, low > 0)]
 
@@ -131,13 +134,13 @@ def _not(t: Interpreter, step: Equation, inputs: list[Value]) -> list[Value]:
 
 @rule("and", "or", "xor")
 def _logic(t: Interpreter, step: Equation, inputs: list[Value]) -> list[Value]:
-    a, b = map(as_whole, _levelled(inputs))
+    a, b = map(as_whole, levelled(inputs))
     return [whole.OPERATIONS[step.primitive.name](a, b)]
 
 
 @rule("select_n")
 def _select(t: Interpreter, step: Equation, inputs: list[Value]) -> list[Value]:
-    which, *cases = _levelled(inputs)
+    which, *cases = levelled(inputs)
     return [select(as_whole(which), cases)]
 
 

@@ -12,17 +12,12 @@ Source: N. Nedialkov, K. Jackson, G. Corliss, Validated solutions of initial val
 ordinary differential equations, Applied Mathematics and Computation 105 (1999), sections 5 and 6.
 """
 
-import contextlib
-import math
 from collections.abc import Callable, Sequence
-from functools import lru_cache, partial
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.core import Tracer
-from jax.experimental.jet import jet
 from jax.extend.core import Primitive
 from jaxtyping import Array, PyTree
 
@@ -30,15 +25,11 @@ from verifai_jax.addons.verification.sets.form import SLACK, Form, Reals, add, j
 from verifai_jax.addons.verification.sets.interpreter import (
     Equation,
     Interpreter,
-    MissingRule,
-    Program,
     Value,
     as_form,
     rule,
 )
-from verifai_jax.core.compute.fingerprint import without_unused
-from verifai_jax.core.compute.jaxprs import called, run_through
-from verifai_jax.core.user_code.user_errors import source_line
+from verifai_jax.addons.verification.sets.series import Rates
 
 ORDER = 4
 """Order of the polynomials: that of the Runge-Kutta method whose step they take."""
@@ -47,16 +38,6 @@ PARTS = (1, 2, 4, 8)
 TRIES = 12
 """Boxes that are tried for a part of a step, each wider than the one before it by `WIDER`."""
 WIDER = 0.1
-SMOOTH = frozenset({
-    "acosh", "add", "add_any", "asinh", "atan2", "atanh", "broadcast_in_dim", "concatenate", "copy",
-    "convert_element_type", "cos", "cosh", "cumsum", "div", "dot_general", "erf", "erfc", "exp",
-    "expm1", "integer_pow", "log", "log1p", "logistic", "mul", "neg", "pow", "reduce_sum",
-    "reshape", "rev", "rsqrt", "sin", "sinh", "slice", "split", "sqrt", "square", "squeeze",
-    "stack", "sub", "tanh", "transpose", "unstack",
-})  # fmt: skip
-"""Operations with derivatives of all orders that jax.experimental.jet knows."""
-CHOOSING = {"select_n": (1, None), "dynamic_slice": (0, 1), "gather": (0, 1)}
-"""Operations that are smooth in these operands alone; the others choose among them."""
 _solution = Primitive("flow")
 _solution.multiple_results = True
 
@@ -73,22 +54,11 @@ def flow(
     def rates(time: Array, *leaves: Array) -> list[Array]:
         return jax.tree.leaves(derivative(time, tree.unflatten(leaves)))
 
-    def derivatives(time: Array, *leaves: Array) -> list[list[Array]]:
-        found = [rates(time, *leaves)]
-        for order in range(1, ORDER + 1):
-            clock = [jnp.ones_like(time), *[jnp.zeros_like(time)] * (order - 1)]
-            series = [clock, *(list(each) for each in zip(*found, strict=True))]
-            found.append([last[-1] for last in jet(rates, (time, *leaves), series)[1]])
-        return found
-
     time = jnp.asarray(time, leaves[0].dtype)
-    plain = jax.make_jaxpr(rates)(time, *leaves)
-    _varying(plain.jaxpr, [True] * (1 + len(leaves)))
-    closed = jax.make_jaxpr(derivatives)(time, *leaves)
-    closed = jax.make_jaxpr(partial(_evaluated_once, closed.jaxpr, closed.consts))(time, *leaves)
+    closed = jax.make_jaxpr(rates)(time, *leaves)
     results = _solution.bind(
-        *closed.consts, time, jnp.asarray(seconds, time.dtype), *leaves, program=closed.jaxpr,
-        text=str(closed.jaxpr), shared=len(closed.consts),
+        *closed.consts, time, jnp.asarray(seconds, time.dtype), *leaves,
+        rates=Rates(closed.jaxpr, ORDER), text=str(closed.jaxpr), shared=len(closed.consts),
     )  # fmt: skip
     return tree.unflatten(results[: len(leaves)]), tree.unflatten(results[len(leaves) :])
 
@@ -98,96 +68,27 @@ def _forms(*operands: Any, shared: int, **params: Any) -> list[Any]:
     return [*operands[shared + 2 :]] * 2
 
 
-def _varying(program: Program, inputs: Sequence[bool]) -> list[bool]:
-    """Return which results depend on time or state, and refuse what is not smooth in them."""
-
-    def step(each: Equation, operands: list[bool]) -> list[bool]:
-        inner, name = called(each), each.primitive.name
-        if inner is not None:
-            return _varying(getattr(inner, "jaxpr", inner), operands)
-        first, last = CHOOSING.get(name, (0, None))
-        choices = operands[:first] + ([] if last is None else operands[last:])
-        real = all(jnp.issubdtype(out.aval.dtype, jnp.floating) for out in each.outvars)
-        smooth = name in SMOOTH or (name in CHOOSING and not any(choices))
-        if any(operands) and not (smooth and real):
-            line = source_line(each.source_info.traceback)
-            raise MissingRule(
-                f"the dynamics apply {name} to the state or the time{f' ({line})' * bool(line)}, "
-                "which is not smooth, or has no Taylor series here: continuous=True needs smooth "
-                "dynamics; move switching and saturation into the controller"
-            )
-        return [any(operands)] * len(each.outvars)
-
-    constants = [False] * len(program.constvars)
-    return run_through(program, constants, inputs, lambda _: False, step)
-
-
-def _evaluated_once(program: Program, constants: Sequence[Any], *inputs: Array) -> list[Any]:
-    """Run a program, what is computed twice once, and factorials and other constants now."""
-    known: dict[Any, Any] = {}
-
-    def step(each: Equation, operands: list[Any]) -> Sequence[Any]:
-        inner = called(each)
-        if inner is not None:
-            inner, consts = getattr(inner, "jaxpr", inner), getattr(inner, "consts", ())
-            return run_through(inner, consts, operands, lambda one: one.val, step)
-        key = each.primitive, str(each.params), *(
-            id(one) if isinstance(one, Tracer) or np.ndim(one)
-            else (str(one), type(one), getattr(one, "dtype", None))
-            for one in operands
-        )  # fmt: skip
-        if key not in known:
-            with contextlib.ExitStack() as stack:
-                if not any(isinstance(one, Tracer) for one in operands):
-                    stack.enter_context(jax.ensure_compile_time_eval())
-                found = each.primitive.bind(*operands, **each.params)
-                found = found if each.primitive.multiple_results else [found]
-                # As numbers of the program's text they are the same wherever it is traced.
-                if not any(isinstance(one, Tracer) for one in found):
-                    found = [np.asarray(one) for one in found]
-            # The operands live on, so that no other number gets the same identity.
-            known[key] = operands, found
-        return known[key][1]
-
-    return run_through(program, constants, inputs, lambda one: one.val, step)
-
-
 @rule("flow")
 def _flow(t: Interpreter, step: Equation, inputs: list[Value]) -> list[Value]:
-    shared, program, text = (step.params[name] for name in ("shared", "program", "text"))
+    shared, rates, text = (step.params[name] for name in ("shared", "rates", "text"))
     time, seconds, *state = map(as_form, inputs[shared:])
     length = float(seconds.centre.flat[0])
     # The signals of a step and its end are asked for one after the other.
     key = text, length, *map(id, inputs[:shared]), id(time), *map(id, state)
     if t.latest is None or t.latest[0] != key:
-        step_of = _Step(t, program, inputs[:shared], len(state))
+        step_of = _Step(t, rates, inputs[:shared])
         t.latest = key, inputs, step_of(time, state, length)
     return list(t.latest[2])
 
 
-@lru_cache(maxsize=64)
-def _part(program: Program, count: int, orders: tuple[int, ...]) -> Program:
-    """Return what computes the derivatives of some orders, of `count` arrays of a state."""
-    wanted = [i // count + 1 in orders for i in range(len(program.outvars))]
-    whole = program.replace(constvars=[], invars=[*program.constvars, *program.invars])
-    return without_unused(whole, wanted)
-
-
 class _Step:
-    """One step of a differential equation on sets, by a program of all derivatives of a state.
+    """One step of a differential equation on sets, by its rates.
 
-    Its operands are the `shared` ones, which do not change, a time, and `count` arrays of a state.
+    Their operands are the `shared` ones, which do not change, a time, and the arrays of a state.
     """
 
-    def __init__(self, t: Interpreter, program: Program, shared: Sequence[Value], count: int):
-        def some(*orders: int) -> Callable[..., list[Form]]:
-            part = _part(program, count, orders)
-            return lambda shared, time, state: [
-                *map(as_form, t.closed(part, [*shared, time, *state]))
-            ]
-
-        self.rates, self.terms = some(1), some(*range(1, ORDER + 1))
-        self.bounded = some(2, ORDER + 1)
+    def __init__(self, t: Interpreter, rates: Rates, shared: Sequence[Value]):
+        self.t, self.rates = t, rates
         self.boxes, self.shared = t.boxes, shared
         self.apart = [_hull(v) if isinstance(v, Form) else v for v in shared]
 
@@ -229,7 +130,7 @@ class _Step:
         ends, lost, stays = begins, self.unbounded(state), np.zeros(self.boxes, bool)
         for _ in range(TRIES):
             now = [_between(low, high, span) for low, high in ends]
-            rates = self.rates(self.apart, span, now)
+            (rates,) = self.rates(self.t, self.apart, [span, *now], 0)
             reached, inside = [], np.ones(self.boxes, bool)
             for (low, high), end, rate in zip(begins, ends, rates, strict=True):
                 slowest, fastest = rate.bounds()
@@ -260,15 +161,13 @@ class _Step:
         self, begin: Form, span: Form, state: list[Form], box: list[Form], length: float
     ) -> tuple[list[Form], list[Form]]:
         """Return the states during a part of the step, and after it."""
-        terms, count = self.terms(self.shared, begin, state), len(state)
         during, after = list[Form](), list(state)
-        for k in range(ORDER):
-            share = np.array(length ** (k + 1) / math.factorial(k + 1))
-            for i, term in enumerate(terms[k * count : (k + 1) * count]):
-                after[i] = add(after[i], scaled(term, share))
-        share = np.array(length ** (ORDER + 1) / math.factorial(ORDER + 1))
-        bends = self.bounded(self.apart, span, box)
-        for i, (bend, last) in enumerate(zip(bends[:count], bends[count:], strict=True)):
+        for k, terms in enumerate(self.rates(self.t, self.shared, [begin, *state], ORDER - 1), 1):
+            share = np.array(length**k / k)
+            after = [add(a, scaled(each, share)) for a, each in zip(after, terms, strict=True)]
+        bends = self.rates(self.t, self.apart, [span, *box], ORDER)
+        share = np.array(length ** (ORDER + 1) / (ORDER + 1))
+        for i, (bend, last) in enumerate(zip(bends[1], bends[ORDER], strict=True)):
             after[i] = add(after[i], scaled(_hull(last), share))
             # Between its ends a solution is a chord and at most an eighth of its second derivative.
             low, high = scaled(_hull(bend), np.array(-(length**2) / 8)).bounds()

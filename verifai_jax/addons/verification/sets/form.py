@@ -207,16 +207,10 @@ def unknown(low: Reals, high: Reals) -> Reals:
 
 
 def rounded(
-    centre: Reals,
-    slopes: Reals | None,
-    radius: Reals,
-    size: Reals,
-    dtype: np.dtype,
-    ends: tuple[Reals, Reals] | None = None,
-    frame: Frame | None = None,
-    units: float = 1.0,
+    centre: Reals, slopes: Reals | None, radius: Reals, size: Reals, dtype: np.dtype,
+    ends: tuple[Reals, Reals] | None = None, frame: Frame | None = None, units: float = 1.0,
     exact: bool = False,
-) -> Form:
+) -> Form:  # fmt: skip
     """Return the result of an operation, widened by its error in so many units of rounding.
 
     So are the `ends` of its interval; what is `exact` is never rounded, such as a maximum.
@@ -226,9 +220,7 @@ def rounded(
     radius = radius + (share * size + absolute)
     low, high = (None, None) if ends is None else ends
     if low is not None and high is not None and not exact:
-        low, high = low - share * np.abs(low), high + share * np.abs(high)
-        low = np.where(np.abs(low) < kind.smallest, np.where(low < 0, -kind.smallest, 0.0), low)
-        high = np.where(np.abs(high) < kind.smallest, np.where(high > 0, kind.smallest, 0.0), high)
+        low, high = widened(low, high, share, kind.smallest)
     form = Form(centre, slopes, radius, size, dtype, low, high, frame)
     if not size.max(initial=0.0) + radius.max(initial=0.0) <= kind.highest / 2:
         # What may overflow, or is NaN, is unbounded.
@@ -238,6 +230,29 @@ def rounded(
         form.forget(wild)
         form.low, form.high = low, high
     return form
+
+
+def widened(low: Reals, high: Reals, share: float, smallest: float) -> tuple[Reals, Reals]:
+    """Return ends that are apart by a share of each more; what is tiny keeps its sign."""
+    low, high = low - share * np.abs(low), high + share * np.abs(high)
+    if np.abs(low).min(initial=1.0) < smallest:
+        low = np.where(np.abs(low) < smallest, np.where(low < 0, -smallest, 0.0), low)
+    if np.abs(high).min(initial=1.0) < smallest:
+        high = np.where(np.abs(high) < smallest, np.where(high > 0, smallest, 0.0), high)
+    return low, high
+
+
+def spanned(low: Reals, high: Reals, dtype: np.dtype, units: float = 1.0) -> Form:
+    """Return an interval, the result of an operation, widened by so many units of rounding."""
+    kind = rounding(dtype)
+    if units:
+        low, high = widened(low, high, kind.unit * units, kind.smallest)
+    size = np.maximum(np.abs(low), np.abs(high))
+    if not size.max(initial=0.0) <= kind.highest / 2:
+        return Form.between(low, high, dtype)
+    centre = low / 2 + high / 2
+    radius = (high / 2 - low / 2) + SLACK * size
+    return Form(centre, None, radius, size, dtype, low, high)
 
 
 def alike(forms: Sequence[Form]) -> tuple[list[Form], Frame | None, int]:
@@ -290,17 +305,20 @@ def add(a: Form, b: Form, sign: float = 1.0) -> Form:
         rest = (a.centre - (end - back)) + (other - back)
         if (form := exactly(end, rest, a.dtype)) is not None:
             return form
+    ends = None
+    if a.low is not None and b.low is not None:
+        (low, high), (first, last) = a.bounds(), b.bounds()
+        if sign < 0:
+            first, last = -last, -first
+        ends = _sum_end(low, first, a.dtype, -1), _sum_end(high, last, a.dtype, 1)
+        if a.slopes is None and b.slopes is None:
+            return spanned(*ends, a.dtype, 0)
+        ends = overflown(*ends, rounding(a.dtype).highest)
     (a, b), frame, _ = alike([a, b])
     slopes = joint_slopes(a, b, 1.0, sign)
     centre = a.centre + b.centre if sign > 0 else a.centre - b.centre
     form = rounded(centre, slopes, a.radius + b.radius, a.size + b.size, a.dtype, None, frame)
-    if a.low is None or b.low is None:
-        return form
-    (low, high), (first, last) = a.bounds(), b.bounds()
-    if sign < 0:
-        first, last = -last, -first
-    ends = _sum_end(low, first, a.dtype, -1), _sum_end(high, last, a.dtype, 1)
-    form.low, form.high = overflown(*ends, rounding(a.dtype).highest)
+    form.low, form.high = ends or (None, None)
     return form
 
 
@@ -343,17 +361,20 @@ def scaled(a: Form, by: Reals) -> Form:
         ends = np.minimum(one, other), np.maximum(one, other)
     # Times 0, 1, 2, 4 ... nothing is rounded.
     exact = bool(((np.frexp(scale)[0] == 0.5) & (scale >= 1) | (scale == 0)).all())
+    if slopes is None and ends is not None and np.isfinite(size).all():
+        return spanned(*ends, a.dtype, 0 if exact else 1)
     return rounded(
         a.centre * by, slopes, a.radius * scale, size, a.dtype, ends, a.frame, exact=exact
     )
 
 
-def interval_product(a: Form, b: Form) -> tuple[Reals, Reals]:
-    """Return the interval of a product; unbounded if zero may meet infinity."""
-    (low, high), (first, last) = a.bounds(), b.bounds()
+def interval_product(low: Reals, high: Reals, first: Reals, last: Reals) -> tuple[Reals, Reals]:
+    """Return the product of two intervals; unbounded if zero may meet infinity."""
     ends = low * first, low * last, high * first, high * last
     lowest = np.minimum(np.minimum(ends[0], ends[1]), np.minimum(ends[2], ends[3]))
     highest = np.maximum(np.maximum(ends[0], ends[1]), np.maximum(ends[2], ends[3]))
+    if np.isfinite(lowest).all() and np.isfinite(highest).all():
+        return lowest, highest
     bad = np.isnan(lowest)
     # An interval with zero inside and one without an end: none of the four products is NaN.
     for ours, theirs in (((low, high), (first, last)), ((first, last), (low, high))):
@@ -361,8 +382,8 @@ def interval_product(a: Form, b: Form) -> tuple[Reals, Reals]:
     return np.where(bad, -np.inf, lowest), np.where(bad, np.inf, highest)
 
 
-def product(a: Form, b: Form) -> Form:
-    """Return `a * b` for two different forms."""
+def product(a: Form, b: Form, narrow: bool = True) -> Form:
+    """Return `a * b` for two different forms; unless `narrow`, an interval only if both are one."""
     if is_point(a) and is_point(b):
         result = a.centre * b.centre
         # Products of numbers of single precision fit double precision; of others, of small ones.
@@ -374,8 +395,13 @@ def product(a: Form, b: Form) -> Form:
         if is_point(one) and np.isfinite(one.centre).all():
             return scaled(other, one.centre)
     (a, b), frame, _ = alike([a, b])
-    ends = interval_product(a, b)
-    size = np.maximum(np.abs(ends[0]), np.abs(ends[1]))
+    if a.slopes is None and b.slopes is None:
+        return spanned(*interval_product(*a.bounds(), *b.bounds()), a.dtype)
+    whole = (np.abs(a.centre) + a.spread) * (np.abs(b.centre) + b.spread)
+    ends, size = None, whole
+    if narrow:
+        ends = interval_product(*a.bounds(), *b.bounds())
+        size = np.maximum(np.abs(ends[0]), np.abs(ends[1]))
     slopes = joint_slopes(a, b, b.centre, a.centre)
     centre = a.centre * b.centre
     radius = np.abs(a.centre) * b.radius + np.abs(b.centre) * a.radius + a.spread * b.spread
@@ -385,8 +411,7 @@ def product(a: Form, b: Form) -> Form:
         squares = a.slopes[:count] * b.slopes[:count]
         centre = centre + squares.sum(0) / 2
         radius = radius - np.abs(squares).sum(0) / 2
-    slack = (np.abs(a.centre) + a.spread) * (np.abs(b.centre) + b.spread) * SLACK
-    return rounded(centre, slopes, radius + slack, size, a.dtype, ends, frame)
+    return rounded(centre, slopes, radius + whole * SLACK, size, a.dtype, ends, frame)
 
 
 def _whole(numbers: Reals) -> Reals:

@@ -18,7 +18,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from verifai_jax.addons.verification.sets.form import SLACK, Form, Frame, alike, padded
+from verifai_jax.addons.verification.sets.arrays import together
+from verifai_jax.addons.verification.sets.form import SLACK, Form, Frame, padded
+from verifai_jax.addons.verification.sets.interpreter import as_form
 from verifai_jax.addons.verification.sets.whole import Whole
 
 WIDEST = 24
@@ -44,28 +46,19 @@ def framed(carry: Sequence[Form | Whole], boxes: int, features: int) -> list[For
     """
     kept = {i: v for i, v in enumerate(carry)
             if isinstance(v, Form) and (v.slopes is not None or len(v.centre) > 1)}  # fmt: skip
-    values, out = [*kept.values()], list(carry)
-    sizes = [int(np.prod(value.shape, dtype=np.int64)) for value in values]
+    out, sizes = list(carry), [int(np.prod(v.shape, dtype=np.int64)) for v in kept.values()]
     count = sum(sizes)
     if not count or count > WIDEST:
         return [v.unframed() if isinstance(v, Form) else v for v in carry]
-    values, _, old = alike(values)
-    old = max(old, features)
-    slopes = np.zeros((old, boxes, count))
-    centre, radius, size, low, high = (np.empty((boxes, count)) for _ in range(5))
-    start = 0
-    for value, each in zip(values, sizes, strict=True):
-        part = slice(start, start + each)
-        ends = value.bounds()
-        for into, array in (
-            (centre, value.centre), (radius, value.radius), (size, value.size),
-            (low, ends[0]), (high, ends[1]),
-        ):  # fmt: skip
-            into[:, part] = array.reshape(len(array), each)
-        if value.slopes is not None:
-            rows = value.slopes
-            slopes[: len(rows), :, part] = rows.reshape(*rows.shape[:2], each)
-        start += each
+    flat = [v.moved(lambda a, lead: a.reshape(*a.shape[:lead], -1)) for v in kept.values()]
+    ends = [np.concatenate([np.broadcast_to(v.bounds()[side], (boxes, *v.shape)) for v in flat], 1)
+            for side in (0, 1)]  # fmt: skip
+    whole = as_form(together(flat, np.concatenate))
+    old = max(0 if whole.slopes is None else len(whole.slopes), features)
+    slopes = np.broadcast_to(padded(whole, old), (old, boxes, count))
+    centre, radius, size = (
+        np.broadcast_to(each, (boxes, count)) for each in (whole.centre, whole.radius, whole.size)
+    )
     bounded = np.isfinite(radius)
     radius = np.where(bounded, radius, 0.0)
     noise = np.zeros((boxes, count, old - features + count))
@@ -77,28 +70,28 @@ def framed(carry: Sequence[Form | Whole], boxes: int, features: int) -> list[For
         sides, rest = _reduced(noise, left)
     new = np.concatenate([slopes[:features], sides.transpose(2, 0, 1)])
     radius = np.where(bounded, rest + 4 * SLACK * np.abs(noise).sum(2), np.inf)
-    size = np.minimum(size, np.maximum(np.abs(low), np.abs(high)))
+    size = np.minimum(size, np.maximum(*map(np.abs, ends)))
     frame = Frame(next(_NUMBERS), features, len(new))
-    start = 0
-    for i, value, each in zip(kept, values, sizes, strict=True):
-        part, shape = slice(start, start + each), (boxes, *value.shape)
-        pieces = [array[:, part].reshape(shape) for array in (centre, radius, size, low, high)]
+    stops = np.cumsum(sizes)
+    for i, value, stop, each in zip(kept, kept.values(), stops, sizes, strict=True):
+        part, shape = slice(stop - each, stop), (boxes, *value.shape)
+        pieces = [array[:, part].reshape(shape) for array in (centre, radius, size, *ends)]
         own = new[:, :, part].reshape(len(new), *shape)
         # Bounded numbers get no interval: what is computed with it would cost, and is no tighter.
-        ends = (None, None) if np.isfinite(pieces[1]).all() else (pieces[3], pieces[4])
-        out[i] = Form(pieces[0], own, pieces[1], pieces[2], value.dtype, *ends, frame)
-        start += each
+        limits = (None, None) if np.isfinite(pieces[1]).all() else pieces[3:]
+        out[i] = Form(pieces[0], own, pieces[1], pieces[2], value.dtype, *limits, frame)
     return out
 
 
 def of_layer(units: Form, features: int) -> Form:
-    """Return the numbers of a layer, an array with one axis, with each radius as a symbol."""
+    """Return the numbers of a layer with each radius as a symbol."""
     outer, bounded = units.frame, np.isfinite(units.radius)
     first = features if outer is None else outer.stop
-    count = units.shape[0]
+    count = int(np.prod(units.shape, dtype=np.int64))
     if first + count > MANY or units.radius[bounded].sum() <= WORTH * units.spread[bounded].sum():
         return units
-    own = np.where(bounded, units.radius, 0.0)[None] * np.eye(count)[:, None]
+    each = np.eye(count).reshape(count, 1, *units.shape)
+    own = np.where(bounded, units.radius, 0.0)[None] * each
     old = padded(units, first)
     old = np.broadcast_to(old, (first, *np.broadcast_shapes(old.shape[1:], own.shape[1:])))
     return Form(

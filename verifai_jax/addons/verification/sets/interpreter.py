@@ -15,7 +15,7 @@ from jax.typing import ArrayLike
 
 from verifai_jax.addons.verification.sets.form import Form
 from verifai_jax.addons.verification.sets.whole import Whole
-from verifai_jax.core.compute.jaxprs import CUSTOM_CALLS, called, run_through
+from verifai_jax.core.compute.jaxprs import called, run_through
 from verifai_jax.core.user_code.user_errors import source_line
 
 Value: TypeAlias = Form | Whole
@@ -25,12 +25,11 @@ Equation: TypeAlias = Any
 Program: TypeAlias = Any
 """A `Jaxpr` or a `ClosedJaxpr`."""
 Rule: TypeAlias = Callable[["Interpreter", Equation, list[Value]], list[Value]]
-Known: TypeAlias = Callable[[Program], Callable[[list[Value]], list[Value]] | None]
 RULES: dict[str, Rule] = {}
 """What each primitive does with sets, by its name."""
 Shortcut: TypeAlias = Callable[["Interpreter", Program, list[Value]], list[Value] | None]
 SHORTCUTS: dict[str, Shortcut] = {}
-"""What functions of JAX do with sets as a whole, by the name of their call; None to go inside."""
+"""What functions do with sets as a whole, by the name of their call; None to go inside."""
 
 
 class MissingRule(NotImplementedError):
@@ -48,13 +47,10 @@ def rule(*names: str) -> Callable[[Rule], Rule]:
 
 
 class Interpreter:
-    """Evaluates programs with sets, for a batch of boxes and so many symbols of features.
+    """Evaluates programs with sets, for a batch of boxes and so many symbols of features."""
 
-    `known` returns the rule for a custom-derivative function, given its program, or None.
-    """
-
-    def __init__(self, boxes: int, features: int, known: Known | None = None) -> None:
-        self.boxes, self.features, self.known = boxes, features, known
+    def __init__(self, boxes: int, features: int) -> None:
+        self.boxes, self.features = boxes, features
         self._literals: dict[int, tuple[Any, Value]] = {}
         self.latest: tuple[Any, ...] | None = None
         """The last step of a differential equation: what it was made of, and its results."""
@@ -92,11 +88,9 @@ class Interpreter:
         """Evaluate one operation."""
         name = step.primitive.name
         if (inner := called(step)) is not None:
-            short = SHORTCUTS.get(step.params.get("name", ""))
-            if short is not None and (results := short(self, inner, inputs)) is not None:
-                return results
-            known = self.known(inner) if self.known and name in CUSTOM_CALLS else None
-            return self.closed(inner, inputs) if known is None else known(inputs)
+            short = SHORTCUTS.get(step.params.get("name", name))
+            results = None if short is None else short(self, inner, inputs)
+            return self.closed(inner, inputs) if results is None else results
         found = RULES.get(name)
         if found is None:
             return self.concrete(step, inputs)

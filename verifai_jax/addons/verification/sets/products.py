@@ -47,7 +47,7 @@ def _contracted(
             text = f"...{own},{its}->...{result}"
             terms = int(np.prod([form.shape[own.index(c)] for c in joint[1]], dtype=np.int64))
             few = count < FEW
-            if not few and len(form.shape) == 1:
+            if not few:
                 form = of_layer(form, t.features)
             sums = _times(form, other.centre[0], text, dtype, terms)
             return sums.unframed(lambda frame: not frame.of_layer) if few else sums

@@ -1,6 +1,6 @@
-"""Functions of JAX over tables of constants, on sets: `jnp.interp` and `jnp.searchsorted`.
+"""Functions that sets do not go into: `jnp.interp`, `jnp.searchsorted` and `sin_cos`.
 
-They are bisections whose passes, one by one, have wide sets. As a whole they are monotone, or
+Those over tables are bisections whose passes have wide sets. As a whole they are monotone, or
 linear by pieces. They are recognised by the text of their program, and only with constant tables.
 """
 
@@ -13,26 +13,21 @@ import jax.numpy as jnp
 import numpy as np
 
 from verifai_jax.addons.verification.sets.form import Form, Reals, is_point, rounding, unknown
-from verifai_jax.addons.verification.sets.functions import Function
+from verifai_jax.addons.verification.sets.functions import FUNCTIONS, Function
 from verifai_jax.addons.verification.sets.interpreter import (
     SHORTCUTS,
     Interpreter,
     Program,
     Value,
+    as_form,
 )
 from verifai_jax.addons.verification.sets.whole import Whole
+from verifai_jax.core.compute.jaxprs import called
+from verifai_jax.systems.ode import sin_cos
 
 UNITS = 16.0
 """Error of an interpolation in units of rounding of its greatest value, which its formula with six
 operations keeps below ten."""
-
-
-def _shortcut(name: str) -> Callable[[Any], Any]:
-    def register(function: Any) -> Any:
-        SHORTCUTS[name] = function
-        return function
-
-    return register
 
 
 def _table(value: Value) -> np.ndarray | None:
@@ -45,7 +40,6 @@ def _table(value: Value) -> np.ndarray | None:
     return numbers
 
 
-@_shortcut("_interp")
 def _interpolation(t: Interpreter, program: Program, inputs: list[Value]) -> list[Value] | None:
     if len(inputs) != 3 or getattr(program, "consts", ()):
         return None
@@ -58,7 +52,7 @@ def _interpolation(t: Interpreter, program: Program, inputs: list[Value]) -> lis
     # Closer points than these JAX takes for equal, with a jump between them.
     if len(edges) < 2 or len(edges) != len(heights) or not (gaps > 1e-6 * (1 + np.abs(
         edges[1:]
-    ))).all() or not _is(program, jnp.interp, 0):  # fmt: skip
+    ))).all() or not _is(program, jnp.interp):  # fmt: skip
         return None
     scale = np.abs(heights).max()
 
@@ -85,7 +79,6 @@ def _interpolation(t: Interpreter, program: Program, inputs: list[Value]) -> lis
     return [form]
 
 
-@_shortcut("searchsorted")
 def _search(t: Interpreter, program: Program, inputs: list[Value]) -> list[Value] | None:
     if len(inputs) != 2 or getattr(program, "consts", ()):
         return None
@@ -93,7 +86,7 @@ def _search(t: Interpreter, program: Program, inputs: list[Value]) -> list[Value
     edges = _table(table)
     if not isinstance(x, Form) or edges is None or not (np.diff(edges) >= 0).all():
         return None
-    side = next((i for i in (0, 1) if _is(program, _SEARCHES[i], i)), None)
+    side = next((i for i in (0, 1) if _is(program, _SEARCHES[i])), None)
     if side is None:
         return None
     low, high = x.bounds()
@@ -109,7 +102,27 @@ def _search(t: Interpreter, program: Program, inputs: list[Value]) -> list[Value
 _SEARCHES = (partial(jnp.searchsorted, side="left"), partial(jnp.searchsorted, side="right"))
 
 
-def _is(program: Program, function: Callable[..., Any], side: int) -> bool:
+def _sin_cos(t: Interpreter, program: Program, inputs: list[Value]) -> list[Value] | None:
+    """Not inside: it reduces its argument by whole quarter turns, which boxes have several of."""
+    if len(inputs) != 1 or program.consts or not _is(program, sin_cos):
+        return None
+    angle, results = as_form(inputs[0]), []
+    low, high = angle.bounds()
+    for name in ("sin", "cos"):
+        form = FUNCTIONS[name](angle)
+        # Its error is 1.2e-7, and beyond 1e5 it is NaN.
+        form.radius = form.radius + 2.4e-7
+        if form.low is not None and form.high is not None:
+            form.low, form.high = form.low - 2.4e-7, form.high + 2.4e-7
+        form.forget((low < -1e5) | (high > 1e5))
+        results.append(form)
+    return results
+
+
+SHORTCUTS |= {"_interp": _interpolation, "searchsorted": _search, "custom_jvp_call": _sin_cos}
+
+
+def _is(program: Program, function: Callable[..., Any]) -> bool:
     """Return whether a program is that of a function of JAX for such arguments."""
     forms = tuple((form.shape, form.dtype) for form in program.in_avals)
     return _text(program) == _reference(function, forms)
@@ -123,4 +136,4 @@ def _text(program: Program) -> str:
 @cache
 def _reference(function: Callable[..., Any], forms: tuple[Any, ...]) -> str:
     steps = jax.make_jaxpr(function)(*(jax.ShapeDtypeStruct(*form) for form in forms)).jaxpr.eqns
-    return str(steps[0].params.get("jaxpr")) if len(steps) == 1 else ""
+    return str(called(steps[0])) if len(steps) == 1 else ""

@@ -147,15 +147,11 @@ def _left(a: Whole, b: Whole) -> Whole:
 OPERATIONS: dict[str, Callable[[Whole, Whole], Whole]] = {
     "add": lambda a, b: by_corners(np.add, a, b, dtype=a.dtype),
     "sub": lambda a, b: by_corners(np.subtract, a, b, dtype=a.dtype),
-    "mul": lambda a, b: by_corners(np.multiply, a, b, dtype=a.dtype),
-    "div": _divided,
-    "rem": _left,
+    "mul": lambda a, b: by_corners(np.multiply, a, b, dtype=a.dtype), "div": _divided, "rem": _left,
     "max": lambda a, b: Whole(np.maximum(a.low, b.low), np.maximum(a.high, b.high), a.dtype),
     "min": lambda a, b: Whole(np.minimum(a.low, b.low), np.minimum(a.high, b.high), a.dtype),
-    "and": _logic(np.bitwise_and),
-    "or": _logic(np.bitwise_or),
-    "xor": _logic(np.bitwise_xor),
-}
+    "and": _logic(np.bitwise_and), "or": _logic(np.bitwise_or), "xor": _logic(np.bitwise_xor),
+}  # fmt: skip
 """Operations on two sets, by the name of JAX's primitive."""
 
 
