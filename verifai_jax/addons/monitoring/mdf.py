@@ -196,7 +196,8 @@ def _converted(name: str, channel: Channel) -> dict[str, np.ndarray]:
         raise ValueError("it is a structure")
     if raw.dtype.kind in "SUO":
         words = [_text(each) for each in raw.tolist()]
-        return word_columns(name, words)
+        # An empty text is a value: it has none of the words.
+        return word_columns(name, words, None if all(words) else [True] * len(words))
     if conversion is None or kind not in TEXTS:
         return {name: _numbers(raw, conversion)}
     words = _looked_up(raw, conversion)
