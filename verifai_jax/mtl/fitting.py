@@ -48,6 +48,11 @@ def sizes_of(signals: Mapping[str, Any], lanes: int = 0) -> dict[str, int]:
     return {name: x.shape[-1] for name, x in signals.items() if x.ndim == 2 + lanes}
 
 
+def is_open(formula: Formula) -> bool:
+    """Return whether units or sizes of signals have to complete a formula."""
+    return bool(_open_kinds(formula))
+
+
 def assumptions(formula: Formula, units: Mapping[str, str]) -> tuple[str, ...]:
     """Return sentences on what is taken for granted of signals whose units are not known."""
     leaves = [leaf for f in with_counted(formula) for leaf in f.subformulas() if leaf.terms()]

@@ -16,22 +16,16 @@ import operator
 from collections.abc import Callable, Iterable, Mapping
 from typing import NamedTuple, TypeAlias
 
+from verifai_jax.addons.monitoring.functions import AtLast, Count, Mean
 from verifai_jax.core.messages.checks import is_number
 from verifai_jax.core.messages.errors import check_names
 from verifai_jax.mtl import formula as ast
 from verifai_jax.mtl._parse import parse
-from verifai_jax.mtl.expression import (
-    Arithmetic,
-    Component,
-    Duration,
-    Expression,
-    Number,
-    Signal,
-    duration,
-    with_counted,
-)
+from verifai_jax.mtl.expression import Arithmetic, Component, Expression, Number, Signal
+from verifai_jax.mtl.fitting import is_open
 from verifai_jax.mtl.formula import Formula, Term
 from verifai_jax.mtl.rewriting import expand, rebuild
+from verifai_jax.mtl.sampled import Duration, Sampled, with_counted
 from verifai_jax.mtl.tree import missing_case, postorder
 
 Bar: TypeAlias = float | str | Expression
@@ -92,11 +86,18 @@ def bounded(
 
 
 def check_bars(formulas: Iterable[Formula], bars: ErrorBars) -> None:
-    """Check error bars. **Raises:** `UnknownNameError` for one of a signal that no formula has."""
+    """Check error bars, also against formulas that no recording has to complete.
+
+    **Raises:** `UnknownNameError` for a bar of a signal that no formula has; errors of `with_bars`.
+    """
+    formulas = list(formulas)
     known = [name for f in formulas for part in with_counted(f) for name in part.signals()]
     check_names("signal with an error bar", bars, dict.fromkeys(known))
     for name, bar in bars.items():
         _bar(name, bar)
+    for formula in formulas:
+        if not is_open(formula):
+            with_bars(formula, bars)
 
 
 class _Bounds:
@@ -148,11 +149,8 @@ class _Bounds:
 
     def _ends(self, e: Term, found: Mapping[int, Ends]) -> Ends:
         match e:
-            case Duration(_, operand, window):
-                low, high = (self.formula(expand(operand), upper) for upper in (False, True))
-                certain = low == high
-                ends = (e, e) if certain else (duration(low, window), duration(high, window))
-                return Ends(*ends)
+            case Sampled():
+                return self._sampled(e)
             case Signal(name):
                 return self._bar_of(e, name, lambda end: end)
             case Component(Signal(name), index):
@@ -165,6 +163,21 @@ class _Bounds:
                     return Ends(e, e)
                 return _arithmetic(e, name, ends)
         raise missing_case("the error bar", e)
+
+    def _sampled(self, e: Sampled) -> Ends:
+        pairs = [self._pair(operand) for operand in e.operands]
+        certain = [low is high for low, high in pairs]
+        if all(certain):
+            return Ends(e, e)
+        if isinstance(e, Duration | Count | Mean) or (isinstance(e, AtLast) and certain[0]):
+            return Ends(*(e.of(each, e.window) for each in zip(*pairs, strict=True)))
+        raise _without_bounds(e)
+
+    def _pair(self, operand: Formula | Expression) -> tuple[Formula | Term, Formula | Term]:
+        if not isinstance(operand, Formula):
+            return self.ends(operand)
+        low, high = (self.formula(expand(operand), upper) for upper in (False, True))
+        return (low, low) if low == high else (low, high)
 
     def _bar_of(self, e: Expression, name: str, part: Callable[[Expression], Expression]) -> Ends:
         bar = self.bars.get(name)
@@ -229,9 +242,13 @@ def _arithmetic(e: Arithmetic, name: str, ends: list[Ends]) -> Ends:
             middle, half = (a.low + a.high) / 2, (a.high - a.low) / 2
             wave = Arithmetic(name, (middle,))
             return Ends((wave - half).max(-1.0), (wave + half).min(1.0))
-    raise ValueError(
+    raise _without_bounds(e)
+
+
+def _without_bounds(e: Term) -> ValueError:
+    return ValueError(
         f"{e} has no bounds for signals with error bars; write a norm as the root of a sum of "
-        "squares, and a power with a number for its exponent"
+        "squares, and a power with a number for its exponent; rate and peak_to_peak have none"
     )
 
 

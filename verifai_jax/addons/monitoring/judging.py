@@ -41,7 +41,7 @@ from verifai_jax.core.values.trace import Trace
 from verifai_jax.evaluation.run_on import RunOn
 from verifai_jax.mtl._robustness import first_nan
 from verifai_jax.mtl.evaluate import End
-from verifai_jax.mtl.fitting import assumptions
+from verifai_jax.mtl.fitting import assumptions, fitted, sizes_of
 from verifai_jax.mtl.formula import Formula
 from verifai_jax.mtl.host_values import HostValues
 from verifai_jax.mtl.requirements import Requirement
@@ -146,8 +146,6 @@ def judge(
         raise ValueError(f"end is 'hold', 'truncate' or 'strict'; got {end!r}")
     if error_bars is not None:
         check_bars([each.formalized for each in requirements], error_bars)
-        for each in requirements:
-            with_bars(each.formalized, error_bars)
     reading = Reading(
         time, dt, time_unit, resample_to, method, missing, max_gap, end, explain, stamps,
         sort_times, repeated, dbc, error_bars,
@@ -230,7 +228,8 @@ def _judged(
         try:
             asked, best = formula, None
             if reading.error_bars is not None:
-                asked, best = with_bars(asked, reading.error_bars)
+                fit = fitted(formula, units, sizes_of(signals))
+                asked, best = with_bars(fit, reading.error_bars)
             check_signals(asked, trace, "the recording")
             found, note = find(asked)
             highest = found if best is None else find(best)[0]
