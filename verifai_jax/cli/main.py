@@ -19,7 +19,6 @@ import click
 
 from verifai_jax._version import __version__
 from verifai_jax.cli.confirm import confirm
-from verifai_jax.cli.doctor import doctor
 from verifai_jax.cli.exit_codes import CLOSED_PIPE, EPILOG, INTERRUPTED, CommandError, command_error
 from verifai_jax.cli.explain import explain
 from verifai_jax.cli.falsify import falsify
@@ -31,7 +30,7 @@ from verifai_jax.cli.shrink import shrink
 from verifai_jax.core.display.extensions import extension, extensions
 from verifai_jax.core.messages.errors import unknown_name
 
-COMMANDS = (falsify, list_targets, replay, doctor, confirm, explain, shrink, new)
+COMMANDS = (falsify, list_targets, replay, confirm, explain, shrink, new)
 """The sub-commands of the core. Their files import nothing heavy until a command runs."""
 GROUP = "verifai_jax.commands"
 """Entry points of the sub-commands of add-ons and of other packages."""
