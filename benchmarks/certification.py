@@ -19,7 +19,7 @@ import numpy as np
 
 from verifai_jax.addons.estimation.certification import certify, race
 from verifai_jax.addons.estimation.certification.allocation import Allocation
-from verifai_jax.statistics.confidence_sequences import simultaneous_interval, verdict
+from verifai_jax.addons.estimation.simultaneous_interval import simultaneous_interval, verdict
 
 PROFILES = {
     "facts": np.r_[0, 0, 0.004, 0.035, 0.299, 0.357, np.linspace(0.05, 0.9, 58)],

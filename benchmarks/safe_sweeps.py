@@ -41,8 +41,8 @@ from envs.lane_keeping import LaneKeepingTask
 from envs.mountain_car import MountainCarTask
 from specs.cartpole import balance_with
 from specs.mountain_car import climb_with, trained_on
+from verifai_jax.addons.estimation.intervals import upper_bound
 from verifai_jax.addons.rl import PPO, Continuous, Discrete, Policy, evaluate
-from verifai_jax.statistics.binomial import upper_bound
 
 HIDDEN = (64, 64)
 CONFIDENCE, P = 0.95, 0.01

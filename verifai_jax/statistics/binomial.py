@@ -96,19 +96,6 @@ def exact_interval(
     return low, float(betaincinv(high_count + 1, samples - high_count, 1 - tail))
 
 
-def upper_bound(failures: int, simulations: int, confidence: float = 0.95) -> float:
-    """Compute the one-sided Clopper-Pearson bound: the largest rate that is not excluded.
-
-    **Arguments:** those of `clopper_pearson`; without simulations, or if all fail, the bound is 1.
-    **Returns:** the bound; without a failure about `3 / simulations` at a confidence of 95 %.
-    """
-    from scipy.special import betaincinv
-
-    if simulations < 1 or failures >= simulations:
-        return 1.0
-    return float(betaincinv(failures + 1, simulations - failures, confidence))
-
-
 def simulations_without_failure(rate: float, confidence: float = 0.95) -> int:
     """Count the simulations without a failure that would show a failure rate below `rate`.
 
@@ -121,33 +108,6 @@ def simulations_without_failure(rate: float, confidence: float = 0.95) -> int:
     check_fraction("rate", rate)
     check_fraction("confidence", confidence)
     return math.ceil(math.log1p(-confidence) / math.log1p(-rate) - 1e-9)
-
-
-def simulations_until(
-    p0: float, failures: int = 0, simulations: int = 0, confidence: float = 0.95
-) -> int:
-    """Count the further simulations without a failure that would show a rate below `p0`.
-
-    **Arguments:**
-    - `p0`: failure rate to exclude.
-    - `failures`, `simulations`: samples taken so far.
-    - `confidence`: the probability that the statement holds.
-    **Returns:** the least `n` for which `upper_bound(failures, simulations + n)` is at most `p0`.
-    **Raises:** `ValueError` unless `0 < p0 < 1`.
-    """
-    check_fraction("p0", p0)
-    low, high = 0, 1
-    while upper_bound(failures, simulations + high, confidence) > p0:
-        low, high = high, 2 * high
-        if high > 2**62:
-            break
-    if upper_bound(failures, max(simulations, 1), confidence) <= p0 and simulations:
-        return 0
-    while high - low > 1:
-        middle = (low + high) // 2
-        enough = upper_bound(failures, simulations + middle, confidence) <= p0
-        low, high = (low, middle) if enough else (middle, high)
-    return high
 
 
 def check_counts(failures: int, simulations: int, undecided: int = 0) -> None:

@@ -6,12 +6,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.stats import binom, genpareto
 
-from verifai_jax.addons.estimation.intervals import skewed_interval, tail_index, weighted_mean
-from verifai_jax.statistics.binomial import (
+from verifai_jax.addons.estimation.intervals import (
     simulations_until,
-    simulations_without_failure,
+    skewed_interval,
+    tail_index,
     upper_bound,
+    weighted_mean,
 )
+from verifai_jax.statistics.binomial import simulations_without_failure
 
 
 @given(st.integers(1, 3000), st.data(), st.sampled_from([0.9, 0.95, 0.99]))

@@ -1,10 +1,12 @@
-"""Intervals of the mean of weighted samples, and of the products of fractions of splitting."""
+"""Intervals of the mean of weighted samples and of products of fractions; one-sided bounds."""
 
 import math
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
+
+from verifai_jax.core.messages.checks import check_fraction
 
 
 class WeightedMean(NamedTuple):
@@ -105,3 +107,43 @@ def tail_index(weights: Float[np.ndarray, " n"]) -> float:
     share /= share.sum()
     shape = float(np.mean(np.log1p(-float(b @ share) * x)))
     return (count * shape + 5) / (count + 10)  # Their weak prior at one half.
+
+
+def upper_bound(failures: int, simulations: int, confidence: float = 0.95) -> float:
+    """Compute the one-sided Clopper-Pearson bound: the largest rate that is not excluded.
+
+    **Arguments:** those of `clopper_pearson`; without simulations, or if all fail, the bound is 1.
+    **Returns:** the bound; without a failure about `3 / simulations` at a confidence of 95 %.
+    """
+    from scipy.special import betaincinv
+
+    if simulations < 1 or failures >= simulations:
+        return 1.0
+    return float(betaincinv(failures + 1, simulations - failures, confidence))
+
+
+def simulations_until(
+    p0: float, failures: int = 0, simulations: int = 0, confidence: float = 0.95
+) -> int:
+    """Count the further simulations without a failure that would show a rate below `p0`.
+
+    **Arguments:**
+    - `p0`: failure rate to exclude.
+    - `failures`, `simulations`: samples taken so far.
+    - `confidence`: the probability that the statement holds.
+    **Returns:** the least `n` for which `upper_bound(failures, simulations + n)` is at most `p0`.
+    **Raises:** `ValueError` unless `0 < p0 < 1`.
+    """
+    check_fraction("p0", p0)
+    low, high = 0, 1
+    while upper_bound(failures, simulations + high, confidence) > p0:
+        low, high = high, 2 * high
+        if high > 2**62:
+            break
+    if upper_bound(failures, max(simulations, 1), confidence) <= p0 and simulations:
+        return 0
+    while high - low > 1:
+        middle = (low + high) // 2
+        enough = upper_bound(failures, simulations + middle, confidence) <= p0
+        low, high = (low, middle) if enough else (middle, high)
+    return high

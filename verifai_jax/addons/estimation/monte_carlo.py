@@ -8,8 +8,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from verifai_jax.addons.estimation.intervals import upper_bound
 from verifai_jax.addons.estimation.normal_space import Ended, LimitState
-from verifai_jax.statistics.binomial import clopper_pearson, upper_bound
+from verifai_jax.statistics.binomial import clopper_pearson
 
 AT_ONCE = 8
 """Batches between two looks at the clock, after which nothing of them is lost."""

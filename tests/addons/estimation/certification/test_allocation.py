@@ -6,7 +6,7 @@ from scipy.stats import beta
 
 from verifai_jax.addons.estimation.certification import race
 from verifai_jax.addons.estimation.certification.allocation import Allocation, find_leader
-from verifai_jax.statistics.confidence_sequences import simultaneous_interval, verdict
+from verifai_jax.addons.estimation.simultaneous_interval import simultaneous_interval, verdict
 
 # Failure rates of 64 policies: the six of `facts` that reached full return, the others worse.
 FACTS = np.concatenate([[0, 0, 0.004, 0.035, 0.299, 0.357], np.linspace(0.05, 0.9, 58)])

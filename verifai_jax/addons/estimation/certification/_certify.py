@@ -28,6 +28,7 @@ from verifai_jax.addons.estimation.certification.attack import (
 from verifai_jax.addons.estimation.certification.blocks import Blocks, Remember
 from verifai_jax.addons.estimation.certification.certification import Certification
 from verifai_jax.addons.estimation.certification.result import Certificate, Certificates
+from verifai_jax.addons.estimation.simultaneous_interval import simultaneous_interval, verdict
 from verifai_jax.core.compute.compilation import power_of_two
 from verifai_jax.core.compute.devices import enable_compile_cache
 from verifai_jax.core.display.progress import say_done, shows_progress
@@ -40,7 +41,6 @@ from verifai_jax.features import FeatureSpace
 from verifai_jax.problem.dependence import depends_on_key
 from verifai_jax.problem.problem import Problem
 from verifai_jax.problem.silent_mistakes import formula_notes
-from verifai_jax.statistics.confidence_sequences import simultaneous_interval, verdict
 
 LANES = 64
 """Number of samples of a policy in one block."""

@@ -16,8 +16,8 @@ simulations go to the leader and half to its likeliest rivals (top-two sampling:
 Bayesian algorithms for best-arm identification, Operations Research 68, 2020). The chance only
 decides when to stop; it is not a bound and certifies nothing.
 
-**Verdicts** rely on bounds that hold at any time (`statistics/confidence_sequences.py`), so they
-are valid for any allocation. Undecided policies are simulated further if their observed rate
+**Verdicts** rely on bounds that hold at any time (`simultaneous_interval.py`), so they are valid
+for any allocation. Undecided policies are simulated further if their observed rate
 suggests a decision within the budget, those closest to a decision first.
 """
 
@@ -29,7 +29,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from verifai_jax.statistics.confidence_sequences import (
+from verifai_jax.addons.estimation.simultaneous_interval import (
     evidence_above,
     evidence_below,
     required_evidence,

@@ -6,10 +6,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from verifai_jax.addons.estimation.simultaneous_interval import UNSAFE, safe_at
 from verifai_jax.core.display.notebook import InNotebook
 from verifai_jax.core.messages.text import format_percent
 from verifai_jax.statistics.binomial import Rate
-from verifai_jax.statistics.confidence_sequences import UNSAFE, safe_at
 
 if TYPE_CHECKING:
     import pandas as pd

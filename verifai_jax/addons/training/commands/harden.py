@@ -36,8 +36,8 @@ def harden(
     """Train a policy of the study TARGET (FILE.py:NAME), train it on its failures, certify it."""
     from verifai_jax import Certification, FurtherTraining, Stop, Study
     from verifai_jax import harden as run
+    from verifai_jax.addons.estimation.simultaneous_interval import safe_at
     from verifai_jax.core.user_code.targets import load_target
-    from verifai_jax.statistics.confidence_sequences import safe_at
 
     study = load_target(target, Study)
     into = folder or Path("runs") / f"harden-{target.rpartition(':')[2]}"

@@ -23,6 +23,7 @@ import pandas as pd
 from verifai_jax._version import __version__
 from verifai_jax.addons.estimation.certification import Certificates, Certification, certify
 from verifai_jax.addons.estimation.comparison import Comparison, compare
+from verifai_jax.addons.estimation.simultaneous_interval import safe_at
 from verifai_jax.addons.rl import PPO, evaluate
 from verifai_jax.addons.training.hardening.arms import FunctionArms, TaskArms
 from verifai_jax.addons.training.hardening.collecting import Collected, collect
@@ -48,7 +49,6 @@ from verifai_jax.core.store.cache import Cache, locked_cache
 from verifai_jax.features import Categorical
 from verifai_jax.problem.problem import Problem
 from verifai_jax.problem.silent_mistakes import formula_notes
-from verifai_jax.statistics.confidence_sequences import safe_at
 from verifai_jax.statistics.stopping import Stop
 
 ROUND, FINAL, COMPARED, ATTACK, RETURNS = range(5)

@@ -11,13 +11,13 @@ from jaxtyping import Float
 
 from verifai_jax.addons.estimation.certification import Certificate, Certificates
 from verifai_jax.addons.estimation.comparison import Comparison
+from verifai_jax.addons.estimation.simultaneous_interval import safe_at
 from verifai_jax.addons.training.paired import PairedDifference, paired_difference
 from verifai_jax.core.display.figure import Drawn
 from verifai_jax.core.display.notebook import Tabular
 from verifai_jax.core.messages.text import counted, format_percent
 from verifai_jax.core.store.locks import write_lock
 from verifai_jax.core.store.replacements import replacing_all
-from verifai_jax.statistics.confidence_sequences import safe_at
 
 HARDENED, BASELINE = "hardened", "randomised"
 """Names of the arms: with counterexamples, and with the prior alone (domain randomisation)."""

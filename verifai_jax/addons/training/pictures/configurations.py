@@ -7,10 +7,10 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import NullFormatter
 
+from verifai_jax.addons.estimation.simultaneous_interval import verdict_kind
 from verifai_jax.addons.training.pictures.sweep import LOOKS
 from verifai_jax.addons.training.sweeps.result import Sweep
 from verifai_jax.pictures import style
-from verifai_jax.statistics.confidence_sequences import verdict_kind
 
 
 def plot_parallel(sweep: Sweep, path: str | Path | None = None) -> Figure:

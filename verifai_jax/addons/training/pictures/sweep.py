@@ -9,6 +9,7 @@ from jaxtyping import Bool, Float
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from verifai_jax.addons.estimation.simultaneous_interval import verdict_kind
 from verifai_jax.addons.training.sweeps.importance import HyperparameterImportance
 from verifai_jax.addons.training.sweeps.ranking import (
     full_return_threshold,
@@ -20,7 +21,6 @@ from verifai_jax.addons.training.sweeps.result import Sweep
 from verifai_jax.addons.training.sweeps.summary import format_failures
 from verifai_jax.core.messages.text import format_percent, shorten
 from verifai_jax.pictures import style
-from verifai_jax.statistics.confidence_sequences import verdict_kind
 
 if TYPE_CHECKING:
     import pandas as pd

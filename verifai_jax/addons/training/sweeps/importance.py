@@ -26,12 +26,12 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
+from verifai_jax.addons.estimation.simultaneous_interval import verdict_kind
 from verifai_jax.addons.training.sweeps.fanova import leaf_boxes, variance_shares
 from verifai_jax.core.display.lazy import lazy_import
 from verifai_jax.core.display.notebook import InNotebook
 from verifai_jax.core.messages.text import format_percent
 from verifai_jax.features import FeatureSpace
-from verifai_jax.statistics.confidence_sequences import verdict_kind
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from jaxtyping import Bool, Int
 
+from verifai_jax.addons.estimation.simultaneous_interval import verdict_kind
 from verifai_jax.addons.training.sweeps.pareto import fronts
-from verifai_jax.statistics.confidence_sequences import verdict_kind
 
 if TYPE_CHECKING:
     import pandas as pd

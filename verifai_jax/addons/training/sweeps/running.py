@@ -11,6 +11,7 @@ from verifai_jax._version import __version__
 from verifai_jax.addons.estimation.certification._certify import certify
 from verifai_jax.addons.estimation.certification.certification import Certification
 from verifai_jax.addons.estimation.certification.result import Certificate, Certificates
+from verifai_jax.addons.estimation.simultaneous_interval import verdict_kind
 from verifai_jax.addons.rl._evaluate import batched_mean_returns
 from verifai_jax.addons.training.sweeps import record
 from verifai_jax.addons.training.sweeps.clock import CERTIFYING, TRAINING, Clock, OutOfTime
@@ -29,7 +30,6 @@ from verifai_jax.core.store.cache import Cache
 from verifai_jax.core.store.log import Arrays
 from verifai_jax.core.user_code.callbacks import Callback, notify
 from verifai_jax.evaluation.run_on import RunOn
-from verifai_jax.statistics.confidence_sequences import verdict_kind
 
 SCREENING = 64
 """Samples of a policy, and simulations of the attack on it, by which a search or halving chooses.

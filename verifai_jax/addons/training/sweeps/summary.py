@@ -12,10 +12,10 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from verifai_jax.addons.estimation.simultaneous_interval import verdict_kind
 from verifai_jax.addons.training.sweeps import ranking
 from verifai_jax.addons.training.sweeps.record import SweepRecord, algorithm_uses, error_message
 from verifai_jax.core.messages.text import counted, format_features, format_percent
-from verifai_jax.statistics.confidence_sequences import verdict_kind
 
 if TYPE_CHECKING:
     import pandas as pd

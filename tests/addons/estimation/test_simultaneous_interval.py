@@ -7,16 +7,16 @@ import pytest
 from scipy.integrate import quad
 from scipy.stats import beta
 
-from verifai_jax.statistics.binomial import clopper_pearson
-from verifai_jax.statistics.confidence_sequences import (
+from verifai_jax.addons.estimation.simultaneous_interval import (
     ATOM,
-    anytime_interval,
     evidence_above,
     evidence_below,
     required_evidence,
     simultaneous_interval,
     verdict,
 )
+from verifai_jax.statistics.binomial import clopper_pearson
+from verifai_jax.statistics.confidence_sequences import anytime_interval
 
 
 @pytest.mark.parametrize(("k", "n", "q"), [(0, 40, 0.05), (2, 50, 0.2), (7, 30, 0.4), (5, 5, 0.9)])
