@@ -8,7 +8,6 @@ from verifai_jax.core.messages.text import (
     folder_name,
     format_error,
     format_features,
-    format_probability,
     one_line,
     printable,
 )
@@ -61,12 +60,3 @@ def test_names_of_a_problem_are_one_line(name):
     # What is data may be any text, and is written in one line.
     vj.Trace({name: np.ones(1)}, dt=1.0)
     assert len(format_features({"c": name}).splitlines()) == 1
-
-
-@pytest.mark.parametrize(
-    ("probability", "text"),
-    [(0.0, "0"), (1e-7, "1e-07"), (0.2345678, "0.235"), (0.999, "0.999"), (0.99993, "0.99993"),
-     (0.9999, "0.9999"), (0.9999999, "0.9999999"), (1.0, "1")],
-)  # fmt: skip
-def test_no_probability_below_one_is_written_as_one(probability, text):
-    assert format_probability(probability) == text

@@ -78,10 +78,6 @@ PROVED = option(
 REPORT = option(
     "--report", type=PATH, metavar="HTML", help="Write the evidence report into an HTML file."
 )
-ERRORS = option(
-    "--errors", type=click.IntRange(1), metavar="PAIRS",
-    help="Add how wrong the number can be, with this many pairs of simulations for each part.",
-)  # fmt: skip
 ODD = option(
     "--odd", type=PATH, metavar="YAML",
     help="Operational design domain, an OpenODD file: report how much of it is covered.",
@@ -102,51 +98,6 @@ def all_of(*decorators: Callable[[Any], Any]) -> Callable[[Command], Command]:
         return command
 
     return decorate
-
-
-PARAMETER_CHOICE = all_of(
-    option(
-        "--aim",
-        type=click.Choice(("robustness", "probability")),
-        default="robustness",
-        help="Robustness against an attack, or the lowest failure probability.",
-    ),
-    option("--margin", default=0.0, help="Robustness wanted."),
-    option("--attack", default="cross_entropy", help="Search used for attacks."),
-    option("--held-out", default=2000, help="Fresh simulations to check the result."),
-    option(
-        "--mass",
-        default=0.999,
-        help="Probability of the central part of the prior that is attacked; 1 for all of it.",
-    ),
-    click.option(
-        "--gradient/--no-gradient",
-        default=None,
-        help="Use gradients  [default: if the system has them]",
-    ),
-    SEED,
-    MAX_SECONDS,
-    BACKEND,
-)
-"""Options of `synthesize` and `repair`, for `values_of`."""
-NAMES = all_of(
-    option("--const", "constants", multiple=True, metavar="NAME=NUMBER"),
-    option("--define", "definitions", multiple=True, metavar="NAME=FORMULA"),
-)
-"""Names that a formula may use."""
-
-
-def read_names(
-    constants: tuple[str, ...], definitions: tuple[str, ...]
-) -> tuple[dict[str, float], dict[str, str]]:
-    """Read the constants and the definitions of `NAMES`; a usage error names a wrong entry."""
-    numbers = {}
-    for name, value in split_pairs("--const", constants):
-        try:
-            numbers[name] = float(value)
-        except ValueError:
-            raise click.UsageError(f"--const {name} must be a number; got {value!r}") from None
-    return numbers, dict(split_pairs("--define", definitions))
 
 
 @contextlib.contextmanager

@@ -26,7 +26,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from verifai_jax.counterexamples.candidates import Candidates, Tangent
-from verifai_jax.statistics.smallest_change import shortest_in_box
+from verifai_jax.statistics.least_distance import shortest_in_box
 
 Point = Float[np.ndarray, " d"]
 Points = Float[np.ndarray, "n d"]

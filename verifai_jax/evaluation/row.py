@@ -2,7 +2,6 @@
 
     inputs = CubePoints(problem)                        # points of the unit cube, or given features
     inputs = TableRows(refiner, formats)                # features of a table, at a finer step
-    inputs = WithParameters(problem, size, system_of)   # points, and parameters that all share
     function = RowFunction(problem, inputs, "float32", gradient=True, goals=None, guidance=NOTHING)
     function(row, key, temperature, shared, Derivative(d))          # Row, traced by JAX
 
@@ -121,37 +120,6 @@ class TableRows(Inputs):
         self, coordinates: Float[Array, " dim"], row: PyTree, shared: PyTree
     ) -> tuple[PyTree, Callable[..., Any]]:
         return row, self.system_at(shared)
-
-
-class WithParameters(Inputs):
-    """Points of the unit cube, with a vector of system parameters shared by all rows.
-
-    The coordinates are the parameters followed by the point.
-
-    **Arguments:**
-    - `problem`: the problem with its space and formulas.
-    - `size`: number of parameters.
-    - `system_of`: a function from a vector of parameters to the system.
-    """
-
-    def __init__(
-        self, problem: Problem, size: int, system_of: Callable[[Array], Callable[..., Any]]
-    ) -> None:
-        self.problem, self.size, self.system_of = problem, size, system_of
-        self.dim = size + problem.space.dim
-        self.row_form = jax.ShapeDtypeStruct((problem.space.dim,), jnp.float32)
-        self.shared_form = jax.ShapeDtypeStruct((size,), jnp.float32)
-
-    def coordinates(self, row: PyTree, shared: PyTree, precision: str) -> Float[Array, " dim"]:
-        return jnp.concatenate([shared.astype(precision), row.astype(precision)])
-
-    def simulated(
-        self, coordinates: Float[Array, " dim"], row: PyTree, shared: PyTree
-    ) -> tuple[PyTree, Callable[..., Any]]:
-        theta, u = coordinates[: self.size], coordinates[self.size :]
-        with lifting():
-            features = self.problem.space.unflatten(u)
-        return features, self.system_of(theta)
 
 
 class Row(NamedTuple):

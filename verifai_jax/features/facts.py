@@ -50,18 +50,3 @@ def integer_facts(low: int, high: int) -> dict[str, Any]:
     """Return the facts about a column of equally probable integers."""
     ends = (low, high)
     return {"ordered": True, "bounds": ends, "range": ends, "integer": True, "uniform": True}
-
-
-def joined_facts(one: dict[str, Any] | None, other: dict[str, Any]) -> dict[str, Any]:
-    """Return the facts about a column that has one of two domains, or may be empty."""
-    if not other["ordered"]:
-        return {"ordered": False}
-    if one is None or one == other:
-        return other
-    if not (one["ordered"] and other["ordered"]):
-        return {"ordered": False}
-    joined: dict[str, Any] = {"ordered": True, "integer": one["integer"] and other["integer"]}
-    for ends in ("bounds", "range"):
-        (a, b), (c, d) = one[ends], other[ends]
-        joined[ends] = (min(a, c), max(b, d))
-    return joined

@@ -8,7 +8,6 @@ first one. An action takes effect `n` steps after its decision; until then the s
 zeros, or a discrete environment its first choice.
 """
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from types import ModuleType
 from typing import Any, TypeAlias
@@ -22,8 +21,6 @@ from verifai_jax.systems.channels import Instant, Link, Side
 
 Features: TypeAlias = PyTree
 Value: TypeAlias = Array | np.ndarray
-DelayOption: TypeAlias = int | Mapping[str, int]
-"""The option of a delay: a number of steps, or `{feature: greatest number of steps}`."""
 FEW = 16
 """Values of a line up to which each is an array of its own."""
 
@@ -94,38 +91,6 @@ class Delay(Link):
             )
 
 
-NO_DELAY = Delay()
-"""An observation that is seen at once, an action that takes effect at once."""
-
-
-def as_delay(option: DelayOption, name: str) -> Delay:
-    """Return the delay given by the option `name`.
-
-    **Raises:** `ValueError` for anything but a number of steps or `{feature: maximum}`.
-    """
-    side: Side = "action" if name == "action_delay" else "observation"
-    delay = Delay(option, side=side) if isinstance(option, int) else None
-    if isinstance(option, Mapping) and len(option) == 1:
-        ((feature, maximum),) = option.items()
-        delay = Delay(maximum, feature, side)
-    whole = (
-        delay is not None
-        and isinstance(delay.max_steps, int)
-        and not isinstance(delay.max_steps, bool)
-    )
-    if (
-        delay is None
-        or not whole
-        or delay.max_steps < 0
-        or not isinstance(delay.feature, str | None)
-    ):
-        raise ValueError(
-            f"{name} must be a number of steps, or a feature with its maximum number of steps, "
-            f"{{'latency': 5}}; got {option!r}"
-        )
-    return delay
-
-
 def line_of(first: Value, count: int) -> Any:
     """Return a delay line: the last `count` values, newest first, initially all `first`.
 
@@ -151,11 +116,6 @@ def entry(line: Any, index: Any, xp: ModuleType = jnp) -> Any:
     for i, earlier in enumerate(line[1:], 1):
         chosen = xp.where(index == i, earlier, chosen)
     return chosen
-
-
-def links_of(*delays: Delay) -> tuple[Delay, ...]:
-    """Return the delays that are not zero."""
-    return tuple(delay for delay in delays if delay.max_steps or delay.feature is not None)
 
 
 def joined(links: tuple[Link, ...], faults: tuple[Link, ...]) -> tuple[Link, ...]:

@@ -7,6 +7,7 @@ from hypothesis import strategies as st
 from scipy.stats import binom, genpareto
 
 from verifai_jax.addons.estimation.intervals import (
+    format_probability,
     simulations_until,
     skewed_interval,
     tail_index,
@@ -66,3 +67,12 @@ def test_equal_weights_are_worth_their_number():
     assert told.effective == pytest.approx(50)
     assert told.mean == pytest.approx(0.025)
     assert told.tail == -np.inf
+
+
+@pytest.mark.parametrize(
+    ("probability", "text"),
+    [(0.0, "0"), (1e-7, "1e-07"), (0.2345678, "0.235"), (0.999, "0.999"), (0.99993, "0.99993"),
+     (0.9999, "0.9999"), (0.9999999, "0.9999999"), (1.0, "1")],
+)  # fmt: skip
+def test_no_probability_below_one_is_written_as_one(probability, text):
+    assert format_probability(probability) == text

@@ -8,10 +8,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import minimize
 
-from verifai_jax.addons.synthesis.max_min import max_min_step
+from verifai_jax.addons.synthesis.linear_steps import max_min_step, smallest_change
 from verifai_jax.addons.synthesis.optimize import worst_case
 from verifai_jax.addons.synthesis.parametric import Pairs
-from verifai_jax.statistics.smallest_change import smallest_change
 
 sizes = st.tuples(st.integers(1, 4), st.integers(1, 6), st.integers(0, 10_000))
 

@@ -147,3 +147,11 @@ def simulations_until(
         enough = upper_bound(failures, simulations + middle, confidence) <= p0
         low, high = (low, middle) if enough else (middle, high)
     return high
+
+
+def format_probability(probability: float) -> str:
+    """Format a probability with three digits, or more if needed to differ from 1: `0.99993`."""
+    if 0.999 < probability < 1:
+        digits = -math.floor(math.log10(1 - probability))
+        return f"{probability:z.{digits}f}".rstrip("0")
+    return f"{probability:z.3g}"

@@ -12,11 +12,11 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
-from verifai_jax.addons.estimation.intervals import simulations_until
+from verifai_jax.addons.estimation.intervals import format_probability, simulations_until
 from verifai_jax.core.display.figure import Drawn, Reported
 from verifai_jax.core.display.notebook import InNotebook
 from verifai_jax.core.messages.checks import check_fraction
-from verifai_jax.core.messages.text import format_percent, format_probability
+from verifai_jax.core.messages.text import format_percent
 
 if TYPE_CHECKING:
     pass

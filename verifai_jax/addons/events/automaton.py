@@ -23,7 +23,7 @@ from verifai_jax.core.messages.checks import check_count
 from verifai_jax.core.messages.errors import unknown_name
 from verifai_jax.core.messages.text import format_seconds
 from verifai_jax.features.domain import Domain, Row, as_real, cell, centre, dotted, indexed
-from verifai_jax.features.facts import Facts, integer_facts, joined_facts
+from verifai_jax.features.facts import Facts, integer_facts
 
 
 @dataclass(frozen=True, init=False, repr=False)
@@ -415,3 +415,16 @@ def _among(taken: jax.Array, numbers: tuple[int, ...]) -> jax.Array:
     for number in numbers[1:]:
         found |= taken == number
     return found
+
+
+def joined_facts(one: dict[str, Any] | None, other: dict[str, Any]) -> dict[str, Any]:
+    """Return the facts about a column that has one of two domains, or may be empty."""
+    if not (other["ordered"] and (one is None or one["ordered"])):
+        return {"ordered": False}
+    if one is None or one == other:
+        return other
+    joined: dict[str, Any] = {"ordered": True, "integer": one["integer"] and other["integer"]}
+    for ends in ("bounds", "range"):
+        (a, b), (c, d) = one[ends], other[ends]
+        joined[ends] = (min(a, c), max(b, d))
+    return joined

@@ -25,7 +25,7 @@ from verifai_jax.addons.synthesis.aim import Aim, as_aim
 from verifai_jax.addons.synthesis.budget import Budget, split_budget
 from verifai_jax.addons.synthesis.failure_counts import FailureCounts
 from verifai_jax.addons.synthesis.held_out import held_out
-from verifai_jax.addons.synthesis.max_min import max_min_step
+from verifai_jax.addons.synthesis.linear_steps import max_min_step, smallest_change
 from verifai_jax.addons.synthesis.parametric import FeatureParameters, Parametric
 from verifai_jax.addons.synthesis.region import Region, region_of
 from verifai_jax.addons.synthesis.results import Repair, Round
@@ -38,7 +38,6 @@ from verifai_jax.falsification.run import Run
 from verifai_jax.falsification.validation import usual_batch
 from verifai_jax.problem.problem import Problem
 from verifai_jax.search import Search
-from verifai_jax.statistics.smallest_change import smallest_change
 from verifai_jax.statistics.stopping import Stop
 
 ADDED = 8

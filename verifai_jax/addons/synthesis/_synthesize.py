@@ -24,7 +24,7 @@ from verifai_jax.addons.synthesis.aim import Aim, as_aim
 from verifai_jax.addons.synthesis.budget import Budget, split_budget
 from verifai_jax.addons.synthesis.failure_counts import FailureCounts
 from verifai_jax.addons.synthesis.held_out import HeldOut, draw, held_out
-from verifai_jax.addons.synthesis.max_min import max_min_step
+from verifai_jax.addons.synthesis.linear_steps import max_min_step
 from verifai_jax.addons.synthesis.parametric import FeatureParameters, Parametric, rows_of
 from verifai_jax.addons.synthesis.region import Region, region_of
 from verifai_jax.addons.synthesis.results import Synthesis

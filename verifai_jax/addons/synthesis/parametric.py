@@ -22,11 +22,12 @@ from jaxtyping import Array, Bool, Float, PyTree
 
 from verifai_jax.core.compute.compilation import pad_rows
 from verifai_jax.core.compute.keys import run_keys
+from verifai_jax.core.compute.lifting import lifting
 from verifai_jax.core.compute.precision import in_precision
 from verifai_jax.core.messages.errors import check_names
 from verifai_jax.evaluation.engine import Engine
 from verifai_jax.evaluation.evaluator import Evaluator
-from verifai_jax.evaluation.row import WithParameters
+from verifai_jax.evaluation.row import Inputs
 from verifai_jax.evaluation.verdicts import trace_verdict
 from verifai_jax.features import FeatureSpace
 from verifai_jax.problem.problem import Problem
@@ -224,8 +225,7 @@ class ArrayParameters:
     def _check(self) -> None:
         features = jax.eval_shape(self.problem.space.unflatten, jnp.zeros(self.problem.space.dim))
         key = jax.eval_shape(lambda: jax.random.key(0))
-        start = self._restore(jnp.asarray(self.start, jnp.float32))
-        if replace(self.problem, system=self.system_of(start)).black_box:
+        if self.with_parameters(self.start).black_box:
             raise ValueError(
                 "arrays of parameters are repaired by gradients, which a black box has not; make "
                 "the parameters features of the space, and name them"
@@ -233,8 +233,7 @@ class ArrayParameters:
         theta = jax.ShapeDtypeStruct((self.dim,), jnp.float32)
 
         def simulated(theta: Array, features: PyTree, key: Array) -> PyTree:
-            system = self.system_of(self._restore(theta))
-            return trace_verdict(self.problem, system(features, key))
+            return trace_verdict(self.problem, self.system_at(theta)(features, key))
 
         try:
             jax.eval_shape(simulated, theta, features, key)
@@ -291,6 +290,10 @@ class ArrayParameters:
         """Return the problem with the system for these parameters."""
         return replace(self.problem, system=self.system_of(self.values(theta)))
 
+    def system_at(self, theta: Array) -> Callable[..., Any]:
+        """Return the system with these parameters, which JAX may trace."""
+        return self.system_of(self._restore(theta))
+
     @cached_property
     def _values(self) -> Engine:
         return self._engine(self.batch, gradient=False)
@@ -301,10 +304,29 @@ class ArrayParameters:
         return self._engine(min(self.batch, MAX_DIFFERENTIATED), gradient=True)
 
     def _engine(self, batch: int, gradient: bool) -> Engine:
-        inputs = WithParameters(
-            self.problem, self.dim, lambda theta: self.system_of(self._restore(theta))
-        )
-        return Engine(self.problem, batch, gradient, precision=self.precision, inputs=inputs)
+        precision, inputs = self.precision, _Inputs(self)
+        return Engine(self.problem, batch, gradient, precision=precision, inputs=inputs)
+
+
+class _Inputs(Inputs):
+    """The coordinates of the environment, with the arrays, which all rows share, before them."""
+
+    def __init__(self, arrays: ArrayParameters) -> None:
+        self.arrays, self.space = arrays, arrays.problem.space
+        self.dim = arrays.dim + self.space.dim
+        self.row_form = jax.ShapeDtypeStruct((self.space.dim,), jnp.float32)
+        self.shared_form = jax.ShapeDtypeStruct((arrays.dim,), jnp.float32)
+
+    def coordinates(self, row: PyTree, shared: PyTree, precision: str) -> Float[Array, " dim"]:
+        return jnp.concatenate([shared.astype(precision), row.astype(precision)])
+
+    def simulated(
+        self, coordinates: Float[Array, " dim"], row: PyTree, shared: PyTree
+    ) -> tuple[PyTree, Callable[..., Any]]:
+        theta, u = jnp.split(coordinates, [self.arrays.dim])
+        with lifting():
+            features = self.space.unflatten(u)
+        return features, self.arrays.system_at(theta)
 
 
 Parametric = FeatureParameters | ArrayParameters

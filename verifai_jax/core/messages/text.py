@@ -32,14 +32,6 @@ def format_percent(share: float) -> str:
     return f"{percent:z.3g} %"
 
 
-def format_probability(probability: float) -> str:
-    """Format a probability with three digits, or more if needed to differ from 1: `0.99993`."""
-    if 0.999 < probability < 1:
-        digits = -math.floor(math.log10(1 - probability))
-        return f"{probability:z.{digits}f}".rstrip("0")
-    return f"{probability:z.3g}"
-
-
 def format_time(seconds: float, digits: int = 6) -> str:
     """Format an instant in seconds with enough digits to distinguish samples: `1700000003.5`.
 

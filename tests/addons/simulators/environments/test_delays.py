@@ -8,10 +8,11 @@ import pytest
 from checked_types import unchecked
 
 import verifai_jax as vj
+from verifai_jax.addons.simulators.delay_options import as_delay
 from verifai_jax.addons.simulators.environments._gymnasium import gymnasium
 from verifai_jax.core.values.trace import Status
 from verifai_jax.systems.channels import Instant
-from verifai_jax.systems.delays import Delay, as_delay
+from verifai_jax.systems.delays import Delay
 
 STEPS = 40
 

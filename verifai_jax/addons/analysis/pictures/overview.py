@@ -8,7 +8,13 @@ import pandas as pd
 
 from verifai_jax.addons.analysis._importance import NAMES, Importance
 from verifai_jax.addons.analysis.overview import Analysis
-from verifai_jax.addons.analysis.pictures.panels import cells, draw_rule, draw_samples, two_features
+from verifai_jax.addons.analysis.pictures.panels import (
+    cells,
+    draw_rule,
+    draw_samples,
+    name_points,
+    two_features,
+)
 from verifai_jax.addons.analysis.sensitivity.sensitivity import Sensitivity
 from verifai_jax.core.display.figure import Axes, Figure
 from verifai_jax.core.messages.text import format_percent
@@ -189,5 +195,5 @@ def plot_effects(table: pd.DataFrame, title: str, path: str | Path | None = None
     style.tidy(axes)
     figure.suptitle(title, fontsize=10)
     ends = (table[end].to_numpy(float) for end in ("low", "high"))
-    style.name_points(axes, [str(name) for name in table.index], across, up, *ends)
+    name_points(axes, [str(name) for name in table.index], across, up, *ends)
     return style.show_or_save(figure, path)

@@ -1,15 +1,28 @@
-"""Samples over two features, with the boxes of rules."""
+"""Samples over two features, with the boxes of rules, and names of points."""
 
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float
+from matplotlib.transforms import Bbox
 
 from verifai_jax.addons.analysis._rules import Rule, Rules
 from verifai_jax.addons.analysis.data.columns import Column
 from verifai_jax.addons.analysis.data.samples import Samples
 from verifai_jax.core.display.figure import Axes, Figure
-from verifai_jax.pictures.style import BOUND, FAILING, SAFE, new_figure, show_or_save, tidy
+from verifai_jax.pictures.style import (
+    BOUND,
+    FAILING,
+    SAFE,
+    new_figure,
+    renderer_of,
+    show_or_save,
+    tidy,
+)  # fmt: skip
+
+Positions = Float[np.ndarray, " n"]
 
 DOTS = 3000
 """Rows drawn of each verdict."""
@@ -166,3 +179,52 @@ def _wrapped(line: str, width: int = 100) -> str:
     import textwrap
 
     return textwrap.fill(line, width, subsequent_indent="    ")
+
+
+def name_points(
+    axes: Axes, names: Sequence[str], x: Positions, y: Positions, low: Positions, high: Positions
+) -> None:
+    """Write names next to points without overlaps; call it after the limits are set.
+
+    A name without room at its point is moved up or down, and joined to it by a line.
+
+    **Arguments:**
+    - `names`: the names of the points at `x` and `y`, in the units of the data.
+    - `low`, `high`: ends of a horizontal bar at each point that no name may cover.
+    """
+    figure: Any = axes.figure
+    figure.draw_without_rendering()
+    renderer = renderer_of(figure)
+    points = axes.transData.transform(np.column_stack([x, y]))
+    ends = [axes.transData.transform(np.column_stack([at, y])) for at in (low, high)]
+    taken = [Bbox([[a - 4, h - 2], [b + 4, h + 2]]) for (a, h), (b, _) in zip(*ends, strict=True)]
+    taken += [Bbox.from_bounds(px - 4, py - 4, 8, 8) for px, py in points]
+    middle = axes.bbox.x0 + 0.6 * axes.bbox.width
+    for name, (px, py) in sorted(zip(names, points.tolist(), strict=True), key=lambda n: -n[1][1]):
+        left = px > middle
+        text = axes.annotate(
+            name, (px, py), xycoords="figure pixels", fontsize=8, ha="right" if left else "left",
+            va="center", textcoords="offset pixels", xytext=(-8 if left else 8, 0),
+        )  # fmt: skip
+        box = text.get_window_extent(renderer)
+        text.remove()
+        step = 0.55 * box.height
+        for shift in sorted((k * step for k in range(-40, 41)), key=abs):
+            if py + shift < axes.bbox.y0 + step or py + shift > axes.bbox.y1 - step:
+                continue
+            away = 8 if abs(shift) < step else 18
+            x0 = px - away - box.width if left else px + away
+            area = Bbox.from_bounds(x0, py + shift - box.height / 2, box.width, box.height)
+            if not area.count_overlaps(taken):
+                break
+        else:
+            continue
+        taken.append(area)
+        # In the units of the data, so that it stays there in a picture of another size.
+        at = axes.transData.inverted().transform((px, py))
+        scale = 72 / figure.dpi
+        axes.annotate(
+            name, tuple(at), fontsize=8, ha="right" if left else "left", va="center",
+            textcoords="offset points", xytext=((-away if left else away) * scale, shift * scale),
+            arrowprops=None if away == 8 else {"arrowstyle": "-", "color": BOUND, "linewidth": 0.5},
+        )  # fmt: skip

@@ -151,8 +151,7 @@ def _within(version: str | None, minimum: str | None, below: str | None) -> bool
     if version is None:
         return False
     number = _number(version)
-    enough = minimum is None or number >= _number(minimum)
-    return enough and (below is None or number < _number(below))
+    return _number(minimum or "") <= number and (below is None or number < _number(below))
 
 
 def _number(version: str) -> tuple[int, ...]:

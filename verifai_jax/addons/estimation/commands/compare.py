@@ -5,6 +5,7 @@ from typing import Any
 
 import click
 
+from verifai_jax.addons.estimation.commands.estimate import ERRORS
 from verifai_jax.cli import arguments
 from verifai_jax.cli.gates import Gate, check_gate, fail_on
 from verifai_jax.cli.going_on import kept_until_done
@@ -34,7 +35,7 @@ from verifai_jax.cli.json_output import as_plain, command, give_result, say
 @arguments.MAX_SECONDS
 @arguments.CLUSTER
 @arguments.REPORT
-@arguments.ERRORS
+@ERRORS
 @fail_on(regression="if a candidate fails more often, by more than the margin")
 def compare(
     target: str, candidates: tuple[str, ...], cluster: str | None, report: Path | None,

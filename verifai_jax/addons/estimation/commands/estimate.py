@@ -14,6 +14,10 @@ from verifai_jax.cli.json_output import command, give_result, say, show_result
 
 if TYPE_CHECKING:
     from verifai_jax import Estimate
+ERRORS = option(
+    "--errors", type=click.IntRange(1), metavar="PAIRS",
+    help="Add how wrong the number can be, with this many pairs of simulations for each part.",
+)  # fmt: skip
 
 
 @command()
@@ -43,7 +47,7 @@ if TYPE_CHECKING:
 @arguments.PROVED
 @arguments.PLOT
 @arguments.REPORT
-@arguments.ERRORS
+@ERRORS
 @fail_on(
     p0="unless the probability is shown to be below --p0",
     rate="unless it is shown to be at most P",

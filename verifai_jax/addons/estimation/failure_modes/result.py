@@ -10,11 +10,12 @@ import numpy as np
 import pandas as pd
 from jaxtyping import Array, Key
 
+from verifai_jax.addons.estimation.intervals import format_probability
 from verifai_jax.core.compute.keys import simulation_key
 from verifai_jax.core.display.figure import Drawn
 from verifai_jax.core.display.lazy import lazy_import
 from verifai_jax.core.display.notebook import InNotebook, picture_html
-from verifai_jax.core.messages.text import format_percent, format_probability
+from verifai_jax.core.messages.text import format_percent
 from verifai_jax.counterexamples import explain, shrink
 from verifai_jax.counterexamples._explain import Explained
 from verifai_jax.counterexamples.shrunk import Shrunk

@@ -6,7 +6,9 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 from matplotlib.axes import Axes
+from matplotlib.axis import Axis
 from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter, NullLocator
 
 from verifai_jax.addons.estimation.result import Estimate
 from verifai_jax.core.messages.text import format_percent
@@ -47,7 +49,7 @@ def _draw_interval(axes: Axes, estimate: Estimate) -> None:
             axes.plot(high, height, "|", color=color, markersize=14)
     axes.set_xscale("log")
     axes.set_xlim(lowest, min(1.5, estimate.upper_bound * 4))
-    style.log_ticks(axes.xaxis)
+    log_ticks(axes.xaxis)
     axes.set_yticks(range(len(rows)), [style.wrap_name(row[0], 14) for row in rows])
     axes.set_ylim(-0.8, len(rows) - 0.2)
     axes.set_xlabel(f"failure probability ({sure})")
@@ -66,7 +68,7 @@ def _draw_levels(axes: Axes, levels: list[float], fractions: list[float]) -> Non
     if max(shown) > 50 * (np.median([s for s in shown if s > 0] or [1.0])):
         axes.set_xscale("symlog", linthresh=max(min([s for s in shown if s > 0]), 1e-3))
     axes.set_yscale("log")
-    style.log_ticks(axes.yaxis)
+    log_ticks(axes.yaxis)
     axes.set_xlabel("robustness at most")
     axes.set_ylabel("probability, by splitting")
     style.tidy(axes)
@@ -79,3 +81,15 @@ def _draw_weights(axes: Axes, weights: Float[np.ndarray, " n"]) -> None:
     axes.set_xlabel("failures, the heaviest first")
     axes.set_ylabel("% of the estimate (dashed: all alike)")
     style.tidy(axes)
+
+
+def log_ticks(axis: Axis) -> None:
+    """Label a few numbers on a logarithmic axis: powers of ten, or round numbers."""
+    low, high = axis.get_view_interval()
+    locator: Any = LogLocator(subs=(1.0, 2.0, 5.0) if high / low < 100 else (1.0,), numticks=6)
+    if high / low < 5:  # Powers of ten, twice and five times these, are one at most.
+        locator = MaxNLocator(4)
+        axis.set_minor_locator(NullLocator())
+    axis.set_major_locator(locator)
+    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:zg}"))
+    axis.set_minor_formatter(NullFormatter())

@@ -8,6 +8,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from verifai_jax.addons.estimation.failure_modes.result import Modes
+from verifai_jax.addons.estimation.pictures.estimate import log_ticks
 from verifai_jax.core.messages.text import format_percent
 from verifai_jax.pictures import style
 
@@ -51,7 +52,7 @@ def _draw_bars(axes: Axes, modes: Modes) -> None:
     axes.set_ylim(len(modes) - 0.4, -0.6)
     if len(modes):
         axes.set_xscale("log")
-        style.log_ticks(axes.xaxis)
+        log_ticks(axes.xaxis)
     axes.set_xlabel(f"failure probability ({format_percent(modes.confidence)})")
     axes.set_title(f"modes of failure of {modes.name}", fontsize=10)
     style.tidy(axes)

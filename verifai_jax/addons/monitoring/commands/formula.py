@@ -18,6 +18,11 @@ if TYPE_CHECKING:
 End = Literal["hold", "truncate"]
 FILES = click.argument("recordings", metavar="[RECORDING]...", nargs=-1, type=PATH)
 """Recordings: files, or folders of them."""
+NAMES = arguments.all_of(
+    option("--const", "constants", multiple=True, metavar="NAME=NUMBER"),
+    option("--define", "definitions", multiple=True, metavar="NAME=FORMULA"),
+)
+"""Names that a formula may use."""
 ASKED = arguments.all_of(
     option("--problem", metavar="FILE.py:NAME", help="A problem, instead of recordings."),
     option(
@@ -26,7 +31,7 @@ ASKED = arguments.all_of(
         default="hold",
         help="How a trace continues after the last sample.",
     ),
-    arguments.NAMES,
+    NAMES,
 )
 """Where signals are from besides recordings, and the names that a formula may use."""
 
@@ -52,7 +57,7 @@ def lint(
     that do not go together, windows beyond the recordings. What is neither a formula nor a file of
     requirements is a recording, as after --on.
     """
-    names = arguments.read_names(constants, definitions)
+    names = read_names(constants, definitions)
     found: dict[str, Requirement] = {}
     for file in files:
         path = Path(file)
@@ -156,7 +161,7 @@ for _command in (lint, mutants, distinguish, examples, templates):
 
 
 def _parsed(text: str, constants: tuple[str, ...], definitions: tuple[str, ...]) -> "vj.Formula":
-    return vj.mtl.parse(text, *arguments.read_names(constants, definitions))
+    return vj.mtl.parse(text, *read_names(constants, definitions))
 
 
 def _signals(recordings: tuple[Path, ...], problem: str | None) -> Any:
@@ -166,3 +171,16 @@ def _signals(recordings: tuple[Path, ...], problem: str | None) -> Any:
             raise click.UsageError("give either recordings or --problem, and not both")
         return arguments.load_problem(problem)
     return recordings or None
+
+
+def read_names(
+    constants: tuple[str, ...], definitions: tuple[str, ...]
+) -> tuple[dict[str, float], dict[str, str]]:
+    """Read the constants and the definitions of `NAMES`; a usage error names a wrong entry."""
+    numbers = {}
+    for name, value in arguments.split_pairs("--const", constants):
+        try:
+            numbers[name] = float(value)
+        except ValueError:
+            raise click.UsageError(f"--const {name} must be a number; got {value!r}") from None
+    return numbers, dict(arguments.split_pairs("--define", definitions))

@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 import click
 
 import verifai_jax as vj
+from verifai_jax.addons.monitoring.commands.formula import NAMES, read_names
 from verifai_jax.addons.monitoring.commands.monitor_fleet import (
     fleet_options,
     is_fleet,
@@ -26,7 +27,7 @@ from verifai_jax.addons.monitoring.commands.monitor_fleet import (
     read_missing,
     reading_options,
 )
-from verifai_jax.cli.arguments import NAMES, PATH, PLOT, option, read_names
+from verifai_jax.cli.arguments import PATH, PLOT, option
 from verifai_jax.cli.exit_codes import BROKEN, CommandError
 from verifai_jax.cli.gates import Gate, check_gate, fail_on
 from verifai_jax.cli.json_output import command, give_result, say

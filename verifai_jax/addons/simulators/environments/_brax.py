@@ -16,6 +16,7 @@ from typing import Any, ClassVar
 import jax
 from jaxtyping import Array, Int, Key, PyTree
 
+from verifai_jax.addons.simulators.delay_options import DelayOption
 from verifai_jax.addons.simulators.environments import brax_model
 from verifai_jax.addons.simulators.environments.episode import Moment, step_count, vector_action
 from verifai_jax.addons.simulators.environments.policy_loop import (
@@ -27,7 +28,6 @@ from verifai_jax.core.compute.compilation import XlaOptimization
 from verifai_jax.core.display.lazy import lazy_import
 from verifai_jax.core.messages.errors import require, suggests_options, unknown_name
 from verifai_jax.systems.base import Features
-from verifai_jax.systems.delays import DelayOption
 from verifai_jax.systems.ode.integrators import check_factor
 from verifai_jax.systems.pytree_checks import outline
 

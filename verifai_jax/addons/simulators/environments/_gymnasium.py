@@ -18,6 +18,7 @@ import jax
 import numpy as np
 from jaxtyping import UInt8
 
+from verifai_jax.addons.simulators.delay_options import NO_DELAY, DelayOption, as_delay
 from verifai_jax.addons.simulators.environments import episode_signals
 from verifai_jax.addons.simulators.environments.episode import (
     Moment,
@@ -51,7 +52,7 @@ from verifai_jax.core.values.waveform import is_waveform, set_durations
 from verifai_jax.systems.base import KnownSignals
 from verifai_jax.systems.blackbox._blackbox import BlackBox, PooledBlackBox, blackbox
 from verifai_jax.systems.channels import Channels, Link, Passing
-from verifai_jax.systems.delays import NO_DELAY, Delay, DelayOption, as_delay
+from verifai_jax.systems.delays import Delay
 
 Env: TypeAlias = Any
 """A `gymnasium.Env`; Gymnasium is an optional package, so its types cannot be imported here."""

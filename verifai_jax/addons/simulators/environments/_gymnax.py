@@ -15,6 +15,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Key, PyTree
 
+from verifai_jax.addons.simulators.delay_options import DelayOption
 from verifai_jax.addons.simulators.environments.episode import (
     Moment,
     step_count,
@@ -28,7 +29,6 @@ from verifai_jax.addons.simulators.environments.policy_loop import (
 )
 from verifai_jax.core.messages.errors import check_names, require, suggests_options, unknown_name
 from verifai_jax.systems.base import Features
-from verifai_jax.systems.delays import DelayOption
 from verifai_jax.systems.pytree_checks import check_like, outline
 
 OLDEST = (1, 0, 1)

@@ -16,6 +16,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Key, PyTree
 
+from verifai_jax.addons.simulators.delay_options import DelayOption
 from verifai_jax.addons.simulators.environments._brax import Brax, import_quietly
 from verifai_jax.addons.simulators.environments.brax_model import Env, explain_errors
 from verifai_jax.addons.simulators.environments.episode import Moment, step_count
@@ -25,7 +26,6 @@ from verifai_jax.addons.simulators.mujoco.mjx_rollout import with_leaves
 from verifai_jax.addons.simulators.mujoco.model import load
 from verifai_jax.core.messages.errors import suggests_options, unknown_name
 from verifai_jax.systems.base import Features
-from verifai_jax.systems.delays import DelayOption
 from verifai_jax.systems.pytree_checks import outline
 
 OLDEST = (0, 1)

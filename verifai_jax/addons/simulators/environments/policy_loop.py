@@ -13,6 +13,7 @@ from typing import Any, ClassVar
 import jax
 from jaxtyping import Array, Key, PyTree
 
+from verifai_jax.addons.simulators.delay_options import DelayOption, as_delay, links_of
 from verifai_jax.addons.simulators.environments.episode import (
     Episode,
     Moment,
@@ -38,7 +39,7 @@ from verifai_jax.core.values.waveform import set_durations
 from verifai_jax.systems.actions import Continuous, Discrete
 from verifai_jax.systems.base import Features, Seed, System
 from verifai_jax.systems.channels import Channels, Link, Passing, first_refusal
-from verifai_jax.systems.delays import DelayOption, as_delay, joined, links_of
+from verifai_jax.systems.delays import joined
 from verifai_jax.systems.forks import Rollout
 from verifai_jax.systems.pytree_checks import in_working_precision
 

@@ -17,6 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Key, PyTree
 
+from verifai_jax.addons.simulators.delay_options import DelayOption, as_delay, links_of
 from verifai_jax.addons.simulators.mujoco.bindings import Bound, resolve_bindings
 from verifai_jax.addons.simulators.mujoco.loop import Loop, Signals
 from verifai_jax.addons.simulators.mujoco.mjx_rollout import (
@@ -36,7 +37,7 @@ from verifai_jax.core.values.waveform import set_durations
 from verifai_jax.systems.base import Features, Seed, System
 from verifai_jax.systems.channels import Link, Passing, first_refusal
 from verifai_jax.systems.clock import count_periods
-from verifai_jax.systems.delays import DelayOption, as_delay, joined, links_of
+from verifai_jax.systems.delays import joined
 from verifai_jax.systems.forks import Rollout
 from verifai_jax.systems.ode.integrators import check_factor
 

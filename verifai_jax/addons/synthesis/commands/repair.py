@@ -3,6 +3,7 @@
 from pathlib import Path
 from typing import Any
 
+from verifai_jax.addons.synthesis.commands.synthesize import PARAMETER_CHOICE
 from verifai_jax.cli import arguments
 from verifai_jax.cli.arguments import PATH, option
 from verifai_jax.cli.gates import Gate, check_gate, fail_on
@@ -27,7 +28,7 @@ from verifai_jax.cli.json_output import command, draw, give_result, say, show_re
     type=int,
     help="Simulations for each of the failure probabilities before and after  [default: none]",
 )
-@arguments.PARAMETER_CHOICE
+@PARAMETER_CHOICE
 @arguments.PLOT
 @fail_on(unsafe="unless the repair held in the check")
 def repair(

@@ -3,18 +3,46 @@
 from pathlib import Path
 from typing import Any
 
+import click
+
 from verifai_jax.cli import arguments
 from verifai_jax.cli.arguments import PATH, option
 from verifai_jax.cli.gates import Gate, check_gate, fail_on
 from verifai_jax.cli.going_on import kept_until_done
 from verifai_jax.cli.json_output import command, say, show_result
 
+PARAMETER_CHOICE = arguments.all_of(
+    option(
+        "--aim",
+        type=click.Choice(("robustness", "probability")),
+        default="robustness",
+        help="Robustness against an attack, or the lowest failure probability.",
+    ),
+    option("--margin", default=0.0, help="Robustness wanted."),
+    option("--attack", default="cross_entropy", help="Search used for attacks."),
+    option("--held-out", default=2000, help="Fresh simulations to check the result."),
+    option(
+        "--mass",
+        default=0.999,
+        help="Probability of the central part of the prior that is attacked; 1 for all of it.",
+    ),
+    click.option(
+        "--gradient/--no-gradient",
+        default=None,
+        help="Use gradients  [default: if the system has them]",
+    ),
+    arguments.SEED,
+    arguments.MAX_SECONDS,
+    arguments.BACKEND,
+)
+"""Options of `synthesize` and `repair`, for `values_of`."""
+
 
 @command()
 @arguments.TARGET
 @option("--parameters", metavar="NAMES", help="Features to choose, comma-separated  [default: all]")
 @option("--budget", default=10_000, help="Maximum simulations.")
-@arguments.PARAMETER_CHOICE
+@PARAMETER_CHOICE
 @option("--table", type=PATH, metavar="CSV", help="Write the candidates into a CSV file.")
 @fail_on(unsafe="unless the formula holds with the parameters, in the check too")
 def synthesize(

@@ -1,12 +1,15 @@
-"""The step that maximises the minimum of several linear functions: a linear program.
+"""Steps of parameters that are the best ones for linear models of the robustness.
 
-    max_min_step(theta, rho, gradients, radius=0.1, free=free, bounded=True)
+    max_min_step(theta, rho, gradients, radius=0.1, free=free, bounded=True)      # linear program
+    smallest_change(theta, nominal, rho, gradients, 0.2, free=free, bounded=True)
 
-Exact for its linear model; the caller checks the step by simulation.
+The caller checks a step by simulation.
 """
 
 import numpy as np
 from jaxtyping import Bool, Float
+
+from verifai_jax.statistics.least_distance import shortest_in_box
 
 
 def max_min_step(
@@ -53,4 +56,38 @@ def max_min_step(
     )
     if solution.status == 0:
         step[indices] = np.clip(solution.x[:-1] * radius, low, high)
+    return step
+
+
+def smallest_change(
+    theta: Float[np.ndarray, " p"],
+    nominal: Float[np.ndarray, " p"],
+    rho: Float[np.ndarray, " n"],
+    gradients: Float[np.ndarray, "n p"],
+    target: float,
+    *,
+    free: Bool[np.ndarray, " p"],
+    bounded: bool,
+) -> Float[np.ndarray, " p"] | None:
+    """Compute the step to the point nearest to `nominal` with `rho + gradients @ step >= target`.
+
+    **Arguments:** those of `max_min_step`, and
+    - `nominal`: parameters to stay close to.
+    - `target`: robustness to reach in every environment.
+    **Returns:** the step; None if the linear model has no such point.
+    """
+    indices = np.flatnonzero(free)
+    rows = np.flatnonzero(np.isfinite(rho))
+    linear = gradients[np.ix_(rows, indices)]
+    gap = (theta - nominal)[indices]
+    # With z = theta + step - nominal: linear @ z >= bound.
+    bound = target - rho[rows] + linear @ gap
+    if np.any((np.linalg.norm(linear, axis=1) == 0) & (bound > 0)):
+        return None
+    unit = np.array([[0.0], [1.0]]) if bounded else np.array([[-np.inf], [np.inf]])
+    z = shortest_in_box(-linear, -bound, *(unit - nominal[indices]))
+    if z is None:
+        return None
+    step = np.zeros_like(theta)
+    step[indices] = z - gap
     return step

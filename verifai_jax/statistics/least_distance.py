@@ -7,7 +7,7 @@ problems (1974), chapter 23.
 """
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
 
 def shortest(
@@ -77,60 +77,13 @@ def shortest_in_box(
 
     **Arguments:**
     - `rows`, `maximum`: linear inequalities; rows of zeros are left out.
-    - `low`, `high`: the box.
+    - `low`, `high`: the box; infinite where it has no end.
     **Returns:** the vector, or None.
     """
     sizes = np.linalg.norm(rows, axis=1)
     rows, maximum, sizes = rows[sizes > 0], maximum[sizes > 0], sizes[sizes > 0]
     identity = np.eye(rows.shape[1])
-    z = shortest(
-        np.concatenate([-rows / sizes[:, None], identity, -identity]),
-        np.concatenate([-maximum / sizes, low, -high]),
-    )
+    bound = np.concatenate([-maximum / sizes, low, -high])
+    matrix = np.concatenate([-rows / sizes[:, None], identity, -identity])
+    z = shortest(matrix[np.isfinite(bound)], bound[np.isfinite(bound)])
     return None if z is None else np.clip(z, low, high)
-
-
-def smallest_change(
-    theta: Float[np.ndarray, " p"],
-    nominal: Float[np.ndarray, " p"],
-    rho: Float[np.ndarray, " n"],
-    gradients: Float[np.ndarray, "n p"],
-    target: float,
-    *,
-    free: Bool[np.ndarray, " p"],
-    bounded: bool,
-) -> Float[np.ndarray, " p"] | None:
-    """Compute the step to the point nearest to `nominal` with `rho + gradients @ step >= target`.
-
-    It is exact for this linear model; the caller checks the step by simulation.
-
-    **Arguments:**
-    - `theta`: the present parameters.
-    - `nominal`: parameters to stay close to.
-    - `rho`, `gradients`: robustness in each environment at `theta`, and its derivatives.
-    - `target`: robustness to reach in every environment.
-    - `free`: coordinates that may move.
-    - `bounded`: whether they stay in the unit cube.
-    **Returns:** the step; None if the linear model has no such point.
-    """
-    indices = np.flatnonzero(free)
-    rows = np.flatnonzero(np.isfinite(rho))
-    linear = gradients[np.ix_(rows, indices)]
-    gap = (theta - nominal)[indices]
-    # With z = theta + step - nominal: linear @ z >= bound.
-    bound = target - rho[rows] + linear @ gap
-    sizes = np.linalg.norm(linear, axis=1)
-    if np.any((sizes == 0) & (bound > 0)):
-        return None
-    moved = sizes > 0
-    matrix, bound = linear[moved] / sizes[moved, None], bound[moved] / sizes[moved]
-    if bounded:
-        identity = np.eye(len(indices))
-        matrix = np.vstack([matrix, identity, -identity])
-        bound = np.concatenate([bound, -nominal[indices], nominal[indices] - 1])
-    z = shortest(matrix, bound)
-    if z is None:
-        return None
-    step = np.zeros_like(theta)
-    step[indices] = z - gap
-    return step
