@@ -15,7 +15,7 @@ from verifai_jax.core.messages.errors import UnknownNameError
 from verifai_jax.counterexamples import Shrunk, shrink
 from verifai_jax.counterexamples.fixed_key import fix_key, key_of
 from verifai_jax.counterexamples.nominal import Nominal
-from verifai_jax.statistics.least_distance import shortest_in_box
+from verifai_jax.statistics.shortest_vector import shortest_in_box
 
 
 def problem_of(name, d, rho, nominal=None, black_box=False, space=None):

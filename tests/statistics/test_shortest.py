@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.optimize import nnls
 
-from verifai_jax.statistics.least_distance import shortest
+from verifai_jax.statistics.shortest_vector import shortest
 
 
 @pytest.mark.parametrize("seed", range(40))

@@ -11,7 +11,7 @@ Each round simulates a batch of candidates for each followed point:
   Mechanics Division 100, 1974) and of Rackwitz and Fiessler (Structural reliability under combined
   random load sequences, Computers and Structures 9, 1978), with a line search in one batch; if
   several pieces of the boundary meet, at the nearest point of the intersection of their half-spaces
-  (`statistics.least_distance`);
+  (`statistics.shortest_vector`);
 - sideways and nearer, at random (Brendel, Rauber and Bethge, Decision-based adversarial
   attacks, ICLR 2018), which needs no gradient and no continuity;
 - with a single coordinate nearer to nominal, by a cell if it is discrete.
@@ -26,7 +26,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from verifai_jax.counterexamples.candidates import Candidates, Tangent
-from verifai_jax.statistics.least_distance import shortest_in_box
+from verifai_jax.statistics.shortest_vector import shortest_in_box
 
 Point = Float[np.ndarray, " d"]
 Points = Float[np.ndarray, "n d"]

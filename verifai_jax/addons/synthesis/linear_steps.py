@@ -9,7 +9,7 @@ The caller checks a step by simulation.
 import numpy as np
 from jaxtyping import Bool, Float
 
-from verifai_jax.statistics.least_distance import shortest_in_box
+from verifai_jax.statistics.shortest_vector import shortest_in_box
 
 
 def max_min_step(
