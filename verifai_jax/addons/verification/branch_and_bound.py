@@ -88,8 +88,8 @@ class BranchAndBound:
             bounds = self.enclosure(some.low[worth], some.high[worth])
             some.lowest[worth], some.highest[worth] = bounds.low, bounds.high
             some.inside[worth] |= bounds.inside
-            # Without bounds nothing is known of what moves: all coordinates count alike.
-            moves[worth] = np.where(bounds.moves.any(1, keepdims=True), bounds.moves, 1.0)
+            # Without bounds nothing is known of what moves: what simulations show decides.
+            moves[worth] = bounds.moves
             state = np.where(bounds.holds, PROVED, np.where(bounds.high < 0, BROKEN, OPEN))
             # A box that the constraint cuts is split until it does so no more: its mass is unknown.
             state = np.where(bounds.inside, state, OPEN)
