@@ -1,9 +1,4 @@
-"""Examination of boxes: simulations select decidable boxes, sets decide them, the rest is split.
-
-work = BranchAndBound(problem, enclosure, Boxes.whole(enclosure), seed=0)
-work.go_on(end=time.perf_counter() + 60, limit=None)
-work.boxes
-"""
+"""Examination of boxes: simulations select decidable boxes, sets decide them, the rest is split."""
 
 import time
 from collections.abc import Callable
