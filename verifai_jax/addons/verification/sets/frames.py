@@ -1,11 +1,9 @@
 """Symbols of loops and of layers, which keep nonlinear uncertainties correlated.
 
-A step of a loop rotates and shears the set of states, and nonlinear terms add an uncertainty to
-each number. If each step enclosed the set in a box, the boxes would grow. Here the uncertainties of
-a loop's carried numbers are symbols, which the next step treats like those of the features. Once
-there are many, the shortest are replaced by the symbols of one parallelepiped, with orthogonal
-sides after scaling. The uncertainties of a layer's units stay separate symbols through the
-following layers, up to a result of few numbers.
+If each step of a loop enclosed the set of states in a box, the boxes would grow. Here the
+uncertainties of a loop's carried numbers are symbols, which the next step treats like those of the
+features. Once there are many, the shortest are replaced by those of one parallelepiped. The
+uncertainties of a layer's units stay symbols up to a result of few numbers.
 
 Source: R. Lohner, Enclosing the solutions of ordinary initial and boundary value problems (1987);
 N. Nedialkov, K. Jackson, G. Corliss, Validated solutions of initial value problems for ordinary

@@ -89,12 +89,12 @@ class Rates:
         """Greatest orders of nodes that coefficients of the results need."""
         asked = [(result, order) for result in self.results]
         while asked:
-            node, least = asked.pop()
-            if least <= self.need.get(node, -1):
+            node, depth = asked.pop()
+            if depth <= self.need.get(node, -1):
                 continue
-            self.need[node] = least
-            asked += [(operand, least) for operand in self.nodes[node].operands]
-            asked += [(slope, least - 1) for _, slope in self.slopes(node)] if least else []
+            self.need[node] = depth
+            asked += [(operand, depth) for operand in self.nodes[node].operands]
+            asked += [(slope, depth - 1) for _, slope in self.slopes(node)] if depth else []
 
     def _new(self, step: Equation | None, operands: tuple, number: int, varies: bool) -> int:
         self.nodes.append(Node(step, operands, number, varies))
