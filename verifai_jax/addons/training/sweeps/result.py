@@ -281,7 +281,7 @@ class Sweep(Reported):
 
         `values_0` is the upper end of the failure probability, `values_1` the nominal return.
         """
-        groups = self.configurations
+        groups: Any = self.configurations
         renamed = {name: f"params_{name}" for name in self.hyperparameters}
         values = {"failure_high": "values_0", "nominal_return": "values_1"}
         table = groups[[*values, *renamed]].rename(columns={**values, **renamed})
