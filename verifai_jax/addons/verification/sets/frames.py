@@ -70,14 +70,13 @@ def framed(carry: Sequence[Form | Whole], boxes: int, features: int) -> list[For
     radius = np.where(bounded, rest + 4 * SLACK * np.abs(noise).sum(2), np.inf)
     size = np.minimum(size, np.maximum(*map(np.abs, ends)))
     frame = Frame(next(_NUMBERS), features, len(new))
-    stops = np.cumsum(sizes)
-    for i, value, stop, each in zip(kept, kept.values(), stops, sizes, strict=True):
+    for i, value, stop, each in zip(kept, kept.values(), np.cumsum(sizes), sizes, strict=True):
         part, shape = slice(stop - each, stop), (boxes, *value.shape)
         pieces = [array[:, part].reshape(shape) for array in (centre, radius, size, *ends)]
         own = new[:, :, part].reshape(len(new), *shape)
         # Bounded numbers get no interval: what is computed with it would cost, and is no tighter.
-        limits = (None, None) if np.isfinite(pieces[1]).all() else pieces[3:]
-        out[i] = Form(pieces[0], own, pieces[1], pieces[2], value.dtype, *limits, frame)
+        low, high = (None, None) if np.isfinite(pieces[1]).all() else (pieces[3], pieces[4])
+        out[i] = Form(pieces[0], own, pieces[1], pieces[2], value.dtype, low, high, frame)
     return out
 
 
