@@ -19,8 +19,8 @@ from pathlib import Path
 import jax.numpy as jnp
 import numpy as np
 from arch import BUDGETS, ratio, requirements
-from landscapes import LANDSCAPES
 from mixed_spaces import FRESH, PROBLEMS, SHARES
+from small_problems import landscape
 
 import verifai_jax as vj
 from benchmarks.seeds import first_failures
@@ -48,22 +48,6 @@ def valley(name: str) -> vj.Problem:
         return vj.Trace({"out": value[None]}, dt=0.1)
 
     return vj.Problem(name, {"x": vj.Box([low] * 10, [high] * 10)}, system, "always out > 1")
-
-
-def landscape(name: str) -> vj.Problem:
-    """Return a landscape as a problem."""
-    rho, cube, _ = LANDSCAPES[name]
-    count = len(cube.continuous)
-    choices = {f"c{i}": vj.Categorical(*range(n)) for i, n in enumerate(cube.levels) if n}
-    levels = [n for n in cube.levels if n]
-
-    def system(features, key):
-        cells = [(features[c] + 0.5) / n for c, n in zip(choices, levels, strict=True)]
-        u = jnp.concatenate([features["u"], jnp.asarray(cells, jnp.float32)])
-        return vj.Trace({"out": rho(u)[None]}, dt=0.1)
-
-    space = {"u": vj.Box([0.0] * count, [1.0] * count)} | choices
-    return vj.Problem(name, space, system, "always out > 0")
 
 
 def rows(groups: list[str]) -> list[tuple[str, vj.Problem, int, int]]:

@@ -11,7 +11,8 @@ from verifai_jax.addons.reports.document import write_report
 WRITERS = {
     "addons/agents/mcp.py", "addons/analysis/overview.py",
     "addons/assurance/operational_domain.py", "addons/assurance/qualification/result.py",
-    "addons/checking/corpus.py", "addons/estimation/trials/protocol.py",
+    "addons/assurance/signing.py", "addons/checking/corpus.py",
+    "addons/faults/failure_table/sheet.py", "addons/estimation/trials/protocol.py",
     "addons/monitoring/commands/monitor.py", "addons/monitoring/fmu_monitor.py",
     "addons/monitoring/judgement.py", "addons/monitoring/plot.py",
     "addons/monitoring/requirement_files.py", "addons/native/native_code/library.py",
@@ -20,7 +21,7 @@ WRITERS = {
     "addons/synthesis/commands/synthesize.py", "addons/verification/network.py",
     "cli/new.py", "core/compute/remembered.py",
     "core/display/notebook.py", "core/store/files.py", "addons/training/loggers.py",
-    "pictures/animation.py", "pictures/style.py", "systems/policy.py",
+    "pictures/animation.py", "pictures/style.py", "systems/forks.py", "systems/policy.py",
 }  # fmt: skip
 """Writers by `replacing`, which tests/core/store/test_replacements.py kills at each operation.
 Those by `replacing_all` are in tests/addons/training/sweeps/test_killed_saves.py."""

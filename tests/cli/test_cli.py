@@ -584,7 +584,7 @@ class TestMonitor:
             ),
             (
                 ["always mode > 1", "drive.csv"],
-                "column 'mode' holds no numbers; it starts with",
+                "drive.csv has no signal 'mode'; did you mean 'mode=b' or 'mode=a'?",
             ),
             (["always next dist > 1", "uneven.csv"], "Resample it: --resample 0.75 --method hold"),
             (

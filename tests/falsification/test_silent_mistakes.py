@@ -220,6 +220,7 @@ class TestRuns:
         assert notes == (
             "all 40 simulations with a verdict violate the property: are the formula and its "
             "units right?",
+            "the property is violated already at time 0: does the start satisfy it?",
         )
         rows = vj.simulate(problem, [{"a": 0.5, "b": 0.5}] * 40)
         assert rows.notes == ()

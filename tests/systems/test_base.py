@@ -79,6 +79,8 @@ def test_what_is_not_offered_is_refused_by_name(system):
         system.refined(2)
     with pytest.raises(NotImplementedError, match=r"has no fold\(features, key, carry, update\)"):
         system.fold({}, None, 0, max)
+    with pytest.raises(NotImplementedError, match=r"has no rollout\(features, key\)"):
+        system.forks({})
     with pytest.raises(NotImplementedError, match="has no simulate_batch"):
         system.simulate_batch({}, jax.random.split(jax.random.key(0), 2))
     with pytest.raises(NotImplementedError, match="has no simulate_each"):

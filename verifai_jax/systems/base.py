@@ -162,6 +162,8 @@ class System(ForUsers):
 
         **Returns:** the last carry, and the status of the simulation.
         """
+        if not self.can_fork:
+            raise NotImplementedError(f"{self!r} has no fold(features, key, carry, update)")
         return self.rollout(features, key).fold(carry, update)
 
     @property
@@ -171,7 +173,7 @@ class System(ForUsers):
 
     def rollout(self, features: Features, key: Seed = None) -> Rollout:
         """Return one simulation as a loop over its samples, for a system that can fork."""
-        raise ValueError(f"{self!r} cannot fork, because it has no rollout(features, key)")
+        raise NotImplementedError(f"{self!r} has no rollout(features, key), so it cannot fork")
 
     def forks(self, features: Features, key: Seed = None) -> Fork:
         """Simulate once, and return the forks before all samples; `at(k)` selects one."""

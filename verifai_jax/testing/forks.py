@@ -20,7 +20,7 @@ def check_forks(system: Any, space: FeatureSpace, *, samples: int = 2, seed: int
     They are alone, in a batch with a common index, and read from a file.
 
     **Arguments:** as in `check_system`, of a system that can fork.
-    **Raises:** `AssertionError` naming the broken law; `ValueError` for a system that cannot fork.
+    **Raises:** `AssertionError` naming the broken law; `NotImplementedError` if it cannot.
     """
     system = as_system(system)
     simulate, fork, go_on = jax.jit(system), jax.jit(system.forks), jax.jit(system.go_on)

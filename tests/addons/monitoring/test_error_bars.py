@@ -49,8 +49,9 @@ def formula(rng, depth, leaf=leaf):
         f"({a}) & ({b})", f"({a}) | ({b})", f"always{window} ({a})", f"eventually{window} ({a})",
         f"historically{window} ({a})", f"once{window} ({a})", f"({a}) until{window} ({b})",
         f"({a}) since{window} ({b})", f"!({a})", f"({a}) -> ({b})", f"next ({a})", f"prev ({a})",
-        f"({a}) <-> ({b})", f"duration({leaf(rng)}, 2) >= 1",
-    )[rng.integers(14 if leaf is not monotone_leaf else 8)]  # fmt: skip
+        f"({a}) <-> ({b})", f"duration({leaf(rng)}, 2) >= 1", f"count({leaf(rng)}, 2) <= 2",
+        "mean(x + y, 2) >= abs(u)", "at_last(z > 0, x * u) < 1",
+    )[rng.integers(17 if leaf is not monotone_leaf else 8)]  # fmt: skip
 
 
 def recorded(rng):
@@ -228,3 +229,16 @@ def test_exported_c_gives_the_bounds_of_watch_bit_for_bit(tmp_path, monkeypatch)
         )
         seen = [[float.fromhex(v) for v in line.split()] for line in run.stdout.splitlines()]
         np.testing.assert_array_equal(np.array(seen), monitor.steps(signals))
+
+
+def test_a_quantity_is_completed_before_its_bounds_are_taken():
+    trace = vj.Trace({"speed": np.full(2, 36.0)}, dt=1.0, units={"speed": "m/s"})
+    formula = "always speed <= 130 km/h"
+    assert vj.mtl.judge(formula, trace, error_bars={"speed": 0.05}).rows[0].verdict == "holds"
+    assert vj.mtl.judge(formula, trace, error_bars={"speed": 0.2}).rows[0].verdict == "depends"
+
+
+@pytest.mark.parametrize("text", ["rate(x) < 1", "peak_to_peak(x, 2) < 1", "at_last(x > 0, z) < 1"])
+def test_functions_without_bounds_are_refused(text):
+    with pytest.raises(ValueError, match="has no bounds for signals with error bars"):
+        with_bars(vj.mtl.parse(text), {"x": 0.1})

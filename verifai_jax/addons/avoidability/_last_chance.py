@@ -47,6 +47,7 @@ def last_chance(
     features: Iterable[str] = (),
     forks: int = 2048,
     rounds: int = 12,
+    gradients: bool = True,
     proof_seconds: float = 20.0,
     seed: int = 0,
     progress: bool | None = None,
@@ -70,6 +71,7 @@ def last_chance(
       an action, whole numbers for choices; by default those of the policy or the environment.
     - `features`: the features that the environment may change; by default all that vary.
     - `forks`: number of forks simulated at once; `rounds`: batches for each refinement.
+    - `gradients`: whether to search along gradients, too; of MuJoCo they take long to compile.
     - `proof_seconds`: seconds for a proof that no action avoids the failure; 0 for none.
     - `seed`: the seed of the search; `progress`: as in `falsify`.
     **Returns:** a `LastChance`.
@@ -116,7 +118,9 @@ def last_chance(
 
         programs = problem.programs.get(PROGRAMS, (by, repr(actions), names, precision), make)
         course = programs.course(given, failing.key)
-        bracket = _Bracket(EscapeSearch(programs, course, forks, rounds, seed), failing)
+        search = EscapeSearch(programs, course, forks, rounds, seed)
+        search.climbs &= gradients
+        bracket = _Bracket(search, failing)
         return bracket.result(precision, proof_seconds)
 
 

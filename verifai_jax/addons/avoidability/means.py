@@ -1,4 +1,4 @@
-"""Who could have avoided a failure, and by what: actions, other features, or another policy."""
+"""Means by which a failure could have been avoided: actions, features, or another policy."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -51,7 +51,7 @@ class Steering(Link):
 
 
 class Means:
-    """What could have avoided a failure.
+    """The means by which somebody could have avoided a failure.
 
     - `who`: the subject of a sentence; `system`: the system in which forks go on.
     - `shape`: `(steps, entries)` of a choice; `levels`: number of values of each entry, 0 for real

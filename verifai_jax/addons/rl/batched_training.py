@@ -17,7 +17,7 @@ import time
 from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import NamedTuple, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 import jax
 import jax.numpy as jnp
@@ -361,7 +361,7 @@ def _over_lanes(layout: _Layout, one: Callable[..., PyTree], shared: int) -> Cal
 
 
 @lru_cache(1)
-def _sequential() -> dict[str, str]:
+def _sequential() -> dict[str, Any]:
     return known_options(_SEQUENTIAL)
 
 

@@ -82,4 +82,4 @@ def minibatch_network(
     for weight, bias in layers[:-1]:
         units = between(weight.T @ units + bias[:, None])
     weight, bias = layers[-1]
-    return (weight.T @ units + bias[:, None]).T
+    return jnp.transpose(weight.T @ units + bias[:, None])

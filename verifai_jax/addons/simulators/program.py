@@ -74,13 +74,13 @@ class Program(System):
 
     def check(self, features: Features) -> None:
         """Refuse words in braces that are no features, and features that no word names."""
-        words = [name for each in self.command for name in WORD.findall(each)]
+        named = [name for each in self.command for name in WORD.findall(each)]
         known = _by_name(features)
-        for name in words:
+        for name in named:
             if name not in known and name not in OWN:
                 raise missing_name("the command", "feature", name, [*known, *OWN])
-        left = [name for name in features if not _is_named(name, words)]
-        if left and "features" not in words:
+        left = [name for name in features if not _is_named(name, named)]
+        if left and "features" not in named:
             raise ValueError(
                 f"the command does not say where the features {', '.join(left)} go: write "
                 f"{{{left[0]}}}, or {{features}} for the name of a JSON file with all of them"
@@ -112,7 +112,7 @@ class Program(System):
         if outcome.trace is not None or not outcome.message:
             return outcome
         # The name of the temporary folder would make each message another one.
-        return outcome._replace(message=outcome.message.replace(f"{folder}{os.sep}", ""))
+        return outcome._replace(message=re.sub(re.escape(f"{folder}{os.sep}"), "", outcome.message))
 
     def _run(
         self, folder: Path, features: Features, seed: int, stopped: threading.Event

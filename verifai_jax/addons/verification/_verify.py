@@ -1,6 +1,7 @@
 """Branch and bound over boxes of the feature space: `verify`."""
 
 import time
+from copy import deepcopy
 from pathlib import Path
 
 from verifai_jax._version import __version__
@@ -78,7 +79,7 @@ def verify(
         before.check_same(problem, precision, continuous)
     sources = problem.sources()
     enclosure = Enclosure(about, precision)
-    found = Boxes.whole(enclosure) if before is None else before.boxes.copy()
+    found = Boxes.whole(enclosure) if before is None else deepcopy(before.boxes)
     work = BranchAndBound(problem, enclosure, found, seed)
     end = None if seconds is None else started + seconds * (1 - REST)
     stopped = work.go_on(end, boxes)

@@ -89,10 +89,6 @@ class Boxes:
     def __getitem__(self, rows: Int[np.ndarray, " m"] | Bool[np.ndarray, " n"]) -> "Boxes":
         return Boxes(*(getattr(self, field.name)[rows] for field in fields(self)))
 
-    def copy(self) -> "Boxes":
-        """Return a copy of the boxes that can be changed independently."""
-        return self[np.arange(len(self))]
-
     def within(self, low: Float[np.ndarray, " dim"], high: Float[np.ndarray, " dim"]) -> "Boxes":
         """Return the intersections of the boxes with the box between two corners, as open boxes."""
         lower, upper = np.maximum(self.low, low), np.minimum(self.high, high)

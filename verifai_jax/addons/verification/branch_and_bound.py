@@ -1,9 +1,4 @@
-"""Examination of boxes: simulations select decidable boxes, sets decide them, the rest is split.
-
-work = BranchAndBound(problem, enclosure, Boxes.whole(enclosure), seed=0)
-work.go_on(end=time.perf_counter() + 60, limit=None)
-work.boxes
-"""
+"""Examination of boxes: simulations select decidable boxes, sets decide them, the rest is split."""
 
 import time
 from collections.abc import Callable
@@ -88,8 +83,8 @@ class BranchAndBound:
             bounds = self.enclosure(some.low[worth], some.high[worth])
             some.lowest[worth], some.highest[worth] = bounds.low, bounds.high
             some.inside[worth] |= bounds.inside
-            # Without bounds nothing is known of what moves: all coordinates count alike.
-            moves[worth] = np.where(bounds.moves.any(1, keepdims=True), bounds.moves, 1.0)
+            # Without bounds nothing is known of what moves: what simulations show decides.
+            moves[worth] = bounds.moves
             state = np.where(bounds.holds, PROVED, np.where(bounds.high < 0, BROKEN, OPEN))
             # A box that the constraint cuts is split until it does so no more: its mass is unknown.
             state = np.where(bounds.inside, state, OPEN)

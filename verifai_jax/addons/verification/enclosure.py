@@ -173,10 +173,8 @@ def _rows(value: Value, block: slice) -> Value:
     """Return the sets of some boxes."""
 
     def cut(array: np.ndarray, lead: int) -> np.ndarray:
-        axis = lead - 1
-        if array.shape[axis] == 1:
-            return array
-        return array[block] if lead == 1 else array[:, block]
+        cells = (slice(None),) * (lead - 1)
+        return array if array.shape[lead - 1] == 1 else array[(*cells, block)]
 
     return value.moved(cut)
 

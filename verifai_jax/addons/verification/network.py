@@ -72,7 +72,10 @@ def verify_network(
         case = replace(case, low=low, high=high)
         varying = np.flatnonzero(low < high)
         problem = _problem(f"case {number + 1}", act, case, varying)
-        point, found = _searched(problem, seed), None
+        once = vj.Stop(after=1)
+        run = vj.falsify(problem, budget=SEARCHED, stop=once, seed=seed, progress=False)
+        failing, found = run.table.counterexamples, None
+        point = problem.space.from_row(dict(failing.iloc[0])) if len(failing) else None
         for share in (0.1, 0.9) if point is None else ():
             # A counterexample that the first boxes have ends the work.
             found = verify(
@@ -134,12 +137,3 @@ def _problem(name: str, act: Any, case: Case, varying: np.ndarray) -> vj.Problem
     if not len(varying):
         low, high = np.zeros(1), np.ones(1)
     return vj.Problem(name, {"x": vj.Box(low.tolist(), high.tolist())}, system, "margin > 0")
-
-
-def _searched(problem: vj.Problem, seed: int) -> Any:
-    """Return the features of a counterexample that a short search finds and replays confirm."""
-    run = vj.falsify(problem, budget=SEARCHED, stop=vj.Stop(after=1), seed=seed, progress=False)
-    failing = run.table.counterexamples
-    if not len(failing):
-        return None
-    return problem.space.from_row(dict(failing.iloc[0]))

@@ -1,10 +1,4 @@
-"""The undecided part of a feature space, for sampling and searching.
-
-rest = Rest(boxes, (PROVED, BROKEN))
-rest.mass, rest.draw(random, 1000)      # its share of the prior, and points [1000, dim] of it
-rest.is_decided(points)                 # whether points [n, dim] lie in a box of these states
-RestSpace(space, rest)                  # the space whose constraint refuses these
-"""
+"""The undecided part of a feature space, for sampling and searching."""
 
 from collections.abc import Callable, Sequence
 from functools import cached_property

@@ -1,9 +1,5 @@
 """Properties of networks in VNN-LIB, as boxes of inputs with a margin of the outputs.
 
-    cases = read_property(Path("property.vnnlib"))
-    cases[0].low, cases[0].high                  # the box of the inputs
-    cases[0].margin(inputs, outputs)             # above zero where there is no counterexample
-
 A property describes its counterexamples: each of its assertions holds for one. So the network is
 safe if every point of every box has a positive margin.
 

@@ -284,8 +284,8 @@ def _compiled(
     with _said(name):
         options = _OPTIONS[effort] | ({} if splits else _WHOLE_LOOPS) | (_WIDE if wide else {})
         # The user of this switch wants the least of all programs.
-        least = jax.config.read("jax_disable_most_optimizations")
-        if not options or least or jax.default_backend() != "cpu":
+        reduced = jax.config.read("jax_disable_most_optimizations")
+        if not options or reduced or jax.default_backend() != "cpu":
             return lowered.compile()
         try:
             return lowered.compile(options)

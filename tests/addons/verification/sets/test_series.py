@@ -65,8 +65,10 @@ def chosen(t, x):
 
 
 CASES = [
-    polynomial, ratio, chosen, held, constant_rates,
-    *(pytest.param(each, marks=pytest.mark.thorough) for each in (turned, network, rooted, rarer, twice)),
+    polynomial, ratio, chosen, held, constant_rates, *(
+        pytest.param(each, marks=pytest.mark.thorough)
+        for each in (turned, network, rooted, rarer, twice)
+    ),
 ]  # fmt: skip
 
 

@@ -12,6 +12,7 @@ from verifai_jax.cli import arguments
 from verifai_jax.cli.arguments import PATH, option
 from verifai_jax.cli.gates import Gate, check_gate, fail_on
 from verifai_jax.cli.json_output import command, give_result, say, show_result
+from verifai_jax.core.store.foreign_files import open_file
 
 if TYPE_CHECKING:
     from verifai_jax.addons.monitoring import Requirement
@@ -83,8 +84,8 @@ def _has_requirements(path: Path) -> bool:
 
     if path.suffix.lower() != ".csv":
         return path.suffix.lower() in ENDINGS
-    with path.open(encoding="utf-8", errors="replace") as file:
-        return "formula" in file.readline().lower()
+    with open_file(path) as file:
+        return b"formula" in file.readline(1 << 16).lower()
 
 
 @command()

@@ -51,7 +51,8 @@ def plot_slices(sweep: Sweep, path: str | Path | None = None) -> Figure:
 
 
 def _varying(sweep: Sweep) -> list[str]:
-    names = [n for n in sweep.hyperparameters if sweep.configurations[n].nunique() > 1]
+    table: Any = sweep.configurations
+    names = [n for n in sweep.hyperparameters if table[n].nunique() > 1]
     return names or list(sweep.hyperparameters)
 
 
@@ -71,4 +72,4 @@ def _heights(sweep: Sweep, name: str) -> np.ndarray:
 
 
 def _end(value: object) -> str:
-    return f"{value:.3g}" if isinstance(value, float) else str(value)
+    return f"{value:z.3g}" if isinstance(value, float) else str(value)

@@ -262,11 +262,11 @@ def _draw_bars(
     height, position, drawn = 0.76 / len(targets), np.arange(len(shown)), []
     for k, target in enumerate(targets):
         colour, what, hatch = BARS[target]
-        told = f"{what} (model: R² {scores[target]:z.2f})" if scores else what
+        label = f"{what} (model: R² {scores[target]:z.2f})" if scores else what
         at, widths = position + (k - (len(targets) - 1) / 2) * height, shown[f"{target}_{column}"]
         axes.barh(
             at, widths.to_numpy(float), height * 0.9, color=colour, hatch=hatch, edgecolor="white",
-            linewidth=0, label=told,
+            linewidth=0, label=label,
         )  # fmt: skip
         drawn.append((target, at, height))
     axes.set_yticks(position, [style.wrap_name(str(name), 18) for name in shown.index])

@@ -63,8 +63,8 @@ class TrainedConfiguration:
         folder = Path(folder)
         with write_lock(folder), replacing_all(folder, (POLICY, CONFIGURATION)) as made:
             self.policy.save(made / POLICY)
-            told = {name: value for name, value in vars(self).items() if name != "policy"}
-            files.write_record(made / CONFIGURATION, files.plain(told))
+            record = {name: value for name, value in vars(self).items() if name != "policy"}
+            files.write_record(made / CONFIGURATION, files.plain(record))
         return folder
 
     def train(self, study: Study) -> TrainedPolicy:

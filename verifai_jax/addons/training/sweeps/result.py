@@ -281,13 +281,15 @@ class Sweep(Reported):
 
         `values_0` is the upper end of the failure probability, `values_1` the nominal return.
         """
-        groups = self.configurations
+        groups: Any = self.configurations
         renamed = {name: f"params_{name}" for name in self.hyperparameters}
         values = {"failure_high": "values_0", "nominal_return": "values_1"}
         table = groups[[*values, *renamed]].rename(columns={**values, **renamed})
         table.insert(0, "number", range(len(table)))
-        told = {"verdict": "user_attrs_verdict", "status": "state"}
-        return table.join(groups[[*told]].rename(columns=told)).reset_index(drop=True)
+        text_columns = {"verdict": "user_attrs_verdict", "status": "state"}
+        return table.join(groups[[*text_columns]].rename(columns=text_columns)).reset_index(
+            drop=True
+        )
 
     @suggests_options
     def importance(self, *, repeats: int = 5, seed: int = 0) -> HyperparameterImportance:

@@ -8,14 +8,7 @@ from typing import Any
 import numpy as np
 
 from verifai_jax.addons.verification.sets import functions, whole
-from verifai_jax.addons.verification.sets.form import (
-    Form,
-    alike,
-    padded,
-    product,
-    total,
-    unknown,
-)
+from verifai_jax.addons.verification.sets.form import Form, alike, padded, product, total, unknown
 from verifai_jax.addons.verification.sets.interpreter import (
     Equation,
     Interpreter,
@@ -113,16 +106,11 @@ def together(values: Sequence[Value], join: Callable[[list[np.ndarray], int], np
     )  # fmt: skip
 
 
-@rule("concatenate")
-def _concatenate(t: Interpreter, step: Equation, inputs: list[Value]) -> list[Value]:
-    axis = step.params["dimension"]
-    return [together(inputs, lambda arrays, lead: np.concatenate(arrays, axis + lead))]
-
-
-@rule("stack")
-def _stack(t: Interpreter, step: Equation, inputs: list[Value]) -> list[Value]:
-    axis = step.params["axis"]
-    return [together(inputs, lambda arrays, lead: np.stack(arrays, axis + lead))]
+@rule("concatenate", "stack")
+def _joined(t: Interpreter, step: Equation, inputs: list[Value]) -> list[Value]:
+    stacks = step.primitive.name == "stack"
+    join, axis = (np.stack, "axis") if stacks else (np.concatenate, "dimension")
+    return [together(inputs, lambda arrays, lead: join(arrays, step.params[axis] + lead))]
 
 
 @rule("unstack", "split")

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from verifai_jax.addons.verification.sets import functions, whole
-from verifai_jax.addons.verification.sets.form import Form, add, negative, product, unknown
+from verifai_jax.addons.verification.sets.form import Form, add, product, unknown
 from verifai_jax.addons.verification.sets.interpreter import (
     Equation,
     Interpreter,
@@ -44,7 +44,7 @@ _OF_TWO: dict[str, Callable[[Form, Form], Form]] = {
 }  # fmt: skip
 
 
-@rule(*_OF_TWO)
+@rule(*_OF_TWO, "and", "or", "xor")
 def _two(t: Interpreter, step: Equation, inputs: list[Value]) -> list[Value]:
     name = step.primitive.name
     if step.invars[0] is step.invars[1] and name == "mul" and isinstance(inputs[0], Form):
@@ -60,7 +60,7 @@ def _two(t: Interpreter, step: Equation, inputs: list[Value]) -> list[Value]:
     return [whole.OPERATIONS[name](a, b)]
 
 
-@rule(*functions.FUNCTIONS)
+@rule(*functions.FUNCTIONS, "not")
 def _one(t: Interpreter, step: Equation, inputs: list[Value]) -> list[Value]:
     (value,), name = inputs, step.primitive.name
     if isinstance(value, Form):
@@ -68,12 +68,6 @@ def _one(t: Interpreter, step: Equation, inputs: list[Value]) -> list[Value]:
     if name not in whole.FUNCTIONS:
         return t.concrete(step, inputs)
     return [whole.FUNCTIONS[name](value)]
-
-
-@rule("neg")
-def _negative(t: Interpreter, step: Equation, inputs: list[Value]) -> list[Value]:
-    (value,) = inputs
-    return [negative(value) if isinstance(value, Form) else whole.FUNCTIONS["neg"](value)]
 
 
 @rule("integer_pow")
@@ -125,17 +119,6 @@ def _in_total_order(t: Interpreter, step: Equation, inputs: list[Value]) -> list
     a, b = levelled(inputs)
     low, high = functions.difference(as_form(a), as_form(b)).bounds()
     return [Whole.truth(high < 0, low > 0)]
-
-
-@rule("not")
-def _not(t: Interpreter, step: Equation, inputs: list[Value]) -> list[Value]:
-    return [whole.FUNCTIONS["not"](as_whole(inputs[0]))]
-
-
-@rule("and", "or", "xor")
-def _logic(t: Interpreter, step: Equation, inputs: list[Value]) -> list[Value]:
-    a, b = map(as_whole, levelled(inputs))
-    return [whole.OPERATIONS[step.primitive.name](a, b)]
 
 
 @rule("select_n")

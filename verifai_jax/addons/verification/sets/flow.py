@@ -4,9 +4,7 @@
 
 First a box is found that no solution leaves during the step: it contains all states that the
 initial states can reach with the rates inside the box (Picard and Lindeloef). Then each solution is
-its Taylor polynomial of order `ORDER` at the initial state, a sum of forms, and a remainder, the
-next coefficient on that box. So results hold for the differential equation itself, in real
-arithmetic.
+its Taylor polynomial of order `ORDER` at the initial state and the next coefficient on that box.
 
 Source: N. Nedialkov, K. Jackson, G. Corliss, Validated solutions of initial value problems for
 ordinary differential equations, Applied Mathematics and Computation 105 (1999), sections 5 and 6.
@@ -22,13 +20,7 @@ from jax.extend.core import Primitive
 from jaxtyping import Array, PyTree
 
 from verifai_jax.addons.verification.sets.form import SLACK, Form, Reals, add, joined, scaled
-from verifai_jax.addons.verification.sets.interpreter import (
-    Equation,
-    Interpreter,
-    Value,
-    as_form,
-    rule,
-)
+from verifai_jax.addons.verification.sets.interpreter import Interpreter, Value, as_form, rule
 from verifai_jax.addons.verification.sets.series import Rates
 
 ORDER = 4
@@ -69,7 +61,7 @@ def _forms(*operands: Any, shared: int, **params: Any) -> list[Any]:
 
 
 @rule("flow")
-def _flow(t: Interpreter, step: Equation, inputs: list[Value]) -> list[Value]:
+def _flow(t: Interpreter, step: Any, inputs: list[Value]) -> list[Value]:
     shared, rates, text = (step.params[name] for name in ("shared", "rates", "text"))
     time, seconds, *state = map(as_form, inputs[shared:])
     length = float(seconds.centre.flat[0])

@@ -1,9 +1,5 @@
 """Sets of real numbers, one for each box of a batch: affine forms within intervals.
 
-    x = Form.leaf(low, high, symbol, symbols, np.float32)    # a feature between its ends
-    y = add(x, product(x, x))
-    low, high = y.bounds()                                    # [boxes, *shape] each
-
 A form is `centre + sum_i slopes[i] symbol_i + [-radius, radius]`, intersected with `[low, high]` if
 an operation has a separate interval. Each symbol lies in [-1, 1]. The first symbols are the
 features of the box, so numbers that depend on them stay correlated through a whole simulation;

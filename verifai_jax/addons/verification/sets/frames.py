@@ -1,11 +1,9 @@
 """Symbols of loops and of layers, which keep nonlinear uncertainties correlated.
 
-A step of a loop rotates and shears the set of states, and nonlinear terms add an uncertainty to
-each number. If each step enclosed the set in a box, the boxes would grow. Here the uncertainties of
-a loop's carried numbers are symbols, which the next step treats like those of the features. Once
-there are many, the shortest are replaced by the symbols of one parallelepiped, with orthogonal
-sides after scaling. The uncertainties of a layer's units stay separate symbols through the
-following layers, up to a result of few numbers.
+If each step of a loop enclosed the set of states in a box, the boxes would grow. Here the
+uncertainties of a loop's carried numbers are symbols, which the next step treats like those of the
+features. Once there are many, the shortest are replaced by those of one parallelepiped. The
+uncertainties of a layer's units stay symbols up to a result of few numbers.
 
 Source: R. Lohner, Enclosing the solutions of ordinary initial and boundary value problems (1987);
 N. Nedialkov, K. Jackson, G. Corliss, Validated solutions of initial value problems for ordinary
@@ -72,14 +70,13 @@ def framed(carry: Sequence[Form | Whole], boxes: int, features: int) -> list[For
     radius = np.where(bounded, rest + 4 * SLACK * np.abs(noise).sum(2), np.inf)
     size = np.minimum(size, np.maximum(*map(np.abs, ends)))
     frame = Frame(next(_NUMBERS), features, len(new))
-    stops = np.cumsum(sizes)
-    for i, value, stop, each in zip(kept, kept.values(), stops, sizes, strict=True):
+    for i, value, stop, each in zip(kept, kept.values(), np.cumsum(sizes), sizes, strict=True):
         part, shape = slice(stop - each, stop), (boxes, *value.shape)
         pieces = [array[:, part].reshape(shape) for array in (centre, radius, size, *ends)]
         own = new[:, :, part].reshape(len(new), *shape)
         # Bounded numbers get no interval: what is computed with it would cost, and is no tighter.
-        limits = (None, None) if np.isfinite(pieces[1]).all() else pieces[3:]
-        out[i] = Form(pieces[0], own, pieces[1], pieces[2], value.dtype, *limits, frame)
+        low, high = (None, None) if np.isfinite(pieces[1]).all() else (pieces[3], pieces[4])
+        out[i] = Form(pieces[0], own, pieces[1], pieces[2], value.dtype, low, high, frame)
     return out
 
 

@@ -1,8 +1,5 @@
 """Functions of one or two numbers, on sets: their range, and a linear enclosure.
 
-    FUNCTIONS["tanh"](x)                    # Form -> Form
-    quotient(a, b), greater(a, b), power(a, b)
-
 A function f of one number is enclosed by `slope * x + offset +- error`. The slope is that of the
 secant, and the range of `f(x) - slope * x` is exact: its extremes are at the ends, or where the
 derivative of f equals the slope, for which each function has a formula. Rounding of such a point
@@ -224,7 +221,7 @@ FUNCTIONS: dict[str, Callable[[Form], Form]] = {
     "tan": _tangent,
     "floor": _whole(np.floor),
     "ceil": _whole(np.ceil),
-    "sign": _whole(np.sign),
+    "sign": _whole(np.sign), "neg": negative,
 }  # fmt: skip
 """Functions of one number, by the name of JAX's primitive."""
 _RAMP = Function(lambda x: np.maximum(x, 0.0), _single(np.zeros_like), units=0.0, range=_POSITIVE)

@@ -63,14 +63,6 @@ class Interpreter:
         with np.errstate(all="ignore"):
             return self.closed(program, inputs)
 
-    def program(
-        self, program: Program, constants: Sequence[ArrayLike], inputs: Sequence[Value]
-    ) -> list[Value]:
-        """Evaluate a `Jaxpr`."""
-        pairs = zip(program.constvars, constants, strict=True)
-        known = [constant(value, variable.aval.dtype) for variable, value in pairs]
-        return run_through(program, known, inputs, self.literal, self.step)
-
     def literal(self, each: Any) -> Value:
         """Return a number in a program, which loops read again and again."""
         found = self._literals.get(id(each))
@@ -82,7 +74,9 @@ class Interpreter:
     def closed(self, program: Program, inputs: Sequence[Value]) -> list[Value]:
         """Evaluate a program with its constants, or one without constants."""
         inner = getattr(program, "jaxpr", program)
-        return self.program(inner, getattr(program, "consts", ()), inputs)
+        pairs = zip(inner.constvars, getattr(program, "consts", ()), strict=True)
+        known = [constant(value, variable.aval.dtype) for variable, value in pairs]
+        return run_through(inner, known, inputs, self.literal, self.step)
 
     def step(self, step: Equation, inputs: list[Value]) -> list[Value]:
         """Evaluate one operation."""

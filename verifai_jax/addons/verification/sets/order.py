@@ -88,9 +88,9 @@ def _placed(value: Value, possible: np.ndarray) -> Value:
     - `possible`: `[boxes, ..., element, position]`.
     """
     low, high = _ends(value)
-    lowest, highest = _extent(low, high)
-    lowest = np.where(possible, low[..., :, None], highest).min(-2)
-    highest = np.where(possible, high[..., :, None], _extent(low, high)[0]).max(-2)
+    bottom, top = low.min(initial=0), high.max(initial=0)
+    lowest = np.where(possible, low[..., :, None], top).min(-2)
+    highest = np.where(possible, high[..., :, None], bottom).max(-2)
     if isinstance(value, Whole):
         return Whole(lowest, highest, value.dtype)
     lost = np.asarray(unknown(low, high).any(-1, keepdims=True))
@@ -107,10 +107,6 @@ def _placed(value: Value, possible: np.ndarray) -> Value:
         return np.take_along_axis(array, index, -1)
 
     return chosen([single, ~single], [value.moved(pick), hull])
-
-
-def _extent(low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    return low.min(initial=0), high.max(initial=0)
 
 
 def _by_pairs(key: Value, placed: Value, nothing: np.ndarray) -> Value:

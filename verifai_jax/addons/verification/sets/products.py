@@ -1,27 +1,23 @@
 """Products of matrices and convolutions, on sets."""
 
 import functools
+import math
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
 from verifai_jax.addons.verification.sets.arrays import add_up, times_each, together
 from verifai_jax.addons.verification.sets.form import Form, is_point, rounded
 from verifai_jax.addons.verification.sets.frames import FEW, of_layer
-from verifai_jax.addons.verification.sets.interpreter import (
-    Equation,
-    Interpreter,
-    Value,
-    constant,
-    rule,
-)
+from verifai_jax.addons.verification.sets.interpreter import Interpreter, Value, constant, rule
 from verifai_jax.addons.verification.sets.whole import Whole
 
 Axes = tuple[Sequence[int], Sequence[int]]
 
 
 @rule("dot_general")
-def _dot(t: Interpreter, step: Equation, inputs: list[Value]) -> list[Value]:
+def _dot(t: Interpreter, step: Any, inputs: list[Value]) -> list[Value]:
     contracted, batched = step.params["dimension_numbers"]
     form = step.outvars[0].aval
     return [_contracted(t, inputs[0], inputs[1], contracted, batched, np.dtype(form.dtype))]
@@ -39,13 +35,14 @@ def _contracted(
         names.append("".join(known.get(i) or next(letters) for i in range(len(value.shape))))
     free = ["".join(c for c in name if c not in joint[0] + joint[1]) for name in names]
     result = "".join(joint[0]) + free[0] + free[1]
-    count = _count(a, b, contracted, batched)
+    sizes = {c: n for name, v in zip(names, (a, b), strict=True)
+             for c, n in zip(name, v.shape, strict=True)}  # fmt: skip
+    count, terms = (math.prod(sizes[c] for c in each) for each in (result, joint[1]))
     for form, other, (own, its) in ((a, b, names), (b, a, names[::-1])):
         if isinstance(form, Whole) or isinstance(other, Whole):
             continue
         if is_point(other) and np.isfinite(other.centre).all():
             text = f"...{own},{its}->...{result}"
-            terms = int(np.prod([form.shape[own.index(c)] for c in joint[1]], dtype=np.int64))
             few = count < FEW
             if not few:
                 form = of_layer(form, t.features)
@@ -68,15 +65,6 @@ def _contracted(
     return add_up(times_each(a, b), range(len(result), len(axes)))
 
 
-def _count(a: Value, b: Value, contracted: Axes, batched: Axes) -> int:
-    """Return how many numbers a result has."""
-    free = [
-        size for value, ours, theirs in zip((a, b), contracted, batched, strict=True)
-        for axis, size in enumerate(value.shape) if axis not in (*ours, *theirs)
-    ]  # fmt: skip
-    return int(np.prod([*free, *(a.shape[axis] for axis in batched[0])], dtype=np.int64))
-
-
 def _times(a: Form, numbers: np.ndarray, names: str, dtype: np.dtype, terms: int) -> Form:
     """Return sums of so many products of a form and exact numbers, as einsum names them."""
     times = functools.partial(np.einsum, names, optimize=["einsum_path", (0, 1)])
@@ -89,7 +77,7 @@ def _times(a: Form, numbers: np.ndarray, names: str, dtype: np.dtype, terms: int
 
 
 @rule("conv_general_dilated")
-def _convolution(t: Interpreter, step: Equation, inputs: list[Value]) -> list[Value]:
+def _convolution(t: Interpreter, step: Any, inputs: list[Value]) -> list[Value]:
     """Collect the numbers that each result is a sum of, zeros for padding, and multiply those."""
     params, (image, kernel) = step.params, inputs
     forms = params["dimension_numbers"]

@@ -3,9 +3,8 @@
     rates = Rates(program, order=4)                     # of a time and a state, as JAX traced it
     rates(interpreter, shared, [time, *state], 3)[k][i] # set of the k-th coefficient of rate i
 
-The operations of the rates become nodes, each once. Sums and rearrangements act on coefficients of
-one order, products are convolutions, and those of a function follow from its derivative, which JAX
-gives as more nodes: `k y[k] = sum_i i x[i] f'(x)[k - i]`.
+The operations of the rates become nodes, each once. Products are convolutions, and coefficients of
+a function follow from its derivative, more nodes: `k y[k] = sum_i i x[i] f'(x)[k - i]`.
 
 Source: R. Moore, Methods and applications of interval analysis, SIAM (1979), section 3.4.
 """
@@ -89,12 +88,12 @@ class Rates:
         """Greatest orders of nodes that coefficients of the results need."""
         asked = [(result, order) for result in self.results]
         while asked:
-            node, least = asked.pop()
-            if least <= self.need.get(node, -1):
+            node, depth = asked.pop()
+            if depth <= self.need.get(node, -1):
                 continue
-            self.need[node] = least
-            asked += [(operand, least) for operand in self.nodes[node].operands]
-            asked += [(slope, least - 1) for _, slope in self.slopes(node)] if least else []
+            self.need[node] = depth
+            asked += [(operand, depth) for operand in self.nodes[node].operands]
+            asked += [(slope, depth - 1) for _, slope in self.slopes(node)] if depth else []
 
     def _new(self, step: Equation | None, operands: tuple, number: int, varies: bool) -> int:
         self.nodes.append(Node(step, operands, number, varies))
@@ -257,8 +256,8 @@ def _dotted(first: Sequence[Any], second: Sequence[Any]) -> Form | None:
     """Return the sum of products of two rows, in which None is zero."""
     pairs = [_two(a, b) for a, b in zip(first, second, strict=True) if a and b]
     if len(pairs) > 1 and _are_intervals([form for pair in pairs for form in pair]):
-        rows = [_stacked([pair[i] for pair in pairs]) for i in (0, 1)]
-        return _total(*interval_product(*rows[0], *rows[1]), pairs[0][0])
+        a, b = (_stacked([pair[i] for pair in pairs]) for i in (0, 1))
+        return _total(np.stack(interval_product(a[0], a[1], b[0], b[1])), pairs[0][0])
     return _sum([product(a, b, narrow=False) for a, b in pairs])
 
 
@@ -266,7 +265,7 @@ def _sum(terms: Sequence[Any]) -> Form | None:
     """Return the sum of a row."""
     forms = [term for term in terms if term is not None]
     if len(forms) > 1 and _are_intervals(forms):
-        return _total(*_stacked(levelled(forms)), forms[0])
+        return _total(_stacked(levelled(forms)), forms[0])
     return functools.reduce(lambda a, b: add(*_two(a, b)), forms) if forms else None
 
 
@@ -281,8 +280,7 @@ def _stacked(forms: Sequence[Any]) -> Any:
     return np.stack([np.stack(ends[::2]), np.stack(ends[1::2])])
 
 
-def _total(low: np.ndarray, high: np.ndarray, like: Form) -> Form:
+def _total(ends: np.ndarray, like: Form) -> Form:
     """Return the sum of rows of intervals, whose rounding is relative to each of them."""
-    unit = 2 * (len(low) + 2) * rounding(like.dtype).unit
-    low, high = low - unit * np.abs(low), high + unit * np.abs(high)
-    return spanned(low.sum(0), high.sum(0), like.dtype)
+    margin = 2 * (len(ends[0]) + 2) * rounding(like.dtype).unit * np.abs(ends)
+    return spanned((ends - margin)[0].sum(0), (ends + margin)[1].sum(0), like.dtype)

@@ -59,24 +59,14 @@ def _interpolation(t: Interpreter, program: Program, inputs: list[Value]) -> lis
     def knots(slope: Reals, low: Reals, high: Reals) -> Sequence[Reals]:
         return [np.full(low.shape, knot) for knot in edges]
 
-    function = Function(
-        lambda at: np.interp(at, edges, heights), knots, units=0.0,
-        range=(heights.min() - UNITS * kind.unit * scale - kind.smallest,
-               heights.max() + UNITS * kind.unit * scale + kind.smallest),
-    )  # fmt: skip
-    form = function(x)
     # What is taken for zero moves the argument, and with it the value by the steepest slope.
     steepest = np.abs(np.diff(heights) / gaps).max()
     margin = UNITS * kind.unit * scale + (4 * steepest + 16) * kind.smallest
-    lost = unknown(*x.bounds())
-    form.radius = form.radius + margin
-    form.size = form.size + margin
-    assert form.low is not None
-    assert form.high is not None
-    form.low = np.where(lost, -np.inf, form.low - margin)
-    form.high = np.where(lost, np.inf, form.high + margin)
-    form._bounds = form._spread = None
-    return [form]
+    function = Function(
+        lambda at: np.interp(at, edges, heights), knots, units=1.0, tiny=margin / kind.smallest,
+        range=(heights.min() - margin, heights.max() + margin),
+    )  # fmt: skip
+    return [function(x)]
 
 
 def _search(t: Interpreter, program: Program, inputs: list[Value]) -> list[Value] | None:
@@ -86,12 +76,11 @@ def _search(t: Interpreter, program: Program, inputs: list[Value]) -> list[Value
     edges = _table(table)
     if not isinstance(x, Form) or edges is None or not (np.diff(edges) >= 0).all():
         return None
-    side = next((i for i in (0, 1) if _is(program, _SEARCHES[i])), None)
-    if side is None:
+    word = next((word for word, search in _SEARCHES.items() if _is(program, search)), None)
+    if word is None:
         return None
     low, high = x.bounds()
     tiny = 2 * rounding(x.dtype).smallest
-    word = "left" if side == 0 else "right"
     first = np.searchsorted(edges, low - tiny, side=word)
     last = np.searchsorted(edges, high + tiny, side=word)
     lost = unknown(low, high)
@@ -99,7 +88,9 @@ def _search(t: Interpreter, program: Program, inputs: list[Value]) -> list[Value
     return [Whole(np.where(lost, 0, first), np.where(lost, len(edges), last), dtype)]
 
 
-_SEARCHES = (partial(jnp.searchsorted, side="left"), partial(jnp.searchsorted, side="right"))
+_SEARCHES: dict[Any, Any] = {
+    side: partial(jnp.searchsorted, side=side) for side in ("left", "right")
+}
 
 
 def _sin_cos(t: Interpreter, program: Program, inputs: list[Value]) -> list[Value] | None:
@@ -122,15 +113,11 @@ def _sin_cos(t: Interpreter, program: Program, inputs: list[Value]) -> list[Valu
 SHORTCUTS |= {"_interp": _interpolation, "searchsorted": _search, "custom_jvp_call": _sin_cos}
 
 
+@cache
 def _is(program: Program, function: Callable[..., Any]) -> bool:
     """Return whether a program is that of a function of JAX for such arguments."""
     forms = tuple((form.shape, form.dtype) for form in program.in_avals)
-    return _text(program) == _reference(function, forms)
-
-
-@cache
-def _text(program: Program) -> str:
-    return str(program)
+    return str(program) == _reference(function, forms)
 
 
 @cache

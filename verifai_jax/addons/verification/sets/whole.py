@@ -195,17 +195,12 @@ COMPARISONS = ("eq", "ne", "lt", "le", "gt", "ge")
 
 def compared(name: str, low: np.ndarray, high: np.ndarray) -> Whole:
     """Return a comparison of two numbers, decided by the ends of their difference."""
-    match name:
-        case "lt":
-            return Whole.truth(high < 0, low >= 0)
-        case "le":
-            return Whole.truth(high <= 0, low > 0)
-        case "gt":
-            return Whole.truth(low > 0, high <= 0)
-        case "ge":
-            return Whole.truth(low >= 0, high < 0)
     same, different = (low == 0) & (high == 0), (low > 0) | (high < 0)
-    return Whole.truth(same, different) if name == "eq" else Whole.truth(different, same)
+    cases = {
+        "lt": (high < 0, low >= 0), "le": (high <= 0, low > 0), "gt": (low > 0, high <= 0),
+        "ge": (low >= 0, high < 0), "eq": (same, different), "ne": (different, same),
+    }  # fmt: skip
+    return Whole.truth(*cases[name])
 
 
 def selected(truth: np.ndarray, maybe: np.ndarray, no: Whole, yes: Whole) -> Whole:
