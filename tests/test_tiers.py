@@ -76,7 +76,8 @@ def test_the_tests_of_the_core_pass_without_add_ons(
 
 
 WHOLE = (
-    "test_architecture", "test_changed", "test_documents", "test_faults", "test_language",
+    "test_architecture", "test_changed", "test_documents", "test_doors", "test_faults",
+    "test_language",
     "test_notebooks", "test_plugin", "test_public_names", "test_readme_claims", "test_sentences",
     "test_tiers",
 )  # fmt: skip

@@ -267,4 +267,7 @@ def _on_grid(span: Interval, dt: float) -> Interval:
         return span
     start, end = math.ceil(span.start / dt - 1e-6), span.end / dt + 1e-6
     last = end if math.isinf(end) else max(math.floor(end), start)
-    return Interval(*(float(f"{steps * dt:z.10g}") for steps in (start, last)))
+    low, high = (float(f"{steps * dt:z.10g}") for steps in (start, last))
+    # An end that moved inwards belongs to the interval.
+    ends = span.open_start and low == span.start, span.open_end and high == span.end
+    return Interval(low, high, *ends)

@@ -282,7 +282,9 @@ def _compiled(
     name: str, lowered: jax.stages.Lowered, effort: XlaOptimization, splits: bool, wide: bool
 ) -> jax.stages.Compiled:
     with _said(name):
-        options = _OPTIONS[effort] | ({} if splits else _WHOLE_LOOPS) | (_WIDE if wide else {})
+        options: dict[str, Any] = (
+            _OPTIONS[effort] | ({} if splits else _WHOLE_LOOPS) | (_WIDE if wide else {})
+        )
         # The user of this switch wants the least of all programs.
         reduced = jax.config.read("jax_disable_most_optimizations")
         if not options or reduced or jax.default_backend() != "cpu":
