@@ -132,7 +132,8 @@ def test_noise_lasts_as_long_as_its_episode_and_has_the_policys_deviation():
         def step(state, key):
             noise_key, key = jax.random.split(key)
             noise = jax.random.normal(noise_key, (400, 1))
-            return act(sac, Blind(time_limit=4), state, noise, key)[0], None
+            keys = jax.random.split(key, (400, 2))
+            return act(sac, Blind(time_limit=4), state, noise, keys)[0], None
 
         start = sac.init(Blind(time_limit=4), key, updates=1)
         state, _ = jax.lax.scan(step, start, jax.random.split(key, 5))

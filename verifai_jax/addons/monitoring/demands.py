@@ -132,6 +132,8 @@ class Demands:
                     ]  # fmt: skip
                     alone = [own for own in mine if own.range.apart(theirs.range)][:1]
                     leaves = dict.fromkeys(own.leaf for own in alone or mine)
+                    if not leaves:  # The other one excludes itself, such as abs(x) < -1.
+                        continue
                     return ast.conjunction(*leaves), theirs.leaf, start, both
         return None
 

@@ -13,6 +13,7 @@ from planted_sweep import ToyStudy, planted_rows, record_of
 import verifai_jax
 from verifai_jax.addons.training.augmentation.result import Augmentation
 from verifai_jax.addons.training.hardening.result import Hardening
+from verifai_jax.addons.training.sweeps.exported import TrainedConfiguration
 from verifai_jax.addons.training.sweeps.result import Sweep, load_sweep
 from verifai_jax.core.store.locks import settled
 
@@ -39,6 +40,11 @@ def sweep_of(number):
     return Sweep(record_of(planted_rows()[: 4 + number]), ToyStudy()).save
 
 
+def configuration_of(number):
+    fake = SimpleNamespace(study="s", steps=number, policy=Saved(number))
+    return lambda folder: TrainedConfiguration.export(fake, folder)
+
+
 def contents(folder):
     files = (p for p in folder.rglob("*") if p.is_file() and p.name != "writer.lock")
     named = {str(p.relative_to(folder)): p.read_bytes() for p in files}
@@ -49,6 +55,7 @@ SAVERS = {
     "addons/training/sweeps/storage.py": (sweep_of, lambda f: load_sweep(f).table.to_dict("list")),
     "addons/training/hardening/result.py": (lambda n: result_of(Hardening, n), None),
     "addons/training/augmentation/result.py": (lambda n: result_of(Augmentation, n), None),
+    "addons/training/sweeps/exported.py": (configuration_of, None),
     "falsification/run_folder.py": None,  # tests/core/store/test_replacements.py
 }
 """What saves several files together: saves by number, and the reader where there is one."""
