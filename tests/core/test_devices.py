@@ -17,6 +17,7 @@ def run(code, **environment):
     )
 
 
+@pytest.mark.thorough
 def test_one_device_per_core():
     done = run(
         "import verifai_jax, jax, os; print(len(jax.devices()), len(os.sched_getaffinity(0)))"
@@ -37,11 +38,13 @@ def test_a_choice_that_is_none():
     assert "VERIFAI_JAX_CORES must be a positive integer; got 'many'" in done.stderr
 
 
+@pytest.mark.thorough
 def test_a_backend_that_runs_already_is_left_alone():
     done = run("import jax; jax.devices(); import verifai_jax; print(len(jax.devices()))")
     assert done.stdout.strip() == "1"
 
 
+@pytest.mark.thorough
 def test_a_full_disk_keeps_no_halves_of_programs(tmp_path):
     code = (
         "import shutil, types, jax\n"

@@ -127,6 +127,7 @@ def test_what_can_be_no_trace_is_refused_when_it_is_made(wrong, error, said):
         Trace(**{"signals": {"x": np.ones(3)}, "dt": 0.1, **wrong})
 
 
+@pytest.mark.thorough
 def test_wide_integers_of_the_host_do_not_wrap():
     x = np.full(4, 2**40 + 5)
     assert robustness("always x > 6", Trace({"x": x}, dt=0.1, valid=3)) == np.float32(2.0**40)

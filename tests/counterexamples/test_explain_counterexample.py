@@ -238,6 +238,7 @@ def test_it_is_said_that_changed_features_have_no_verdict():
     assert "simulations had no verdict, the first because of RuntimeError: solver lost" in said
 
 
+@pytest.mark.thorough
 def test_without_nominal_features_and_gradients_it_says_what_is_missing():
     system = vj.blackbox(lambda features: vj.Trace({"x": np.full(2, features["x"])}, dt=1.0))
     run = vj.falsify(

@@ -166,6 +166,7 @@ def test_each_kind_by_itself():
     assert shrink(run, 1, budget=200, stay=True).changed["x0"][1] == pytest.approx(1.2, rel=0.01)
 
 
+@pytest.mark.thorough
 def test_what_cannot_work_is_refused_with_the_reason(edges):
     safe = int(edges.table.safe.index[0])
     with pytest.raises(ValueError, match=rf"row {safe} is not a counterexample: status ok"):

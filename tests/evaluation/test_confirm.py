@@ -466,6 +466,7 @@ def test_features_are_those_of_the_table():
         space.features_of({name: c for name, c in columns.items() if name != "mass"}, "float32")
 
 
+@pytest.mark.thorough
 def test_of_many_the_worst_and_the_first_are_examined():
     smooth = plain(lambda f, key: f["x"], "always x <= 0.2")
     run = vj.falsify(smooth, "uniform", 1024, batch=1024, seed=1, progress=False, confirm=False)

@@ -180,6 +180,7 @@ def test_a_folder_that_is_whole_is_resumed(problem, whole, folders, tmp_path, mo
     assert vj.load(folder).table.all.equals(whole)
 
 
+@pytest.mark.thorough
 @pytest.mark.addons
 def test_rows_that_are_not_those_of_the_checkpoint_are_told(problem, folders, tmp_path):
     folder = shutil.copytree(folders / "short", tmp_path / "run")

@@ -252,6 +252,7 @@ class TestBlackBox:
         )
         assert "'x'" in run.table.all["message"][0]
 
+    @pytest.mark.thorough
     @AT_ZERO
     def test_at_zero_the_comparator_decides_without_simulating_again(self, spec, violated):
         calls = []

@@ -133,6 +133,7 @@ def test_other_versions_are_noted(folder):
     assert again.failure_rate is not None
 
 
+@pytest.mark.thorough
 def test_a_run_that_recorded_no_model_says_so(folder):
     record = json.loads((folder / "run.json").read_text())
     record["sources"] = []
@@ -293,6 +294,7 @@ def test_what_is_imported_while_it_runs_is_part_of_the_model(project, monkeypatc
     sys.modules.pop("late_gain", None)
 
 
+@pytest.mark.thorough
 def test_a_compiled_module_is_part_of_the_model(project):
     (project / f"plant{EXTENSION_SUFFIXES[0]}").write_bytes(b"\0as built\0")
     problem = slope("try:\n    import plant\nexcept ImportError:\n    pass\n" + SPEC)

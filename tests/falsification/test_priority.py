@@ -67,6 +67,7 @@ def test_the_front_holds_the_gravest_failures(ordered, plain):
         assert not np.any(np.all(broken > broken[row], axis=1))
 
 
+@pytest.mark.thorough
 def test_front_of_one_formula_is_its_worst_row(plain):
     problem = vj.Problem("one", space=SPACE, system=trip, spec=SPEC["smooth"])
     run = vj.falsify(problem, "uniform", 64, batch=64)

@@ -56,6 +56,7 @@ def test_in_memory(problem, name):
     assert len(part.table) == first
 
 
+@pytest.mark.thorough
 def test_with_more_counterexamples_than_are_replayed():
     problem = vj.Problem("ramp", space=SPACE, system=ramp, spec="always[0, 1] x <= 0.3")
     whole = vj.falsify(problem, "uniform", 8192, batch=1024)

@@ -41,6 +41,7 @@ class TestEveryDistribution:
     def test_the_laws_of_domains_hold(self, domain):
         check_domain(domain)
 
+    @pytest.mark.thorough
     def test_quantiles(self, domain):
         values = jax.jit(jax.vmap(domain.from_unit))(POINTS[:, None])
         wanted = REFERENCES[domain].ppf(POINTS.astype(np.float64))

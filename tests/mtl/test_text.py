@@ -314,6 +314,7 @@ def test_a_formula_travels_to_other_processes():
     assert "_hash" not in pickle.loads(pickle.dumps(f)).__dict__
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("name", ["not", "and", "iff", "sum"])
 def test_deep_texts_have_a_robustness(name):
     trace = Trace({"x": np.array([2.0, 1.5])}, dt=0.1)

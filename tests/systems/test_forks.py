@@ -106,6 +106,7 @@ class Leaky:
         return rollout._replace(sample=sample)
 
 
+@pytest.mark.thorough
 def test_a_state_that_forgets_is_found():
     with pytest.raises(AssertionError, match="must go on"):
         check_forks(Leaky(pendulum()), SPACE, samples=1)

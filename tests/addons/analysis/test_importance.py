@@ -12,6 +12,7 @@ def found():
     return importance(failing_table(3000))
 
 
+@pytest.mark.thorough
 def test_influence_is_found(found):
     assert set(found.ranked[:2]) == {"x", "colour"}
     rest = found.table.loc[["y", "lanes", "same"], ["failing", "rho"]]
@@ -35,6 +36,7 @@ def test_loss_is_what_theory_says(found):
     assert low < found.table.loc["colour", "rho"] < high
 
 
+@pytest.mark.thorough
 def test_rare_failures_are_learned():
     frame = failing_table(20000)
     frame["violated"] = (frame.x > 0.97) & (frame.colour == "blue")

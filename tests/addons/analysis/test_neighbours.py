@@ -91,6 +91,7 @@ def test_nearest_to_a_row_and_to_features(kind):
     assert nearest(frame, 4, 1).distances.tolist() == [0.0]
 
 
+@pytest.mark.thorough
 def test_random_rows():
     frame = table("mixed")
     draws = [random_rows(frame, 5, seed).rows.tolist() for seed in range(400)]

@@ -91,6 +91,7 @@ def test_what_is_inside(domain):
     assert "environment.lit: false, true, no feature" in str(domain)
 
 
+@pytest.mark.thorough
 def test_its_space_is_the_domain(domain):
     space = domain.space()
     assert space.domains["speed"] == vj.Box(0.0, 15.0)
@@ -142,6 +143,7 @@ def test_coverage_is_that_of_brute_force(domain):
     assert "environment.lit: never varied" in str(found)
 
 
+@pytest.mark.thorough
 def test_the_next_points_fill_what_is_empty(domain):
     some = rows(40, seed=2)
     found = domain.coverage(some, cells=5)

@@ -131,6 +131,7 @@ pytestmark = pytest.mark.filterwarnings("ignore:.*is read as Windows-1252")
 NAMES = ["p.npz", "r.csv", "r.reqif", "r.toml", "r.yaml", "c.json"]
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("name", NAMES)
 def test_mutated(samples, name, tmp_path):
     check_sample(samples[name], tmp_path, FEW)

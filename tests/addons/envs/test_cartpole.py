@@ -283,6 +283,7 @@ def test_neural_refuses_what_it_cannot_use():
         cp.neural(replace(policy, action=Discrete(3)))
 
 
+@pytest.mark.thorough
 def test_wind_is_a_force_on_the_cart():
     blown = cp.cartpole(lambda time, state, f: 0.0 * state.x, duration=0.2)
     pushed = cp.cartpole(lambda time, state, f: 2.0 * time + 0.0 * state.x, duration=0.2)

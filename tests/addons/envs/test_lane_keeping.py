@@ -73,6 +73,7 @@ def test_a_circle_beside_the_middle_of_a_round_road_stays_beside_it(double):
     np.testing.assert_allclose(trace["distance"][-1], 80 / (1 - curvature * offset), rtol=1e-9)
 
 
+@pytest.mark.thorough
 def test_a_road_is_a_function_of_distance_and_not_of_time(double):
     # One bend between 40 m and 60 m, passed at two speeds with the wheels straight.
     road = Waveform(jnp.array([0.0, 0.0, 0.004, 0.0, 0.0, 0.0], jnp.float64), duration=100.0)

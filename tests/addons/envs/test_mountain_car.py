@@ -146,6 +146,7 @@ def test_missing_features_are_gymnasiums(name):
     )
 
 
+@pytest.mark.thorough
 def test_rolling_along_climbs_the_hill_and_full_throttle_does_not():
     climbing = jax.jit(mc.mountain_car())
     climbs = climbing({"velocity_bias": 0.0}, KEY)

@@ -72,6 +72,7 @@ def oblique_slabs(dim, budget):
     return with_gradient(lambda z: parts(z)[0], lambda z: parts(z)[1], dim, budget), masses.sum()
 
 
+@pytest.mark.thorough
 def test_failures_that_need_two_oblique_conditions_are_hit():
     known, _ = oblique_slabs(40, 100_000)
     found = explore(known, np.random.default_rng(0), 3000)

@@ -82,6 +82,7 @@ def test_the_interval_is_honest_but_not_much_wider_than_needed():
     assert ours + 200 < least(lambda n: anytime_interval(0, n, 1 - 0.05 / 32))
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("q", [0.0, 0.004, 0.05])
 def test_looking_again_and_again_the_intervals_miss_as_rarely_as_they_say(q):
     random = np.random.default_rng(0)

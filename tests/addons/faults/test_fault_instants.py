@@ -68,6 +68,7 @@ def made(kind, **numbers):
 KINDS = ("dropout", "freeze", "held", "delay", "drift")
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("kind", KINDS)
 def test_on_the_host(kind, period):
     for onset, duration, amount in CASES:

@@ -96,6 +96,7 @@ def test_the_interval_is_what_the_gaps_and_the_future_allow(uncompiled, formula,
         assert before[0] <= Oracle(whole).rho(formula, 0) <= before[1]
 
 
+@pytest.mark.thorough
 @given(formulas(2, counted=True), broken(), st.lists(st.floats(-1e9, 1e9), min_size=24))
 @QUICK
 def test_no_value_in_the_gaps_leaves_the_interval(uncompiled, formula, both, extremes):

@@ -78,6 +78,7 @@ def values(signals):
     return HostValues(signals, DT)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("part", range(3))
 def test_no_value_within_the_bars_escapes_300_formulas(part):
     rng = np.random.default_rng(part)

@@ -60,6 +60,7 @@ def test_training_learns_where_the_square_is():
     assert f"{quality.error_rate:.1%} wrong" in str(quality)
 
 
+@pytest.mark.thorough
 def test_a_file_keeps_a_detector_in_half_precision(network, tmp_path):
     save_detector(tmp_path / "network.npz", network)
     read = load_detector(tmp_path / "network.npz")

@@ -373,6 +373,7 @@ def test_mistakes_are_named_before_anything_compiles(scene, options, message):
         jax.eval_shape(lambda: scene.render(**{"camera": Camera(4, 8), **options}))
 
 
+@pytest.mark.thorough
 def test_an_image_has_the_camera_s_shape_whatever_is_traced():
     def image(x, fog):
         scene = Scene((Box((x, 0.0, 0.0), (1.0, 1.0, 1.0), hsv(x)), Sphere((9.0, x, 1.0), 1.0)))

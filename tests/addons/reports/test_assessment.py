@@ -67,6 +67,7 @@ def test_the_tree_is_well_formed_and_has_every_claim():
     assert all(y + h <= other for (y, h), (other, _) in itertools.pairwise(boxes))
 
 
+@pytest.mark.thorough
 def test_any_result_can_have_one(tmp_path):
     def simulate(features):
         return vj.Trace({"x": np.full(2, features["a"])}, dt=0.1)

@@ -127,6 +127,7 @@ def test_texts_of_people_are_text(report):
     assert {link.removeprefix("#") for link in page.links} <= page.anchors
 
 
+@pytest.mark.thorough
 def test_its_policy_allows_nothing_from_elsewhere(report):
     head = report.read_text().partition("<style>")[0]
     policy = re.search(r'Content-Security-Policy" content="([^"]*)"', head)[1]

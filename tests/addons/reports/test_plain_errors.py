@@ -20,6 +20,7 @@ go()
 """
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("on", "call", "lines", "first", "last"),
     [

@@ -218,6 +218,7 @@ def slide(envs):
     return Slide()
 
 
+@pytest.mark.thorough
 def test_brax_task_is_the_environments_own_rollout(brax):
     env = slide(brax)
     task = brax_task(env, time_limit=30)

@@ -172,6 +172,7 @@ def test_a_file_says_what_it_was_made_with(tmp_path):
     assert "jax" in sources["versions"]
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("changed", "told"),
     [

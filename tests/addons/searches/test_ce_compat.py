@@ -51,6 +51,7 @@ def test_discrete_as_verifai():
     np.testing.assert_allclose(np.array(seen)[:, 0], expected, atol=1e-6)
 
 
+@pytest.mark.thorough
 def test_discrete_without_a_verdict():
     # Conformance case ce-05, which raised in VerifAI, for Categorical("a", "b").
     (seen,) = histories(CECompat(), Cube((2,), ordered=(False,)), [([0.25], NAN)])

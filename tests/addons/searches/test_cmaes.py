@@ -171,6 +171,7 @@ def test_reverse_recombination():
         np.testing.assert_allclose(got, expected, rtol=1e-5)
 
 
+@pytest.mark.thorough
 def test_discrete_coordinates_keep_moving():
     evolution = Evolution.begin(jnp.full(2, 0.5), jnp.float32(1e-3), True)
     wide = evolution.widened(np.array([0.0, 0.1], np.float32))

@@ -91,6 +91,7 @@ def test_gives_up_greed_that_does_not_pay():
     assert share_of_starts(lambda u: 1 + jnp.sum(u, axis=1)) < 0.02
 
 
+@pytest.mark.thorough
 def test_draws_the_prior_where_all_points_are_equal():
     _, u = learned(EpsilonGreedy(), Cube((0, 0)), lambda u: jnp.ones(len(u)), 60)
     for j in (0, 1):

@@ -45,6 +45,7 @@ def test_orders_are_permutations():
         assert len(orders) == 3 or total < 12
 
 
+@pytest.mark.thorough
 def test_a_part_of_a_grid_is_spread_over_all_of_it():
     cube = Cube((101, 0, 101))
     u = np.asarray(Grid().ask(Grid().init(jax.random.key(3), cube, 400), cube, 400)[0])

@@ -289,6 +289,7 @@ def test_programs_are_compiled_for_few_numbers_of_rows_whatever_the_capacity(cap
     assert len(set(sizes)) <= 5
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("vectorised", [False, True])
 def test_an_engine_that_keeps_traces(vectorised):
     def many(features):

@@ -178,6 +178,7 @@ def test_pictures_of_a_replay(seen, gl, tmp_path, monkeypatch):
     assert all((tmp_path / name).stat().st_size > 1000 for name in names)
 
 
+@pytest.mark.thorough
 def test_without_a_renderer_one_line_says_what_to_do(seen, tmp_path, monkeypatch, caplog):
     def nothing():
         raise ImportError("Cannot initialize a EGL device display.\nMore.")

@@ -113,6 +113,7 @@ def test_nominal_parameters_that_hold_are_kept():
     assert "k 1.2 unchanged" in str(result)
 
 
+@pytest.mark.thorough
 def test_the_margin_is_kept():
     result = repair(first_order, ["k"], 6000, aim=vj.Aim(margin=0.2), gradient=False)
     limit = brentq(lambda k: 0.5 * fading(k) + (1 - fading(k)) / k - 0.8, 0.3, 2.0)
@@ -207,6 +208,7 @@ def test_the_weights_of_a_network():
     assert result.held_out_after.failures == 0
 
 
+@pytest.mark.thorough
 def test_a_simulation_without_a_verdict_is_no_repair():
     def system(features, key):
         x = jnp.where(features["k"] > 0.5, jnp.nan, -1.0)

@@ -82,6 +82,7 @@ def test_what_it_says(found):
     assert "proves nothing" in str(found)
 
 
+@pytest.mark.thorough
 def test_the_same_seed_gives_the_same(found):
     again = synthesize(first_order, ["k"], 6000)
     assert again.parameters == found.parameters
@@ -100,6 +101,7 @@ def test_no_gain_has_that_margin():
     assert "keep less than the margin" in str(result)
 
 
+@pytest.mark.thorough
 def test_no_gain_is_safe():
     narrow = vj.FeatureSpace({**first_order.space.domains, "k": vj.Box(0.2, 0.8)})
     problem = dataclasses.replace(first_order, space=narrow)
@@ -187,6 +189,7 @@ def test_a_constraint_between_parameter_and_environment():
     assert result.held_out.simulations == 2000
 
 
+@pytest.mark.thorough
 def test_exactly_zero_is_decided_by_the_comparator():
     def system(features, key):
         return vj.Trace({"x": 0 * features["k"] + np.zeros(2, np.float32)}, dt=1.0)

@@ -135,6 +135,7 @@ def test_a_search_begins_where_bounds_are_loosest():
     assert counts[0] <= 64 < 1024 < counts[1]
 
 
+@pytest.mark.thorough
 def test_a_proof_of_another_problem_proves_nothing(proved):
     for other, what in ((squares(factor=1.01), "model"), (squares("always x <= 2"), "formulas")):
         with pytest.raises(ValueError, match=f"verification is of another problem: its {what}"):

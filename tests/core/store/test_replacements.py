@@ -71,6 +71,7 @@ def test_files_that_belong_together_are_replaced_together(tmp_path):
     assert folder.is_symlink()
 
 
+@pytest.mark.thorough
 def test_a_reader_who_is_killed_loses_nothing_either(tmp_path):
     folder, whole = tmp_path / "it", tmp_path / "cut"
     write(folder, "new")
@@ -159,6 +160,7 @@ KINDS = {
 }
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(("save", "read"), KINDS.values(), ids=list(KINDS))
 def test_each_kind_of_file_is_old_or_new(tmp_path, save, read):
     save(tmp_path, "old")

@@ -113,6 +113,7 @@ def test_a_pool_that_is_forgotten_ends_its_workers():
     assert not alive(pid)
 
 
+@pytest.mark.thorough
 def test_a_death_is_survived_by_a_retry(troublesome, tmp_path):
     file = tmp_path / "file"
     assert outcomes(troublesome, [{"a": 10, "file": str(file)}])[0].status == Status.OK
@@ -149,6 +150,7 @@ def test_what_a_simulator_has_started_ends_with_the_pool():
     until(lambda: not alive(child), 5)
 
 
+@pytest.mark.thorough
 def test_what_has_ended_when_interrupted_is_handed_over(monkeypatch, tmp_path):
     """Outcomes of several workers lie in the queue when Ctrl-C comes."""
     system = blackbox(host_systems.troublesome, workers=2)
@@ -202,6 +204,7 @@ def test_refuses_bad_options(options, match):
         blackbox(host_systems.decay, **options)
 
 
+@pytest.mark.thorough
 def test_a_simulator_that_workers_cannot_import(tmp_path, monkeypatch):
     (tmp_path / "licensed.py").write_text(
         "from verifai_jax.systems.blackbox import worker_process\n"
@@ -217,6 +220,7 @@ def test_a_simulator_that_workers_cannot_import(tmp_path, monkeypatch):
         list(system.simulate_each([{}], [0]))
 
 
+@pytest.mark.thorough
 def test_ways_in_which_a_worker_dies_are_named():
     assert workers._manner(3) == "ended with exit code 3"
     assert workers._manner(-11) == "was killed by SIGSEGV"

@@ -227,6 +227,7 @@ def test_no_control_step_is_taken_after_the_end():
     np.testing.assert_allclose(trace["x"], [0, 0.25, 0.5, 0.75, 1.0])
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(("limit", "valid"), [(2.5, 4), (3.0, 5), (-1.0, 1), (100.0, 8)])
 @pytest.mark.parametrize("period", [1.0, 2.0, 3.0])
 def test_termination_freezes_everything(limit, valid, period):

@@ -79,6 +79,7 @@ def junit(path, outcome="", name="test_of_it", **properties):
     return path
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("inside", "properties", "outcome", "text"),
     [
@@ -121,6 +122,7 @@ def test_no_result_is_no_result(tmp_path):
         read_cases([tmp_path])
 
 
+@pytest.mark.thorough
 def test_tests_that_were_edited(tmp_path):
     with session(Session(root=tmp_path)) as now:
         test_of_it()

@@ -228,6 +228,7 @@ def test_at_exactly_zero_the_comparator_decides():
     assert breaks[0].worst_robustness == 0.0
 
 
+@pytest.mark.thorough
 def test_without_a_verdict_is_no_pass():
     def problem_of(policy):
         return vj.Problem("nan", X, simulated(policy, 0.75), "always y <= 0")

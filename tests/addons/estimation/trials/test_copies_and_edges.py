@@ -27,6 +27,7 @@ def test_copies_are_named_by_their_rows():
     assert copies(frame[["n"]]) == copies(frame[["b"]]) == []
 
 
+@pytest.mark.thorough
 def test_both_results_of_trials_say_it(problem):
     a = np.linspace(0.1, 0.9, 5)
     frame = pd.DataFrame({"a": np.repeat(a, 2), "k": 0.5, "failed": np.repeat(a < 0.5, 2)})

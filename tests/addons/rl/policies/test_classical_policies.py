@@ -24,6 +24,7 @@ OUTPUTS = {
 }  # fmt: skip
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(("name", "output"), OUTPUTS.items())
 def test_a_file_of_scikit_learn_or_of_the_quantiser(name, output):
     check_agrees(policy(FILES / f"{name}.onnx", output=output), *expected(name))
@@ -48,6 +49,7 @@ def tree(tmp_path, **changes):
     return policy(tmp_path / "tree.onnx")
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(("mode", "wanted"), [
     ("BRANCH_LEQ", [1, 1, 2, 1]), ("BRANCH_LT", [1, 2, 2, 1]), ("BRANCH_GTE", [2, 1, 1, 1]),
     ("BRANCH_GT", [2, 2, 1, 1]), ("BRANCH_EQ", [2, 1, 2, 1]), ("BRANCH_NEQ", [1, 2, 1, 1]),

@@ -30,6 +30,7 @@ def check_agrees(loaded, observations, actions):
 SB3 = sorted(p.stem for p in FILES.glob("*.zip") if p.stem != "sac_sde")
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("name", SB3)
 def test_a_model_of_stable_baselines3(name):
     check_agrees(policy(FILES / f"{name}.zip", **OPTIONS.get(name, {})), *expected(name))

@@ -130,6 +130,7 @@ def test_equal_to_the_environment_stepped_by_hand(policy):
     np.testing.assert_array_equal(kept["q"], kept["observation"][:, 0])
 
 
+@pytest.mark.thorough
 def test_an_environment_that_is_done_is_not_reset_in_the_trace():
     trace = brax(Slide(), push, steps=40, signals=["x", "v"])({}, KEY)
     end = int(trace.valid)
@@ -352,6 +353,7 @@ def test_one_program_replays_at_every_step(options):
     assert np.abs(found[0]["x"] - found[1]["x"]).max() > 1e-5
 
 
+@pytest.mark.thorough
 def test_an_error_within_brax_names_the_versions():
     class Broken(Slide):
         def step(self, state, action):

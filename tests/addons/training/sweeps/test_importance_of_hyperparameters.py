@@ -154,6 +154,7 @@ def test_trends_are_those_of_scipy_and_chance_is_rarely_beaten():
     assert np.sum(beaten) <= 11  # 5 are expected; more than 11 come in 1 of 200.
 
 
+@pytest.mark.thorough
 def test_too_few_configurations_are_admitted():
     table = made(6, lambda u, steps: u[0], lambda u, steps: u[1], checkpoints=(1, 2, 3))
     found = hyperparameter_importance(table, list(SPACE.domains), SPACE)

@@ -164,6 +164,7 @@ def test_what_cannot_train_or_explodes_is_a_row():
     assert [policy is None for policy in found.record.policies] == list(lost | refused)
 
 
+@pytest.mark.thorough
 def test_a_training_that_raises_is_a_row(monkeypatch):
     def step(self, task, state, step=Drift.step):
         if self.environments == 8:

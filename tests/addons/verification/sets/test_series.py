@@ -96,6 +96,7 @@ def derivatives(function, points):
     return [np.asarray(each) for each in jax.jit(jax.vmap(of))(points)]
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("function", CASES)
 def test_coefficients_are_those_of_jax(function):
     random = np.random.default_rng(1)
