@@ -15,8 +15,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-PROGRAM = """
-import json, resource, sys, tempfile, time
+SWING = """
 import jax.numpy as jnp
 import verifai_jax as vj
 
@@ -31,6 +30,10 @@ problem = vj.Problem(
     "swing", {"angle0": vj.Box(-0.3, 0.3), "mass": vj.Box(0.5, 2.0)},
     vj.ode(swing, begin, dt=0.01, duration=1.0), "always abs(angle) <= 0.5",
 )
+"""
+"""A program that makes a problem of two features, `problem`; for new processes."""
+MEASURE = """
+import json, resource, sys, tempfile, time
 peak = lambda: resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
 found, run = {}, None
 for name, step in (
@@ -49,7 +52,7 @@ print(json.dumps(found))
 def measured(checkout: Path, rows: int) -> dict[str, list[float]]:
     """Return processor seconds, seconds and MB of each step in a new process."""
     done = subprocess.run(
-        [sys.executable, "-c", PROGRAM, str(rows)], capture_output=True, text=True, check=True,
+        [sys.executable, "-c", SWING + MEASURE, str(rows)], capture_output=True, text=True, check=True,
         cwd=checkout, env={**os.environ, "PYTHONPATH": str(checkout)},
     )  # fmt: skip
     return json.loads(done.stdout.splitlines()[-1])

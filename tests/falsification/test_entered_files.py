@@ -12,24 +12,12 @@ from pathlib import Path
 
 import pytest
 
+from benchmarks.many_rows import SWING
+
 ROOT = Path(__file__).parents[2]
 LISTED = ROOT / "docs" / "entered_files.txt"
-PROGRAM = """
+ENTERING = """
 import inspect, json, sys, threading
-import jax.numpy as jnp
-import verifai_jax as vj
-
-def swing(time, state, control, features):
-    push = jnp.clip(-60 * state["angle"] - 15 * state["speed"], -4, 4) / features["mass"]
-    return {"angle": state["speed"], "speed": 9.81 * jnp.sin(state["angle"]) + push}
-
-def begin(features, key):
-    return {"angle": features["angle0"], "speed": 0.0}
-
-problem = vj.Problem(
-    "swing", {"angle0": vj.Box(-0.3, 0.3), "mass": vj.Box(0.5, 2.0)},
-    vj.ode(swing, begin, dt=0.01, duration=1.0), "always abs(angle) <= 0.5",
-)
 entered = {}
 
 def enter(frame, event, argument):
@@ -54,7 +42,7 @@ def one_call() -> dict[str, dict[str, str]]:
     plain = {name: value for name, value in os.environ.items() if not name.startswith(ours)}
     with tempfile.TemporaryDirectory() as cache:
         done = subprocess.run(
-            [sys.executable, "-c", PROGRAM], capture_output=True, text=True, cwd=ROOT,
+            [sys.executable, "-c", SWING + ENTERING], capture_output=True, text=True, cwd=ROOT,
             env=plain | {"VERIFAI_JAX_CACHE": cache, "PYTHONPATH": str(ROOT)},
         )  # fmt: skip
     assert done.returncode == 0, done.stderr

@@ -25,11 +25,8 @@ def test_without_scenic_one_line_names_the_extra(monkeypatch):
 
 @pytest.mark.thorough
 @pytest.mark.filterwarnings("ignore")
+@pytest.mark.usefixtures("installed")
 class TestWithScenic:
-    @pytest.fixture(autouse=True)
-    def _scenic(self):
-        pytest.importorskip("scenic")
-
     def test_names_are_those_of_the_program(self):
         program = vj.scenic(GALLERY / "cones.scenic")
         assert program.compiled

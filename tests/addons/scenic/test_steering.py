@@ -39,11 +39,8 @@ def scenes_until_failure(scenario, limit=6000):
 
 @pytest.mark.thorough
 @pytest.mark.filterwarnings("ignore")
+@pytest.mark.usefixtures("installed")
 class TestWithScenic:
-    @pytest.fixture(autouse=True)
-    def _scenic(self):
-        pytest.importorskip("scenic")
-
     @pytest.mark.slow
     def test_a_planted_failure_is_found_in_a_fifth_of_scenics_own_samples(self, monkeypatch):
         import random

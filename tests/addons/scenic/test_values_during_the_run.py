@@ -11,12 +11,11 @@ from verifai_jax.addons.scenic import ProgramError
 GALLERY = Path(__file__).parent / "gallery"
 PUSH = vj.Reactive({"gap": (0, 20), "speed": (0, 14)}, bounds=(-8, 3))
 
-pytestmark = [pytest.mark.thorough, pytest.mark.filterwarnings("ignore")]
-
-
-@pytest.fixture(autouse=True)
-def _scenic():
-    pytest.importorskip("scenic")
+pytestmark = [
+    pytest.mark.thorough,
+    pytest.mark.filterwarnings("ignore"),
+    pytest.mark.usefixtures("installed"),
+]
 
 
 def test_a_behavior_that_asks_at_each_step_is_falsified():
