@@ -52,8 +52,8 @@ print(json.dumps(found))
 def measured(checkout: Path, rows: int) -> dict[str, list[float]]:
     """Return processor seconds, seconds and MB of each step in a new process."""
     done = subprocess.run(
-        [sys.executable, "-c", SWING + MEASURE, str(rows)], capture_output=True, text=True, check=True,
-        cwd=checkout, env={**os.environ, "PYTHONPATH": str(checkout)},
+        [sys.executable, "-c", SWING + MEASURE, str(rows)], cwd=checkout, check=True,
+        capture_output=True, text=True, env={**os.environ, "PYTHONPATH": str(checkout)},
     )  # fmt: skip
     return json.loads(done.stdout.splitlines()[-1])
 

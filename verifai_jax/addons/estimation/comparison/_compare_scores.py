@@ -125,8 +125,8 @@ def _cluster(sides: list[Any], cluster: str | None) -> str:
 def _pairs(sides: list[Any]) -> Any:
     """Return both scores of each episode if both sides have the same ones; None otherwise."""
     keys = [key for key in KEYS if key in sides[0].columns and key in sides[1].columns]
-    one, other = (side.assign(place=side.groupby(keys).cumcount()) for side in sides)
-    joined = one.merge(other, on=[*keys, "place"], suffixes=("", "_other"))
+    one, other = (side.assign(repetition=side.groupby(keys).cumcount()) for side in sides)
+    joined = one.merge(other, on=[*keys, "repetition"], suffixes=("", "_other"))
     joined["apart"] = joined["score_other"] - joined["score"]
     return joined if len(joined) == len(one) == len(other) else None
 

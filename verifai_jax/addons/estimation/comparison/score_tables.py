@@ -25,7 +25,7 @@ ENDINGS = (".csv", ".json", ".npz", ".parquet")
 KEYS = ("run", "seed", "task", "episode")
 """Columns that say which episode a score is of."""
 SCORES = ("success", "score", "failed")
-"""Columns of scores, of which a table needs one, or `successes` and `episodes`."""
+"""Names of the column of scores. A table has one of them, or `successes` and `episodes`."""
 WORDS = {"true": 1.0, "yes": 1.0, "1": 1.0, "false": 0.0, "no": 0.0, "0": 0.0}
 
 
