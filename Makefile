@@ -30,9 +30,13 @@ PIP = if $(BIN)/python -m pip --version >/dev/null 2>&1; \
 INSTALL = $(PIP); $$pip install -q --disable-pip-version-check -c constraints.txt
 
 # The stamp is renewed when the dependencies change.
-.venv/installed: pyproject.toml constraints.txt
+.venv/package: pyproject.toml constraints.txt
 	$(PYTHON) -c 'import sys; sys.exit("verifai_jax needs Python >= 3.11, this is " + sys.version.split()[0] + "; try make PYTHON=python3.12" if sys.version_info < (3, 11) else 0)'
 	$(PYTHON) -m venv .venv 2>/dev/null || $(PYTHON) -m venv --without-pip --clear .venv
+	@$(INSTALL) -e .
+	@touch $@
+
+.venv/installed: .venv/package
 	@$(INSTALL) -e '.[test]'
 	@touch $@
 
@@ -54,7 +58,7 @@ INSTALL = $(PIP); $$pip install -q --disable-pip-version-check -c constraints.tx
 docs: .venv/docs
 	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --config-file website/mkdocs.yml
 
-falsify: .venv/installed
+falsify: .venv/package
 	$(BIN)/verifai-jax falsify specs/cartpole.py:balance --search uniform --budget 20000
 
 # Tests of one file share what they compile, so a file stays with one worker; long files begin.
