@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from benchmarks.landscapes import LANDSCAPES, tell_of
+from verifai_jax.search import Observations
 
 SEEDS = 25
 # Those on one cube run in one program: compiling is what takes time.
@@ -66,3 +67,24 @@ def gain(name, value):
     failing = value < 0
     first = np.where(failing.any(1), failing.argmax(1) + 1.0, np.inf)
     return math.log(2) / LANDSCAPES[name].share / np.median(first)
+
+
+@lru_cache
+def jitted(search):
+    """Its compiled ask and tell, which all tests of one search share."""
+    return (
+        jax.jit(search.ask, static_argnums=(1, 2)),
+        jax.jit(search.tell, static_argnums=1),
+    )
+
+
+def asked(search, cube, rho, rounds, batch=8, key=None, valid=True):
+    """Points of the first rounds, with this robustness, and the last state."""
+    ask, tell = jitted(search)
+    state, seen = search.init(jax.random.key(0) if key is None else key, cube, batch), []
+    for _ in range(rounds):
+        u, state = ask(state, cube, batch)
+        value = jnp.asarray(rho(u), jnp.float32)
+        state = tell(state, cube, Observations(u, value, jnp.full(batch, valid)))
+        seen.append(np.asarray(u))
+    return np.concatenate(seen), state

@@ -1,13 +1,11 @@
 """Bayesian optimization: quality on known landscapes, what it keeps, and what it never does."""
 
-from functools import cache
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from checked_types import unchecked
-from playing import gain, play
+from playing import asked, gain, jitted, play
 
 from verifai_jax.addons.searches.bayes import Bayes
 from verifai_jax.core.values.cube import Cube
@@ -19,15 +17,6 @@ KEY = jax.random.key(0)
 SMALL = Bayes(capacity=96, candidates=128)
 IMPROVEMENT = Bayes("expected_improvement", capacity=96, candidates=128)
 FLAT = ("ball", "ripples")
-
-
-@cache
-def jitted(search):
-    """Its compiled ask and tell, which all tests of one search share."""
-    return (
-        jax.jit(search.ask, static_argnums=(1, 2)),
-        jax.jit(search.tell, static_argnums=1),
-    )
 
 
 @pytest.mark.proves
@@ -52,18 +41,6 @@ def test_goes_on_failing():
     # At different points.
     for points, failing in zip(u[0, :, -40:], late, strict=True):
         assert len(np.unique(points[failing], axis=0)) == failing.sum()
-
-
-def asked(search, cube, rho, rounds, batch=8, valid=True):
-    """Points of the first rounds, with this robustness, and the last state."""
-    ask, tell = jitted(search)
-    state, seen = search.init(KEY, cube, batch), []
-    for _ in range(rounds):
-        u, state = ask(state, cube, batch)
-        value = jnp.asarray(rho(u), jnp.float32)
-        state = tell(state, cube, Observations(u, value, jnp.full(batch, valid)))
-        seen.append(np.asarray(u))
-    return np.concatenate(seen), state
 
 
 @pytest.mark.slow

@@ -1,12 +1,11 @@
 """Trust-region Bayesian optimization: many dimensions, its region, and what it forgets."""
 
-from functools import cache
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from checked_types import unchecked
+from playing import asked, jitted
 
 from verifai_jax.addons.searches.turbo import SIDES, TuRBO, trust_box
 from verifai_jax.core.values.cube import Cube
@@ -16,27 +15,6 @@ from verifai_jax.search.halton import halton_points
 KEY = jax.random.key(0)
 SMALL = TuRBO(capacity=128, candidates=256)
 TINY = TuRBO(capacity=32, candidates=32)
-
-
-@cache
-def jitted(search):
-    """Its compiled ask and tell, which all tests of one search share."""
-    return (
-        jax.jit(search.ask, static_argnums=(1, 2)),
-        jax.jit(search.tell, static_argnums=1),
-    )
-
-
-def asked(search, cube, rho, rounds, batch=8, key=KEY, valid=True):
-    """Points of the first rounds, with this robustness, and the last state."""
-    ask, tell = jitted(search)
-    state, seen = search.init(key, cube, batch), []
-    for _ in range(rounds):
-        u, state = ask(state, cube, batch)
-        value = jnp.asarray(rho(u), jnp.float32)
-        state = tell(state, cube, Observations(u, value, jnp.full(batch, valid)))
-        seen.append(np.asarray(u))
-    return np.concatenate(seen), state
 
 
 def corner(u):
