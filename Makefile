@@ -65,7 +65,8 @@ falsify: .venv/package
 AS_A_USER := $(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder --durations=10
 # Programs of tests run for moments, so they are compiled in a hurry. Which flags do that depends on
 # the version of XLA, which ends a process that gets one it does not know.
-PYTEST = JAX_DISABLE_MOST_OPTIMIZATIONS=1 XLA_FLAGS="$$($(BIN)/python tests/xla_flags.py)" $(AS_A_USER)
+# Compiled files of tests are kept for the next run, whatever the environment says.
+PYTEST = PYTHONDONTWRITEBYTECODE= JAX_DISABLE_MOST_OPTIMIZATIONS=1 XLA_FLAGS="$$($(BIN)/python tests/xla_flags.py)" $(AS_A_USER)
 
 test: .venv/installed
 	$(PYTEST)

@@ -6,18 +6,21 @@ from changed import importers, paths_for
 LAWS = ["tests/test_architecture.py", "tests/test_language.py", "tests/test_public_names.py"]
 
 
+@pytest.mark.thorough
 def test_a_file_calls_for_its_room_and_for_those_that_import_it():
     found = paths_for(["verifai_jax/pictures/replay.py"])
     assert {"tests/addons/reports", "tests/cli", "tests/pictures", *LAWS} <= set(found)
     assert {"tests/mtl", "tests/evaluation", "tests/addons/native"}.isdisjoint(found)
 
 
+@pytest.mark.thorough
 def test_importers_go_through_others():
     found = importers(["verifai_jax.statistics.binomial"])
     assert {"verifai_jax.statistics.binomial", "verifai_jax.falsification.summary"} <= found
     assert "verifai_jax.core.values.trace" not in found
 
 
+@pytest.mark.thorough
 def test_a_file_that_is_gone_calls_for_all_that_its_room_does():
     gone = set(paths_for(["verifai_jax/addons/estimation/comparison/gone.py"]))
     assert {"tests/addons/estimation", "tests/cli"} <= gone

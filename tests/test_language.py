@@ -89,6 +89,7 @@ def shadowed(package: Path) -> Iterator[tuple[str, str]]:
             yield from [(f"{here}.{node.name}", here)] * exists
 
 
+@pytest.mark.thorough
 def test_first_words(package):
     wrong = [
         f"{file}:{line} {text}"
@@ -106,6 +107,7 @@ def test_first_words_are_noticed():
     assert list(questioning(nodes_of(source))) == [(1, "Whether it holds."), (2, "How.")]
 
 
+@pytest.mark.thorough
 def test_arguments_have_types(package):
     annotations = [text for nodes in package.values() for text in argument_annotations(nodes)]
     share = sum(text in ("Any", "typing.Any") for text in annotations) / len(annotations)
@@ -137,6 +139,7 @@ def signed_zeros(nodes: Nodes) -> Iterator[tuple[int, str]]:
                 yield node.lineno, spec
 
 
+@pytest.mark.thorough
 def test_no_zero_is_printed_with_a_sign(package):
     # `z` makes a zero of what rounds to it: f"{-0.0:zg}" is 0.
     wrong = [
@@ -173,6 +176,7 @@ def is_dialect(name: str) -> bool:
     return name not in USUAL and bool(DIALECT & set(name.lower().split("_")))
 
 
+@pytest.mark.thorough
 def test_names_are_plain_english(package):
     wrong = [str(file) for file in FILES if is_dialect(file.stem)]
     wrong += [

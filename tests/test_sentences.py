@@ -4,6 +4,8 @@ import ast
 from collections.abc import Iterator
 from pathlib import Path
 
+import pytest
+
 PACKAGE = Path(__file__).parents[1] / "verifai_jax"
 
 SENTENCES = {"checked", "finding", "headline", "message", "note", "notes", "reason", "summary"}
@@ -52,6 +54,7 @@ ALLOWED = {
 """Files that may take such a text apart, and why."""
 
 
+@pytest.mark.thorough
 def test_no_sentence_is_parsed():
     wrong = [
         f"{file.relative_to(PACKAGE)}:{line} {text}"
