@@ -161,7 +161,7 @@ class RowProgram:
         computes, *_ = self.derivatives
         return None if computes is None else identity(computes, self.derivative)
 
-    @property
+    @cached_property
     def work(self) -> int:
         """Approximate number of scalar operations in a simulation with its derivative."""
         from verifai_jax.evaluation.work import work_of

@@ -10,7 +10,7 @@ robustness, or with one of exactly zero where the Boolean semantics say so (`x >
 """
 
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -95,11 +95,13 @@ class Verdicts(NamedTuple):
         """Return some of the rows, by their indices."""
         arrays = self._replace(messages=None, traces=None)
         some: Verdicts = jax.tree.map(lambda leaf: leaf[chosen], arrays)
-        numbers = np.arange(len(self.status))[chosen].tolist()
-        return some._replace(
-            messages=None if self.messages is None else [self.messages[i] for i in numbers],
-            traces=None if self.traces is None else [self.traces[i] for i in numbers],
-        )
+
+        def listed(each: list[Any] | None) -> list[Any] | None:
+            if each is None:
+                return None
+            return [each[i] for i in np.arange(len(each))[chosen].tolist()]
+
+        return some._replace(messages=listed(self.messages), traces=listed(self.traces))
 
 
 class RowVerdict(NamedTuple):

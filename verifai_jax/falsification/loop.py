@@ -21,6 +21,7 @@ from jaxtyping import Float
 from verifai_jax.core.compute.compilation import while_compiling
 from verifai_jax.core.compute.keys import run_keys
 from verifai_jax.core.compute.stopwatch import Stopwatch
+from verifai_jax.evaluation.confirmations import Standing
 from verifai_jax.evaluation.confirmer import Confirmer
 from verifai_jax.evaluation.engine import Wanted
 from verifai_jax.evaluation.evaluator import Evaluator
@@ -28,7 +29,7 @@ from verifai_jax.evaluation.kept_work import present
 from verifai_jax.evaluation.raising import Raising
 from verifai_jax.evaluation.verdicts import Verdicts
 from verifai_jax.falsification.columns import import_tables, rows_of, without_failure
-from verifai_jax.falsification.counts import Tally, standing
+from verifai_jax.falsification.counts import Tally
 from verifai_jax.falsification.learning import Batch, Learning
 from verifai_jax.falsification.run_folder import write_checkpoint
 from verifai_jax.falsification.simulations import MEASURED, Simulations
@@ -204,7 +205,7 @@ class Rounds:
         objective = self.learning.objective(verdicts)
         if self._confirmer is not None:
             objective = self._confirm(self._confirmer, columns, objective)
-        stands = standing(columns)
+        stands = Standing.of(verdicts.violated, columns.get("verdict"))
         verdicts = without_failure(verdicts, stands.refused)
         if learns:
             with self._searching():

@@ -242,8 +242,8 @@ class Running:
     def _with_notes_after(self, result: Run) -> Run:
         """Return the result with notes on common properties of all its simulations."""
         rounds, search = self.rounds, self.rounds.search
-        after = notes_after(rounds.table, result.formulas, search, self.warm)
-        if after and rounds.table.counts.violating and is_quick(rounds.problem):
+        after = notes_after(rounds.table, rounds.tally, result.formulas, search, self.warm)
+        if after and rounds.tally.violating and is_quick(rounds.problem):
             row = int(rounds.table.violating.index[0])
             after += note_on_time_0(rounds.problem.formulas, result.replay(row).trace)
         if not rounds.exhausted:

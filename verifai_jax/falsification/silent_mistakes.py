@@ -2,7 +2,7 @@
 
     notes_before(problem, search)                       # nothing compiles
     nominal_note(problem, evaluate)                     # one simulation, on the run's own engine
-    notes_after(run.table, run.formulas, search)
+    notes_after(rounds.table, rounds.tally, run.formulas, search)
 
 Each is a true sentence about the run, for its `notes` and its summary.
 """
@@ -17,6 +17,7 @@ from verifai_jax.core.compute.compilation import Slot
 from verifai_jax.core.values.trace import Trace
 from verifai_jax.evaluation.engine import Engine
 from verifai_jax.evaluation.evaluator import Evaluator
+from verifai_jax.falsification.counts import Tally
 from verifai_jax.falsification.table import ErrorTable
 from verifai_jax.mtl.formula import Formula
 from verifai_jax.mtl.host_values import HostValues
@@ -112,34 +113,36 @@ def _samples(problem: Problem, rows: int) -> int:
 
 
 def notes_after(
-    table: ErrorTable, formulas: Mapping[str, str], search: Search, warm: bool = False
-) -> tuple[str, ...]:
+    table: ErrorTable, tally: Tally, formulas: Mapping[str, str], search: Search,
+    warm: bool = False,
+) -> tuple[str, ...]:  # fmt: skip
     """Return likely mistakes that all simulations of a run show together.
 
     **Arguments:**
     - `table`: the table of the run.
+    - `tally`: the counts over its rows.
     - `formulas`: texts by name.
     - `search`: the search of the run.
     - `warm`: whether the search started from the rows of an earlier run.
     """
-    count = len(table) - table.counts.without_verdict
+    count = len(table) - tally.without_verdict
     if count < ENOUGH or search.origin == "given":
         return ()
-    if table.counts.violating == count:
+    if tally.violating == count:
         if warm:
             return ()
         return (
             f"all {count} simulations with a verdict violate the property: are the formula and "
             "its units right?",
         )
-    if search.samples_prior and table.counts.violating >= NEARLY_ALL * count:
+    if search.samples_prior and tally.violating >= NEARLY_ALL * count:
         return (
-            f"{table.counts.violating} of {count} simulations with a verdict violate the property, "
+            f"{tally.violating} of {count} simulations with a verdict violate the property, "
             "nearly all of the prior: are the formula and its units right?",
         )
     if len(formulas) == 1:
         # The least robustness is known: most tables need not be read for it.
-        ranges = {"the property": _range(table, "rho")} if table.counts.lowest > 0 else {}
+        ranges = {"the property": _range(table, "rho")} if tally.lowest > 0 else {}
     else:
         ranges = {f"formula {name!r}": _range(table, f"rho.{name}") for name in formulas}
     return tuple(note for which, ends in ranges.items() for note in _never_near(which, ends, count))

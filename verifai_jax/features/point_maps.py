@@ -105,12 +105,19 @@ class PointMaps:
     @property
     def feature_form(self) -> dict[str, Any]:
         """Shapes and types of the features of a point, for abstract evaluation."""
-        return jax.eval_shape(self.unflatten, self.point_form)
+        return self.feature_form_in(str(self.point_form.dtype))
 
     def feature_form_in(self, precision: str) -> dict[str, Any]:
         """Return the form of the features in `"float32"` or `"float64"`, whatever JAX's setting."""
-        with in_precision(precision):
-            return jax.eval_shape(self.unflatten, jax.ShapeDtypeStruct((self.dim,), precision))
+        if precision not in self._forms:
+            with in_precision(precision):
+                self._forms[precision] = jax.eval_shape(self.unflatten, self.point_form)
+        return jax.tree.map(lambda form: form, self._forms[precision])
+
+    @cached_property
+    def _forms(self) -> dict[str, dict[str, Any]]:
+        """Forms of the features by precision, each traced once."""
+        return {}
 
     @cached_property
     def columns(self) -> tuple[str, ...]:

@@ -323,6 +323,10 @@ class Problem(InNotebook):
         if trace is None:
             self._check_known()
             return
+        self.programs.get(JUDGED, _settings(), lambda: self._check_judges(trace, features))
+
+    def _check_judges(self, trace: Trace, features: Mapping[str, Any]) -> None:
+        """Trace what judges the simulations, which must give the same program each time."""
 
         def judged(trace: Trace, features: Any) -> Any:
             values = [robustness(f, trace, end=self.end) for f in self.formulas.values()]
@@ -425,6 +429,8 @@ class Problem(InNotebook):
         return "\n".join(lines)
 
 
+JUDGED: Slot[tuple[str, ...], None] = Slot("judged")
+"""That the formulas, the guide and the constraint were checked, by JAX's settings."""
 KEPT: Slot[None, tuple[str, ...]] = Slot("kept")
 """What each call of a problem's system changes, in words."""
 FORM: Slot[None, Trace | None] = Slot("form")
