@@ -87,6 +87,7 @@ thousands in the seconds that gradients take to compile."""
 AMONG = 4
 """Number of best points among which a new one is a gain: those that mutations have as parents."""
 MODELLED = 0.8
+OPENING_ROWS = 20
 PROPOSED = 128
 TAKEN = 32
 """Points remembered as starts and ends of descents; as many as mutations keep to start from."""
@@ -221,7 +222,7 @@ class Portfolio(Search[PortfolioState]):
             else:
                 # That from the middle of the cube goes before all.
                 opening = gradient.starts <= max(OPENING, len(gradient.fresh))
-                opening &= gradient.useless == 0
+                opening &= (gradient.useless == 0) & (state.barren < OPENING_ROWS)
                 if cube.dim < FEW:
                     opening &= state.barren < FEW * cube.dim
                 turn = opening | (credit[GRADIENT] >= 1)
