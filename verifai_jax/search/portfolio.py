@@ -43,7 +43,7 @@ from verifai_jax.search.descent import (
 from verifai_jax.search.gradient import Gradient, GradientState
 from verifai_jax.search.kinds import ENOUGH, Kinds
 from verifai_jax.search.mutation import FEW, Mutation, MutationState
-from verifai_jax.search.surrogate import Surrogate
+from verifai_jax.search.surrogate import CHOICES, MAX_DIM, Surrogate
 from verifai_jax.search.wrapper import Wrapper
 
 GRADIENT, MUTATION, CROSS_ENTROPY, MODEL = range(4)  # numbers of the members
@@ -88,7 +88,6 @@ AMONG = 4
 """Number of best points among which a new one is a gain: those that mutations have as parents."""
 MODELLED = 0.8
 OPENING_ROWS = 20
-PROPOSED = 128
 TAKEN = 32
 """Points remembered as starts and ends of descents; as many as mutations keep to start from."""
 
@@ -162,7 +161,7 @@ class Portfolio(Search[PortfolioState]):
         return np.array(gains, np.float32)
 
     def _models(self, cube: Cube, batch: int) -> bool:
-        return 0 < cube.dim <= 256 and batch <= MANY
+        return 0 < cube.dim <= MAX_DIM and batch <= MANY
 
     def init(self, key: Key[Array, ""], cube: Cube, batch: int) -> PortfolioState:
         keys = jax.random.split(key, 3)
@@ -222,9 +221,8 @@ class Portfolio(Search[PortfolioState]):
             else:
                 # That from the middle of the cube goes before all.
                 opening = gradient.starts <= max(OPENING, len(gradient.fresh))
-                opening &= (gradient.useless == 0) & (state.barren < OPENING_ROWS)
-                if cube.dim < FEW:
-                    opening &= state.barren < FEW * cube.dim
+                opening &= gradient.useless == 0
+                opening &= state.barren < min(OPENING_ROWS, FEW * cube.dim)
                 turn = opening | (credit[GRADIENT] >= 1)
             differentiates = plan.differentiate & turn
             allowed = jnp.where(opening, batch, jnp.floor(credit[GRADIENT]).astype(jnp.int32))
@@ -267,7 +265,7 @@ class Portfolio(Search[PortfolioState]):
         key = jax.random.fold_in(state.key, state.mutation.round)
 
         def propose() -> Float[Array, "batch d"]:
-            others, _ = Mutation().ask(state.mutation._replace(key=key), cube, PROPOSED)
+            others, _ = Mutation().ask(state.mutation._replace(key=key), cube, CHOICES * 2 // 3)
             return model.propose(key, cube, batch, others)
 
         nothing = jnp.full((batch, cube.dim), 0.5, jnp.float32)
@@ -370,11 +368,11 @@ class Portfolio(Search[PortfolioState]):
             model=None if state.model is None else state.model.learned(common.u, common.score),
             # What it gains while it goes first says nothing about what it will.
             gains=jnp.where(
-                state.opening,
+                state.opening | ~known,
                 state.gains,
                 kept * state.gains + jnp.minimum(jnp.sum(is_member & gained[None], axis=1), limits),
             ),
-            costs=jnp.where(state.opening, state.costs, kept * state.costs + spent),
+            costs=jnp.where(state.opening | ~known, state.costs, kept * state.costs + spent),
             # Nobody saves, or owes, more than a few rounds.
             credit=jnp.clip(credit, -4.0 * batch, 4.0 * batch).astype(jnp.float32),
         )
@@ -430,10 +428,9 @@ class Portfolio(Search[PortfolioState]):
         moved = len(cube.continuous) / max(cube.dim, 1)
         rate = rate.astype(jnp.float32).at[GRADIENT].multiply(moved**IN_VAIN)
         descends = state.gradient is not None and not len(cube.discrete)
-        if batch >= FILLED and not (descends or cube.signals):
-            share = prior[MUTATION : CROSS_ENTROPY + 1]
-            both = jnp.sum(rate[MUTATION : CROSS_ENTROPY + 1])
-            rate = rate.at[MUTATION : CROSS_ENTROPY + 1].set(share / np.sum(share) * both)
+        if batch >= FILLED and (state.model is not None or not (descends or cube.signals)):
+            others = prior[MUTATION:]
+            rate = rate.at[MUTATION:].set(others / np.sum(others) * jnp.sum(rate[MUTATION:]))
         if state.gradient is None:
             dead, smallest = jnp.array(True), 0.0
         else:

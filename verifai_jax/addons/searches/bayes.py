@@ -29,7 +29,7 @@ from jaxtyping import Array, Float, Int, Key, UInt32
 
 from verifai_jax.addons.searches.gaussian import Posterior, TrainingData
 from verifai_jax.addons.searches.improvement import APART, PARENTS, already_simulated, improving
-from verifai_jax.search.moves import near_others
+from verifai_jax.addons.searches.moves import near_others
 from verifai_jax.addons.searches.process_data import (
     LARGEST,
     NO_VERDICT,

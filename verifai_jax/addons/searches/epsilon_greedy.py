@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Key, UInt32
 
-from verifai_jax.search.moves import all_or_some, has_fine_cells
+from verifai_jax.addons.searches.moves import all_or_some, has_fine_cells
 from verifai_jax.core.values.cube import Cube
 from verifai_jax.search.base import Asked, Observations, Search, check_options
 from verifai_jax.search.best_points import keep_best

@@ -20,7 +20,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Key
 
 from verifai_jax.addons.searches import trace_model as models
-from verifai_jax.search.moves import near_others
+from verifai_jax.addons.searches.moves import near_others
 from verifai_jax.addons.searches.process_data import snap
 from verifai_jax.addons.searches.trace_form import TraceForm, signals_of
 from verifai_jax.addons.searches.turbo import TuRBO, TuRBOState
