@@ -43,9 +43,10 @@ from verifai_jax.search.descent import (
 from verifai_jax.search.gradient import Gradient, GradientState
 from verifai_jax.search.kinds import ENOUGH, Kinds
 from verifai_jax.search.mutation import FEW, Mutation, MutationState
+from verifai_jax.search.surrogate import CHOICES, MAX_DIM, Surrogate
 from verifai_jax.search.wrapper import Wrapper
 
-GRADIENT, MUTATION, CROSS_ENTROPY = range(3)  # numbers of the members
+GRADIENT, MUTATION, CROSS_ENTROPY, MODEL = range(4)  # numbers of the members
 # The numbers before `PATIENT` were chosen by hand. About halved and doubled they took 0.87 to 1.2
 # times as many simulations on four problems (`search_quality.py constants`); the one that took 0.87
 # took more on others. `PATIENT` was not varied, and what follows says its own.
@@ -85,6 +86,8 @@ MANY = 32
 thousands in the seconds that gradients take to compile."""
 AMONG = 4
 """Number of best points among which a new one is a gain: those that mutations have as parents."""
+MODELLED = 0.8
+OPENING_ROWS = 20
 TAKEN = 32
 """Points remembered as starts and ends of descents; as many as mutations keep to start from."""
 
@@ -94,6 +97,7 @@ class PortfolioState(NamedTuple):
     gradient: GradientState | None
     mutation: MutationState
     cross_entropy: CrossEntropyState
+    model: Surrogate | None
     credit: Float[Array, " members"]  # simulations that each may still spend
     gains: Float[Array, " members"]
     costs: Float[Array, " members"]
@@ -151,7 +155,13 @@ class Portfolio(Search[PortfolioState]):
         descents, others = PRIOR_GAINS
         descents *= min(1.0, cube.dim / FEW)
         fitted = np.clip(batch / FILLED, 0.2, 0.9)
-        return np.array([descents, (1 - fitted) * others, fitted * others], np.float32)
+        modelled = MODELLED if self._models(cube, batch) else 0.0
+        shares = np.array([1 - fitted, fitted])
+        gains = [descents, *((1 - modelled) * others * shares), modelled * others]
+        return np.array(gains, np.float32)
+
+    def _models(self, cube: Cube, batch: int) -> bool:
+        return 0 < cube.dim <= MAX_DIM and batch <= MANY
 
     def init(self, key: Key[Array, ""], cube: Cube, batch: int) -> PortfolioState:
         keys = jax.random.split(key, 3)
@@ -163,10 +173,11 @@ class Portfolio(Search[PortfolioState]):
             gradient=gradient,
             mutation=Mutation().init(keys[1], cube, batch),
             cross_entropy=self._cross_entropy(batch).init(keys[2], cube, batch),
-            credit=jnp.zeros(3, jnp.float32),
+            model=Surrogate.nothing(cube.dim) if self._models(cube, batch) else None,
+            credit=jnp.zeros(4, jnp.float32),
             gains=jnp.asarray(self._prior_gains(cube, batch)),
-            costs=jnp.full(3, PRIOR_COSTS, jnp.float32),
-            rows=jnp.zeros(3, jnp.int32),
+            costs=jnp.full(4, PRIOR_COSTS, jnp.float32),
+            rows=jnp.zeros(4, jnp.int32),
             differentiates=jnp.array(False),
             opening=jnp.array(False),
             taken=jnp.full((TAKEN, cube.dim), jnp.inf, jnp.float32),
@@ -211,8 +222,7 @@ class Portfolio(Search[PortfolioState]):
                 # That from the middle of the cube goes before all.
                 opening = gradient.starts <= max(OPENING, len(gradient.fresh))
                 opening &= gradient.useless == 0
-                if cube.dim < FEW:
-                    opening &= state.barren < FEW * cube.dim
+                opening &= state.barren < min(OPENING_ROWS, FEW * cube.dim)
                 turn = opening | (credit[GRADIENT] >= 1)
             differentiates = plan.differentiate & turn
             allowed = jnp.where(opening, batch, jnp.floor(credit[GRADIENT]).astype(jnp.int32))
@@ -222,24 +232,44 @@ class Portfolio(Search[PortfolioState]):
         others = jnp.where(differentiates, 0, batch - descents)
         draws = jnp.minimum(jnp.floor(credit[CROSS_ENTROPY]).astype(jnp.int32), others)
         draws = jnp.maximum(draws, 0)
-        rows = jnp.stack([descents, others - draws, draws]).astype(jnp.int32)
+        # What no other takes is of the models, or of mutations where there are none.
+        rest = others - draws
+        mutations = jnp.clip(jnp.floor(credit[MUTATION]).astype(jnp.int32), 0, rest)
+        mutations = rest if before.model is None else mutations
+        rows = jnp.stack([descents, mutations, draws, rest - mutations]).astype(jnp.int32)
         member = self._members(rows, batch)[:, None]
         # The last of a batch of cross-entropy explore, which mutations do already.
         drawn = jnp.roll(drawn, batch - draws, axis=0)
         u = jnp.where(
             member == GRADIENT, points, jnp.where(member == CROSS_ENTROPY, drawn, mutated)
         )
+        if before.model is not None:
+            u = jnp.where(member == MODEL, self._modelled(before, cube, batch, rows[MODEL]), u)
         state = state._replace(rows=rows, differentiates=differentiates, opening=opening)
         if before.interior is None:
             return u, state
         points, descents = propose(before.interior, cube, batch)
         # At their turn the others have not been asked.
         none = before._replace(
-            rows=jnp.zeros(3, jnp.int32), differentiates=jnp.array(True), opening=jnp.array(False),
+            rows=jnp.zeros(4, jnp.int32), differentiates=jnp.array(True), opening=jnp.array(False),
             interior=descents,
         )  # fmt: skip
         state = choose(descents.turn, none, state._replace(interior=descents))
         return jnp.where(descents.turn, points, u), state
+
+    def _modelled(
+        self, state: PortfolioState, cube: Cube, batch: int, rows: Int[Array, ""]
+    ) -> Float[Array, "batch d"]:
+        model = state.model
+        assert model is not None
+        key = jax.random.fold_in(state.key, state.mutation.round)
+
+        def propose() -> Float[Array, "batch d"]:
+            others, _ = Mutation().ask(state.mutation._replace(key=key), cube, CHOICES * 2 // 3)
+            return model.propose(key, cube, batch, others)
+
+        nothing = jnp.full((batch, cube.dim), 0.5, jnp.float32)
+        return jax.lax.cond(rows > 0, propose, lambda: nothing)
 
     def plan(self, state: PortfolioState, cube: Cube, batch: int) -> Plan:
         if state.gradient is None:
@@ -295,11 +325,13 @@ class Portfolio(Search[PortfolioState]):
             return points[order], score[order]
 
         mutation, fitted, zero = state.mutation, state.cross_entropy, jnp.int32(0)
+        model = None if state.model is None else Surrogate(*others(*state.model))
         points, score = others(mutation.points, mutation.score)
         elite, level = others(fitted.elite, fitted.score)
         left = state._replace(
             mutation=mutation._replace(points=points, score=score, verdicts=zero, stale=zero),
             cross_entropy=fitted._replace(elite=elite, score=level, stale=zero),
+            model=model,
         )
         return choose(jnp.any(new), left, state)._replace(kinds=kinds), common
 
@@ -317,7 +349,7 @@ class Portfolio(Search[PortfolioState]):
             limit = jnp.where(member == GRADIENT, state.mutation.score[0], limit)
         gained = known & ((common.score < limit) | (common.score == 0)) & common.usable
         proposed = jnp.arange(batch) < jnp.sum(state.rows)
-        is_member = (member[None] == jnp.arange(3)[:, None]) & proposed[None]
+        is_member = (member[None] == jnp.arange(4)[:, None]) & proposed[None]
         spent = jnp.sum(is_member, axis=1) * jnp.where(state.differentiates, 2.0, 1.0)
         total = jnp.sum(spent)
         kept = DISCOUNT**total
@@ -327,19 +359,20 @@ class Portfolio(Search[PortfolioState]):
         mutation = Mutation().tell(state.mutation, cube, common)
         # Boxes of several sizes around a point are one gain.
         descents = batch if state.gradient is None else len(state.gradient.fresh)
-        limits = np.array([descents, batch, batch])
+        limits = np.array([descents, batch, batch, batch])
         # Mutations begin when enough is explored, whatever descents have seen.
         descended = jnp.sum(common.usable & is_member[GRADIENT]).astype(jnp.int32)
         state = state._replace(
             mutation=mutation._replace(verdicts=jnp.maximum(mutation.verdicts - descended, 0)),
             cross_entropy=self._cross_entropy(batch).tell(state.cross_entropy, cube, common),
+            model=None if state.model is None else state.model.learned(common.u, common.score),
             # What it gains while it goes first says nothing about what it will.
             gains=jnp.where(
-                state.opening,
+                state.opening | ~known,
                 state.gains,
                 kept * state.gains + jnp.minimum(jnp.sum(is_member & gained[None], axis=1), limits),
             ),
-            costs=jnp.where(state.opening, state.costs, kept * state.costs + spent),
+            costs=jnp.where(state.opening | ~known, state.costs, kept * state.costs + spent),
             # Nobody saves, or owes, more than a few rounds.
             credit=jnp.clip(credit, -4.0 * batch, 4.0 * batch).astype(jnp.float32),
         )
@@ -380,7 +413,9 @@ class Portfolio(Search[PortfolioState]):
         if gradient is not None:
             gradient = self._gradient(cube).warm_start(gradient, cube, common)
         ce = self._cross_entropy(len(observations.rho))
+        model = None if state.model is None else state.model.learned(common.u, common.score)
         return state._replace(
+            model=model,
             gradient=gradient,
             mutation=Mutation().tell(state.mutation, cube, common),
             cross_entropy=ce.tell(state.cross_entropy, cube, common),
@@ -393,24 +428,25 @@ class Portfolio(Search[PortfolioState]):
         moved = len(cube.continuous) / max(cube.dim, 1)
         rate = rate.astype(jnp.float32).at[GRADIENT].multiply(moved**IN_VAIN)
         descends = state.gradient is not None and not len(cube.discrete)
-        if batch >= FILLED and not (descends or cube.signals):
-            mutated, fitted = prior[MUTATION:] / np.sum(prior[MUTATION:])
-            both = rate[MUTATION] + rate[CROSS_ENTROPY]
-            rate = jnp.stack([rate[GRADIENT], mutated * both, fitted * both])
+        if batch >= FILLED and (state.model is not None or not (descends or cube.signals)):
+            others = prior[MUTATION:]
+            rate = rate.at[MUTATION:].set(others / np.sum(others) * jnp.sum(rate[MUTATION:]))
         if state.gradient is None:
             dead, smallest = jnp.array(True), 0.0
         else:
             dead = state.gradient.useless >= 2
             smallest = jnp.where(dead, 0.02, MIN_SHARE)
         rate = rate.at[GRADIENT].multiply(jnp.where(dead, 0.0, 1.0))
-        min_share = jnp.full(3, MIN_SHARE, jnp.float32).at[GRADIENT].set(smallest)
+        min_share = jnp.full(4, MIN_SHARE, jnp.float32).at[GRADIENT].set(smallest)
+        if state.model is None:
+            rate, min_share = rate.at[MODEL].set(0.0), min_share.at[MODEL].set(0.0)
         share = rate / jnp.maximum(jnp.sum(rate), 1e-9)
         share = jnp.maximum(share, min_share)
         return (share / jnp.sum(share)).astype(jnp.float32)
 
     def _members(self, rows: Int[Array, " members"], batch: int) -> Int[Array, " batch"]:
         row = jnp.arange(batch)
-        return (row >= rows[0]).astype(jnp.int32) + (row >= rows[0] + rows[1])
+        return jnp.sum(row[:, None] >= jnp.cumsum(rows[:-1]), axis=1).astype(jnp.int32)
 
 
 @dataclass(frozen=True)
