@@ -24,10 +24,10 @@ import jax.numpy as jnp
 import numpy as np
 from jax.typing import DTypeLike
 
+from verifai_jax.addons.verification.sets.layers import SLACK, Common, picked, summed
+
 Reals = np.ndarray
 """Numbers of double precision, `[boxes, *shape]`; `[1, *shape]` if they are those of all boxes."""
-SLACK = 2.0**-45
-"""Share of a number by which a result is widened for the rounding of its own bounds."""
 
 
 class Rounding(NamedTuple):
@@ -47,7 +47,7 @@ def rounding(dtype: DTypeLike) -> Rounding:
 
 
 class Frame(NamedTuple):
-    """Symbols in addition to those of the features: of a step of a loop, or of a network layer.
+    """Symbols in addition to those of the features: of a step of a loop.
 
     - `number`: a number greater than those of earlier frames.
     - `first`, `stop`: the range of its symbols among all.
@@ -58,7 +58,6 @@ class Frame(NamedTuple):
     first: int
     stop: int
     outer: "Frame | None" = None
-    of_layer: bool = False
 
 
 class Form:
@@ -69,20 +68,24 @@ class Form:
     - `size`: a bound on the absolute value.
     - `low`, `high`: an additional interval; None without one.
     - `frame`: the frame of the symbols that are not features; None if there are none.
+    - `common`: the parts of the radius that are those of layers; None if it has none.
     - `dtype`: the type in which the simulation computes it.
     """
 
     __slots__ = (
-        "_bounds", "_spread", "centre", "dtype", "frame", "high", "low", "radius", "size", "slopes",
+        "_bounds", "_spread", "centre", "common", "dtype", "frame", "high", "low", "radius", "size",
+        "slopes",
     )  # fmt: skip
 
     def __init__(
         self, centre: Reals, slopes: Reals | None, radius: Reals, size: Reals, dtype: np.dtype,
         low: Reals | None = None, high: Reals | None = None, frame: Frame | None = None,
+        common: Common | None = None,
     ) -> None:  # fmt: skip
         self.centre, self.slopes, self.radius, self.size = centre, slopes, radius, size
         self.dtype, self.low, self.high = dtype, low, high
         self.frame = frame if slopes is not None else None
+        self.common = common if slopes is not None else None
         self._bounds: tuple[Reals, Reals] | None = None
         self._spread: Reals | None = None
 
@@ -148,23 +151,27 @@ class Form:
 
     def moved(self, move: Callable[[np.ndarray, int], np.ndarray]) -> "Form":
         """Return the numbers rearranged by `move(array, leading)`."""
+        common = self.common
+        if common is not None:
+            numbers = np.arange(int(np.prod(self.shape))).reshape(1, *self.shape)
+            common = picked(common, move(common.own, 1), move(numbers, 1).ravel())
         return Form(
             move(self.centre, 1), None if self.slopes is None else move(self.slopes, 2),
             move(self.radius, 1), move(self.size, 1), self.dtype,
             None if self.low is None else move(self.low, 1),
-            None if self.high is None else move(self.high, 1), self.frame,
+            None if self.high is None else move(self.high, 1), self.frame, common,
         )  # fmt: skip
 
     def of_type(self, dtype: np.dtype) -> "Form":
         """Return the same numbers in another type that represents them exactly."""
-        ends = self.low, self.high
-        return Form(self.centre, self.slopes, self.radius, self.size, dtype, *ends, self.frame)
+        rest = self.low, self.high, self.frame, self.common
+        return Form(self.centre, self.slopes, self.radius, self.size, dtype, *rest)
 
     def forget(self, where: np.ndarray) -> None:
         """Make the set unbounded at some numbers."""
         if not np.any(where):
             return
-        self._bounds = self._spread = None
+        self._bounds = self._spread = self.common = None
         for name, value in (
             ("centre", 0.0), ("slopes", 0.0), ("radius", np.inf), ("size", np.inf),
             ("low", -np.inf), ("high", np.inf),
@@ -315,6 +322,7 @@ def add(a: Form, b: Form, sign: float = 1.0) -> Form:
     centre = a.centre + b.centre if sign > 0 else a.centre - b.centre
     form = rounded(centre, slopes, a.radius + b.radius, a.size + b.size, a.dtype, None, frame)
     form.low, form.high = ends or (None, None)
+    form.common = summed(form.radius, [(a, 1.0), (b, sign)])
     return form
 
 
@@ -339,7 +347,8 @@ def negative(a: Form) -> Form:
     slopes = None if a.slopes is None else -a.slopes
     low = None if a.high is None else -a.high
     high = None if a.low is None else -a.low
-    return Form(-a.centre, slopes, a.radius, a.size, a.dtype, low, high, a.frame)
+    common = summed(a.radius, [(a, -1.0)])
+    return Form(-a.centre, slopes, a.radius, a.size, a.dtype, low, high, a.frame, common)
 
 
 def is_point(a: Form) -> bool:
@@ -359,9 +368,11 @@ def scaled(a: Form, by: Reals) -> Form:
     exact = bool(((np.frexp(scale)[0] == 0.5) & (scale >= 1) | (scale == 0)).all())
     if slopes is None and ends is not None and np.isfinite(size).all():
         return spanned(*ends, a.dtype, 0 if exact else 1)
-    return rounded(
+    form = rounded(
         a.centre * by, slopes, a.radius * scale, size, a.dtype, ends, a.frame, exact=exact
     )
+    form.common = summed(form.radius, [(a, by)])
+    return form
 
 
 def interval_product(low: Reals, high: Reals, first: Reals, last: Reals) -> tuple[Reals, Reals]:

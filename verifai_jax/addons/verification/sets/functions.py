@@ -27,6 +27,7 @@ from verifai_jax.addons.verification.sets.form import (
     scaled,
     unknown,
 )
+from verifai_jax.addons.verification.sets.layers import summed
 
 Criticals = Callable[[Reals, Reals, Reals], Sequence[Reals]]
 """A function `(slope, low, high)` to points between which `f(x) - slope * x` is monotone."""
@@ -89,6 +90,7 @@ class Function(NamedTuple):
         if self.range != (-np.inf, np.inf) and form.low is not None and form.high is not None:
             form.low = np.where(outside, form.low, np.clip(form.low, *self.range))
             form.high = np.where(outside, form.high, np.clip(form.high, *self.range))
+        form.common = summed(form.radius, [(x, slope)])
         return form
 
     def _points(self, slope: Reals, low: Reals, high: Reals) -> list[Reals]:
@@ -263,6 +265,10 @@ def _widened(x: Form, units: float) -> Form:
 
 def greater(a: Form, b: Form) -> Form:
     """Return the maximum: `b + max(a - b, 0)`, which preserves common dependencies."""
+    for one, other in ((a, b), (b, a)):
+        if is_point(other) and one.slopes is not None and np.isfinite(other.centre).all():
+            knot = other.centre
+            return Function(lambda x: np.maximum(x, knot), lambda *_: [knot], units=0.0)(one)
     (low, high), (first, last) = a.bounds(), b.bounds()
     nothing = unknown(low, high) | unknown(first, last)
     ours, theirs = (low >= last) & ~nothing, (first >= high) & ~nothing

@@ -9,10 +9,12 @@ import numpy as np
 
 from verifai_jax.addons.verification.sets.arrays import add_up, times_each, together
 from verifai_jax.addons.verification.sets.form import Form, is_point, rounded
-from verifai_jax.addons.verification.sets.frames import FEW, of_layer
 from verifai_jax.addons.verification.sets.interpreter import Interpreter, Value, constant, rule
+from verifai_jax.addons.verification.sets.layers import SLACK, refined, through_layer
 from verifai_jax.addons.verification.sets.whole import Whole
 
+WORTH = 0.002
+"""Share of the spread from which on what is not linear is worth remembering."""
 Axes = tuple[Sequence[int], Sequence[int]]
 
 
@@ -42,12 +44,7 @@ def _contracted(
         if isinstance(form, Whole) or isinstance(other, Whole):
             continue
         if is_point(other) and np.isfinite(other.centre).all():
-            text = f"...{own},{its}->...{result}"
-            few = count < FEW
-            if not few:
-                form = of_layer(form, t.features)
-            sums = _times(form, other.centre[0], text, dtype, terms)
-            return sums.unframed(lambda frame: not frame.of_layer) if few else sums
+            return _times(form, other.centre[0], f"...{own},{its}->...{result}", dtype, terms)
     axes = result + "".join(joint[1])
 
     def spread(name: str, array: np.ndarray, lead: int) -> np.ndarray:
@@ -70,10 +67,20 @@ def _times(a: Form, numbers: np.ndarray, names: str, dtype: np.dtype, terms: int
     times = functools.partial(np.einsum, names, optimize=["einsum_path", (0, 1)])
     slopes = None if a.slopes is None else times(a.slopes, numbers)
     size = np.abs(numbers)
-    return rounded(
-        times(a.centre, numbers), slopes, times(a.radius, size), times(a.size, size), dtype,
+    radius = times(a.radius, size)
+    sums = rounded(
+        times(a.centre, numbers), slopes, radius, times(a.size, size), dtype,
         None, a.frame, units=terms + 1.0,
     )  # fmt: skip
+    if slopes is None or a.radius.sum() <= WORTH * a.spread.sum():
+        return sums
+    units = np.eye(a.centre[0].size)
+    matrix = times(units.reshape(len(units), *a.shape), numbers).reshape(len(units), -1)
+    own = sums.radius - radius + SLACK * radius
+    sums.common = through_layer(matrix, a.radius, a.common, own)
+    if sums.common is not None:
+        sums.radius = refined(sums.radius, sums.common)
+    return sums
 
 
 @rule("conv_general_dilated")
@@ -107,8 +114,6 @@ def _convolution(t: Interpreter, step: Any, inputs: list[Value]) -> list[Value]:
     several = () if parts == 1 else (parts,)
     numbers = numbers.reshape(*several, -1, int(np.prod([inner, *taps], dtype=np.int64)))
     flat = image.moved(lambda array, lead: array.reshape(*array.shape[:lead], -1))
-    if isinstance(flat, Form) and isinstance(kernel, Form) and is_point(kernel):
-        flat = of_layer(flat, t.features)
     zero = constant(np.zeros(1), flat.dtype)
     flat = together([flat, zero], lambda arrays, lead: np.concatenate(arrays, lead))
     picked = flat.moved(lambda array, lead: array[..., numbers])
