@@ -49,6 +49,7 @@ class Function(NamedTuple):
     - `domain`: the interval outside of which it is NaN.
     - `units`, `tiny`: its error in units of rounding, and of the smallest normal number.
     - `range`: an interval that contains all results, including rounding.
+    - `rises`: whether its greatest values are at the ends of intervals.
     """
 
     value: Callable[[Reals], Reals]
@@ -57,19 +58,22 @@ class Function(NamedTuple):
     units: float = UNITS
     tiny: float = TINY
     range: tuple[float, float] = (-np.inf, np.inf)
+    rises: bool = False
 
     def __call__(self, x: Form) -> Form:
         """Return the set of its values on a set."""
         (low, high), (first, last) = x.bounds(), self.domain
         outside = unknown(low, high) | (low < first) | (high > last) | (low > high)
         inside_low, inside_high = np.clip(low, first, last), np.clip(high, first, last)
-        points = self._points(np.zeros_like(low), inside_low, inside_high)
+        points = [inside_low, inside_high]
         values = [self.value(point) for point in points]
-        lowest, highest = _extremes(values)
         slope = (values[1] - values[0]) / (inside_high - inside_low)
         slope = np.where(np.isfinite(slope) & (inside_high > inside_low), slope, 0.0)
-        points = self._points(slope, inside_low, inside_high)
-        below, above = _extremes([self.value(point) - slope * point for point in points])
+        extremes = [] if self.rises else self._points(np.zeros_like(low), *points)
+        lowest, highest = _extremes([*values, *(self.value(point) for point in extremes)])
+        inner = self._points(slope, *points)
+        points, values = points + inner, values + [self.value(point) for point in inner]
+        below, above = _extremes([v - slope * p for v, p in zip(values, points, strict=True)])
         usable = np.isfinite(below) & np.isfinite(above) & np.isfinite(x.spread) & ~outside
         slope = np.where(usable, slope, 0.0)
         size = np.maximum(np.abs(lowest), np.abs(highest))
@@ -95,8 +99,7 @@ class Function(NamedTuple):
 
     def _points(self, slope: Reals, low: Reals, high: Reals) -> list[Reals]:
         inner = self.criticals(slope, low, high)
-        inner = [np.clip(np.where(np.isnan(x), low, x), low, high) for x in inner]
-        return [low, high, *inner]
+        return [np.clip(np.where(np.isnan(x), low, x), low, high) for x in inner]
 
 
 def _extremes(values: Sequence[Reals]) -> tuple[Reals, Reals]:
@@ -189,21 +192,23 @@ def _of_power(n: int) -> Function:
 
 
 FUNCTIONS: dict[str, Callable[[Form], Form]] = {
-    "exp": Function(np.exp, _single(np.log), range=_POSITIVE),
+    "exp": Function(np.exp, _single(np.log), range=_POSITIVE, rises=True),
     "exp2": Function(np.exp2, _single(lambda a: np.log2(a / np.log(2))), units=140.0,
                      range=_POSITIVE),
     "expm1": Function(np.expm1, _single(np.log), range=(-1.0, np.inf)),
-    "log": Function(np.log, _single(lambda a: 1 / a), _POSITIVE),
+    "log": Function(np.log, _single(lambda a: 1 / a), _POSITIVE, rises=True),
     "log1p": Function(np.log1p, _single(lambda a: 1 / a - 1), (-1.0, np.inf)),
-    "sqrt": Function(np.sqrt, _single(lambda a: 1 / (4 * a * a)), _POSITIVE, range=_POSITIVE),
+    "sqrt": Function(np.sqrt, _single(lambda a: 1 / (4 * a * a)), _POSITIVE, range=_POSITIVE,
+                     rises=True),
     # Of zero, which may be a negative one, it is an infinity of either sign.
     "rsqrt": lambda x: _but(_RSQRT(x), x.bounds()[0] > 0),
     # Of numbers that are not normal it has the size of the root of the smallest that is.
     "cbrt": Function(np.cbrt, _even(lambda a: (3 * a) ** -1.5), units=40.0, tiny=1e26),
-    "tanh": Function(np.tanh, _even(lambda a: np.arccosh(1 / np.sqrt(a))), range=(-1.0, 1.0)),
+    "tanh": Function(np.tanh, _even(lambda a: np.arccosh(1 / np.sqrt(a))), range=(-1.0, 1.0),
+                     rises=True),
     "logistic": Function(special.expit, _even(
         lambda a: special.logit(a / (0.5 + np.sqrt(np.maximum(0.25 - a, 0))))
-    ), range=(0.0, 1.0)),
+    ), range=(0.0, 1.0), rises=True),
     "sinh": Function(np.sinh, _even(np.arccosh), units=60.0),
     "cosh": Function(np.cosh, _single(np.arcsinh), units=60.0, range=(1.0, np.inf)),
     "asinh": Function(np.arcsinh, _even(lambda a: np.sqrt(1 / a**2 - 1))),
@@ -211,8 +216,8 @@ FUNCTIONS: dict[str, Callable[[Form], Form]] = {
     "atanh": Function(np.arctanh, _even(lambda a: np.sqrt(1 - 1 / a)), (-1.0, 1.0)),
     "asin": Function(np.arcsin, _even(lambda a: np.sqrt(1 - 1 / a**2)), (-1.0, 1.0)),
     "acos": Function(np.arccos, _even(lambda a: np.sqrt(1 - 1 / a**2)), (-1.0, 1.0)),
-    "atan": Function(np.arctan, _even(lambda a: np.sqrt(1 / a - 1))),
-    "erf": Function(special.erf, _even(lambda a: np.sqrt(-np.log(a * _ROOT_PI / 2)))),
+    "atan": Function(np.arctan, _even(lambda a: np.sqrt(1 / a - 1)), rises=True),
+    "erf": Function(special.erf, _even(lambda a: np.sqrt(-np.log(a * _ROOT_PI / 2))), rises=True),
     "erfc": Function(special.erfc, _even(lambda a: np.sqrt(-np.log(-a * _ROOT_PI / 2)))),
     "abs": Function(np.abs, _single(np.zeros_like), units=0.0, range=_POSITIVE),
     "square": _of_power(2),
@@ -226,7 +231,14 @@ FUNCTIONS: dict[str, Callable[[Form], Form]] = {
     "sign": _whole(np.sign), "neg": negative,
 }  # fmt: skip
 """Functions of one number, by the name of JAX's primitive."""
-_RAMP = Function(lambda x: np.maximum(x, 0.0), _single(np.zeros_like), units=0.0, range=_POSITIVE)
+
+
+def _above(knot: Reals | float) -> Function:
+    """Return the maximum with a number."""
+    return Function(lambda x: np.maximum(x, knot), lambda *_: [knot], units=0.0, rises=True)
+
+
+_RAMP = _above(0.0)._replace(range=_POSITIVE)
 
 
 def nearest(x: Form, to_even: bool) -> Form:
@@ -267,8 +279,7 @@ def greater(a: Form, b: Form) -> Form:
     """Return the maximum: `b + max(a - b, 0)`, which preserves common dependencies."""
     for one, other in ((a, b), (b, a)):
         if is_point(other) and one.slopes is not None and np.isfinite(other.centre).all():
-            knot = other.centre
-            return Function(lambda x: np.maximum(x, knot), lambda *_: [knot], units=0.0)(one)
+            return _above(other.centre)(one)
     (low, high), (first, last) = a.bounds(), b.bounds()
     nothing = unknown(low, high) | unknown(first, last)
     ours, theirs = (low >= last) & ~nothing, (first >= high) & ~nothing

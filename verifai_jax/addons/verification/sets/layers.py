@@ -1,6 +1,6 @@
 """What units of layers have in common, so that sums of them do not add up what cancels.
 
-What a linear function of units misses is a symbol of each unit: where the next layer adds units up,
+What a linear function of units misses is a symbol of each unit: where a later layer adds units up,
 symbols may cancel. They are not kept as arrays of symbols. Each form remembers the layers it came
 through, and `refined` goes back through them from a result, as backward linear relaxation does.
 
@@ -16,24 +16,27 @@ import numpy as np
 
 SLACK = 2.0**-45
 """Share of a number by which a result is widened for the rounding of its own bounds."""
-LARGEST = 2**21
-"""Numbers of a matrix at most for its layer to be remembered."""
-DEEPEST = 16
-"""Layers that are remembered one after another at most."""
+LARGEST, DEEPEST = 2**21, 16
+"""Numbers of a matrix at most, and layers one after another, that are remembered."""
+FEW, FINE_BOXES = 8, 64
+"""Results that go back at most if there are more boxes than these: those are small, and lose less
+by what they do not know of layers between than they would take time."""
 TOGETHER = 32
 """Boxes that go back at once: their rows then fit the cache."""
 _NUMBERS = itertools.count(1)
 
 
 class Layer(NamedTuple):
-    """Sums `units @ matrix`, whose units vary by `own` and by what is common to them.
+    """Sums `units @ matrix`, whose units vary by `own` each and by layers before them.
 
     - `matrix`: `[units, sums]`; `own`: `[boxes, units]`.
+    - `gross`: how much the sums vary if nothing cancels in this layer, `[boxes, sums]`.
     """
 
     number: int
     matrix: np.ndarray
     own: np.ndarray
+    gross: np.ndarray
     before: "tuple[Term, ...]"
     depth: int
 
@@ -53,22 +56,24 @@ class Common(NamedTuple):
 
 
 def through_layer(
-    matrix: np.ndarray, radius: np.ndarray, common: Common | None, own: np.ndarray
+    matrix: np.ndarray, units: Any, own: np.ndarray, gross: np.ndarray
 ) -> Common | None:
-    """Return the parts of the radius of `units @ matrix`, which itself is off by `own`."""
-    terms = () if common is None else common.terms
+    """Return the parts of the radius of sums of a form's `units`, which are off by `own`."""
+    terms = () if units.common is None else units.common.terms
     depth = 1 + max((term.layer.depth for term in terms), default=0)
     if matrix.size > LARGEST or depth > DEEPEST:
         return None
-    units = radius if common is None else common.own
-    units = units.reshape(len(units), -1)
-    layer = Layer(next(_NUMBERS), matrix, units, terms, depth)
+    each = units.radius if units.common is None else units.common.own
+    each = each.reshape(len(each), -1)
+    for before, scale in terms:
+        # The rounding of rows that go back through it.
+        each = each + len(matrix) * SLACK * np.abs(scale) * before.gross
+    gross = gross.reshape(len(gross), -1)
+    layer = Layer(next(_NUMBERS), matrix, each, gross, terms, depth)
     return Common(own, (Term(layer, np.ones((1, matrix.shape[1]))),))
 
 
-def summed(
-    radius: np.ndarray, parts: Sequence[tuple[Any, np.ndarray | float]]
-) -> Common | None:
+def summed(radius: np.ndarray, parts: Sequence[tuple[Any, np.ndarray | float]]) -> Common | None:
     """Return the parts of a radius of a sum of forms times factors; what else it has is its own."""
     if all(form.common is None for form, _ in parts):
         return None
@@ -88,49 +93,51 @@ def summed(
 
 def picked(common: Common, own: np.ndarray, numbers: np.ndarray) -> Common | None:
     """Return the parts for elements with these numbers, `own` rearranged already."""
-    count = common.terms[0].layer.matrix.shape[1]
+    count = common.terms[0].scale.shape[1]
     if len(numbers) == count and (numbers == np.arange(count)).all():
         return Common(own, common.terms)
-    if any(len(t.layer.matrix) * len(numbers) > LARGEST for t in common.terms):
+    if any(len(term.layer.matrix) * len(numbers) > LARGEST for term in common.terms):
         return None
-    return Common(own, tuple(
-        Term(layer._replace(number=next(_NUMBERS), matrix=layer.matrix[:, numbers]),
-             scale[:, numbers])
-        for layer, scale in common.terms
-    ))  # fmt: skip
+    terms = list[Term]()
+    for layer, scale in common.terms:
+        matrix, gross = layer.matrix[:, numbers], layer.gross[:, numbers]
+        part = layer._replace(number=next(_NUMBERS), matrix=matrix, gross=gross)
+        terms.append(Term(part, scale[:, numbers]))
+    return Common(own, tuple(terms))
 
 
 def refined(radius: np.ndarray, common: Common) -> np.ndarray:
     """Return a radius of which what layers have in common counts once."""
-    flat = radius.reshape(len(radius), -1)
-    own = common.own.reshape(len(common.own), -1)
-    boxes = max(len(flat), *(len(t.scale) for t in _all(common.terms)),
-                *(len(t.layer.own) for t in _all(common.terms)))  # fmt: skip
+    flat, own = (each.reshape(len(each), -1) for each in (radius, common.own))
+    if not any(term.layer.before for term in common.terms):
+        return radius
+    boxes = max(len(each) for each in (flat, *_arrays(common.terms)))
+    if boxes > FINE_BOXES and flat.shape[1] > FEW:
+        return radius
     blocks = [slice(i, i + TOGETHER) for i in range(0, boxes, TOGETHER)]
-    sums = np.concatenate([_back(common.terms, block, flat.shape[1]) for block in blocks])
-    # Rounding of the rows is relative to what they are without cancellation, as the radius is.
-    found = own + sums * (1 + SLACK) + SLACK * flat
+    sums = np.concatenate([_back(common.terms, block) for block in blocks])
+    found = own + sums + SLACK * flat
     return np.where(found < flat, found, flat).reshape(-1, *radius.shape[1:])
 
 
-def _all(terms: Sequence[Term]) -> list[Term]:
-    return [each for t in terms for each in (t, *_all(t.layer.before))]
+def _arrays(terms: Sequence[Term]) -> list[np.ndarray]:
+    return [array for layer, scale in terms for array in (scale, layer.own, *_arrays(layer.before))]
 
 
-def _back(terms: Sequence[Term], block: slice, count: int) -> np.ndarray:
-    """Return how much layers add to each of so many results, `[boxes, results]`."""
+def _back(terms: Sequence[Term], block: slice) -> np.ndarray:
+    """Return how much layers add to each result of some boxes."""
 
     def cut(array: np.ndarray) -> np.ndarray:
         return array if len(array) == 1 else array[block]
 
-    left = {t.layer.number: (t.layer, cut(t.scale)[:, :, None] * t.layer.matrix.T) for t in terms}
-    total: np.ndarray | float = 0.0
+    left = {layer.number: (layer, cut(s)[:, :, None] * layer.matrix.T) for layer, s in terms}
+    total = np.zeros((1, 1))
     while left:
         # Layers have greater numbers than those they came through.
         layer, rows = left.pop(max(left))
-        total = total + (np.abs(rows) @ cut(layer.own)[:, :, None])[:, :, 0]
+        total = total + (np.abs(rows) @ cut(layer.own)[:, :, None])[:, :, 0] * (1 + SLACK)
         for before, scale in layer.before:
             more = (rows * cut(scale)[:, None]) @ before.matrix.T
             old = left.get(before.number)
             left[before.number] = before, more if old is None else old[1] + more
-    return np.asarray(total)
+    return total

@@ -39,7 +39,7 @@ def _contracted(
     result = "".join(joint[0]) + free[0] + free[1]
     sizes = {c: n for name, v in zip(names, (a, b), strict=True)
              for c, n in zip(name, v.shape, strict=True)}  # fmt: skip
-    count, terms = (math.prod(sizes[c] for c in each) for each in (result, joint[1]))
+    terms = math.prod(sizes[c] for c in joint[1])
     for form, other, (own, its) in ((a, b, names), (b, a, names[::-1])):
         if isinstance(form, Whole) or isinstance(other, Whole):
             continue
@@ -65,21 +65,22 @@ def _contracted(
 def _times(a: Form, numbers: np.ndarray, names: str, dtype: np.dtype, terms: int) -> Form:
     """Return sums of so many products of a form and exact numbers, as einsum names them."""
     times = functools.partial(np.einsum, names, optimize=["einsum_path", (0, 1)])
-    slopes = None if a.slopes is None else times(a.slopes, numbers)
-    size = np.abs(numbers)
-    radius = times(a.radius, size)
-    sums = rounded(
-        times(a.centre, numbers), slopes, radius, times(a.size, size), dtype,
-        None, a.frame, units=terms + 1.0,
-    )  # fmt: skip
-    if slopes is None or a.radius.sum() <= WORTH * a.spread.sum():
-        return sums
-    units = np.eye(a.centre[0].size)
-    matrix = times(units.reshape(len(units), *a.shape), numbers).reshape(len(units), -1)
-    own = sums.radius - radius + SLACK * radius
-    sums.common = through_layer(matrix, a.radius, a.common, own)
-    if sums.common is not None:
-        sums.radius = refined(sums.radius, sums.common)
+    shape = np.broadcast_shapes(a.centre.shape, a.radius.shape, a.size.shape)
+    centre, radius, size = (np.broadcast_to(x, shape) for x in (a.centre, a.radius, a.size))
+    gross, size = times(np.stack([radius, size]), np.abs(numbers))
+    if a.slopes is None:
+        return rounded(times(centre, numbers), None, gross, size, dtype, units=terms + 1.0)
+    shape = np.broadcast_shapes((1, *shape), a.slopes.shape)
+    parts = [np.broadcast_to(x, (len(x), *shape[1:])) for x in (a.slopes, centre[None])]
+    linear = times(np.concatenate(parts), numbers)
+    sums = rounded(linear[-1], linear[:-1], gross, size, dtype, None, a.frame, units=terms + 1.0)
+    if a.radius.sum() > WORTH * a.spread.sum():
+        one = np.eye(math.prod(a.shape))
+        matrix = times(one.reshape(len(one), *a.shape), numbers).reshape(len(one), -1)
+        own = sums.radius - gross * (1 - SLACK)
+        sums.common = through_layer(matrix, a, own, gross)
+        if sums.common is not None:
+            sums.radius = refined(sums.radius, sums.common)
     return sums
 
 
