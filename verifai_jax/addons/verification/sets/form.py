@@ -237,7 +237,8 @@ def rounded(
 
 def widened(low: Reals, high: Reals, share: float, smallest: float) -> tuple[Reals, Reals]:
     """Return ends that are apart by a share of each more; what is tiny keeps its sign."""
-    low, high = low - share * np.abs(low), high + share * np.abs(high)
+    if share:
+        low, high = low - share * np.abs(low), high + share * np.abs(high)
     if np.abs(low).min(initial=1.0) < smallest:
         low = np.where(np.abs(low) < smallest, np.where(low < 0, -smallest, 0.0), low)
     if np.abs(high).min(initial=1.0) < smallest:

@@ -63,37 +63,39 @@ class Function(NamedTuple):
     def __call__(self, x: Form) -> Form:
         """Return the set of its values on a set."""
         (low, high), (first, last) = x.bounds(), self.domain
-        outside = unknown(low, high) | (low < first) | (high > last) | (low > high)
-        inside_low, inside_high = np.clip(low, first, last), np.clip(high, first, last)
-        points = [inside_low, inside_high]
+        outside, points = unknown(low, high) | (low > high), [low, high]
+        if np.isfinite(first) or np.isfinite(last):
+            outside |= (low < first) | (high > last)
+            points = [np.clip(low, first, last), np.clip(high, first, last)]
         values = [self.value(point) for point in points]
-        slope = (values[1] - values[0]) / (inside_high - inside_low)
-        slope = np.where(np.isfinite(slope) & (inside_high > inside_low), slope, 0.0)
+        slope = (values[1] - values[0]) / (points[1] - points[0])
+        slope = np.where(np.isfinite(slope), slope, 0.0)
         extremes = [] if self.rises else self._points(np.zeros_like(low), *points)
         lowest, highest = _extremes([*values, *(self.value(point) for point in extremes)])
         inner = self._points(slope, *points)
         points, values = points + inner, values + [self.value(point) for point in inner]
         below, above = _extremes([v - slope * p for v, p in zip(values, points, strict=True)])
-        usable = np.isfinite(below) & np.isfinite(above) & np.isfinite(x.spread) & ~outside
-        slope = np.where(usable, slope, 0.0)
         size = np.maximum(np.abs(lowest), np.abs(highest))
-        offset = np.where(usable, below / 2 + above / 2, 0.0)
-        error = np.where(usable, above / 2 - below / 2, np.inf)
+        offset, error, radius = below / 2 + above / 2, above / 2 - below / 2, x.radius
+        usable = np.isfinite(offset) & np.isfinite(x.spread) & ~outside
+        if not usable.all():
+            slope, offset, radius = (np.where(usable, a, 0.0) for a in (slope, offset, radius))
+            error, size = np.where(usable, error, np.inf), np.where(outside, np.inf, size)
+            lowest = np.where(outside, -np.inf, lowest)
+            highest = np.where(outside, np.inf, highest)
         # Numbers of double precision between which the slope and the offset are rounded.
         error = error + 4 * SLACK * (np.abs(offset) + np.abs(slope) * (x.size + np.abs(x.centre)))
-        radius = np.where(usable, np.abs(slope) * x.radius, 0.0) + error
-        ends = np.where(outside, -np.inf, lowest), np.where(outside, np.inf, highest)
+        ends, radius = (lowest, highest), np.abs(slope) * radius + error
         if self.units:
             tiny = self.tiny * rounding(x.dtype).smallest
             ends, radius = (ends[0] - tiny, ends[1] + tiny), radius + tiny
-        size = np.where(outside, np.inf, size)
         slopes = None if x.slopes is None else x.slopes * slope
         form = rounded(
             slope * x.centre + offset, slopes, radius, size, x.dtype, ends, x.frame, self.units
         )
         if self.range != (-np.inf, np.inf) and form.low is not None and form.high is not None:
-            form.low = np.where(outside, form.low, np.clip(form.low, *self.range))
-            form.high = np.where(outside, form.high, np.clip(form.high, *self.range))
+            form.low = np.where(outside, -np.inf, np.clip(form.low, *self.range))
+            form.high = np.where(outside, np.inf, np.clip(form.high, *self.range))
         form.common = summed(form.radius, [(x, slope)])
         return form
 
