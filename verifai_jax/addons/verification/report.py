@@ -50,14 +50,12 @@ def verification_page(result: Verification, about: About, problem: Problem | Non
         some = f"about {shares[1]}" if result.cut.any() else shares[1]
         found = f"Boxes of {some} {of} contain a point that fails for certain."
         claims.append(Claim("C3", found, (boxes,), rests))
+    named = [
+        ("proved: no point fails", proved), ("broken: a point fails for certain", broken),
+        ("of these, every point fails", result.throughout), ("undecided", undecided),
+    ]  # fmt: skip
     parts: list[tuple[str, Child, Child]] = [
-        (name, format_percent(part.mass), format_percent(part.volume))
-        for name, part in (
-            ("proved: no point fails", proved),
-            ("broken: a point fails for certain", broken),
-            ("of these, every point fails", result.throughout),
-            ("undecided", undecided),
-        )
+        (name, format_percent(part.mass), format_percent(part.volume)) for name, part in named
     ]
     columns = ["verdict", "mass", "lowest", "highest", "failure_bound"]
     ends, heads = (
@@ -91,11 +89,9 @@ def verification_page(result: Verification, about: About, problem: Problem | Non
             ("Which assumption is under what is proved?", verified, "limits"),
         ],
         asked=[paragraph(f"Where no {what} of {result.name} fails, for certain."), *asked],
-        found=[
-            table(["part", "of the prior", "of the volume"], parts),
-            picture(drawn, "The parts, two coordinates at a time"),
-            table([*columns, *heads], rows, largest_boxes),
-        ],
+        found=[table(["part", "of the prior", "of the volume"], parts),
+               picture(drawn, "The parts, two coordinates at a time"),
+               table([*columns, *heads], rows, largest_boxes)],
         limits=[open_part, verified, SAMPLED, MODEL, *tails, *result.notes],
         reproduce=[preformatted(python), paragraph(f"Made with verifai_jax {result.version}.")],
     )  # fmt: skip

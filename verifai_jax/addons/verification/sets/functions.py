@@ -272,6 +272,8 @@ def _widened(x: Form, units: float) -> Form:
     """Widen a result by more units of rounding: XLA may divide by multiplying."""
     margin = rounding(x.dtype).unit * units
     x.radius = x.radius + margin * x.size
+    if x.common is not None:
+        x.common = x.common._replace(own=x.common.own + margin * x.size)
     if x.low is not None and x.high is not None:
         x.low, x.high = x.low - margin * np.abs(x.low), x.high + margin * np.abs(x.high)
     return x
