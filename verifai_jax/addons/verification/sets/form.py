@@ -47,17 +47,10 @@ def rounding(dtype: DTypeLike) -> Rounding:
 
 
 class Frame(NamedTuple):
-    """Symbols in addition to those of the features: of a step of a loop.
-
-    - `number`: a number greater than those of earlier frames.
-    - `first`, `stop`: the range of its symbols among all.
-    - `outer`: the enclosing frame, whose symbols come before; None if only features do.
-    """
+    """Symbols of a step of a loop, after so many of features; later frames have greater numbers."""
 
     number: int
     first: int
-    stop: int
-    outer: "Frame | None" = None
 
 
 class Form:
@@ -153,8 +146,9 @@ class Form:
         """Return the numbers rearranged by `move(array, leading)`."""
         common = self.common
         if common is not None:
-            numbers = np.arange(int(np.prod(self.shape))).reshape(1, *self.shape)
-            common = picked(common, move(common.own, 1), move(numbers, 1).ravel())
+            numbers = np.arange(self.centre[0].size)
+            moved = move(numbers.reshape(1, *self.shape), 1).ravel()
+            common = picked(common, move(common.own, 1), moved, len(numbers))
         return Form(
             move(self.centre, 1), None if self.slopes is None else move(self.slopes, 2),
             move(self.radius, 1), move(self.size, 1), self.dtype,
@@ -179,20 +173,13 @@ class Form:
             if getattr(self, name) is not None:
                 setattr(self, name, np.where(where, value, getattr(self, name)))
 
-    def unframed(self, keep: Callable[[Frame], bool] = lambda frame: False) -> "Form":
-        """Return a set without the symbols of inner frames, which are added to the radius.
-
-        **Arguments:**
-        - `keep`: a frame to keep, with all frames outside of it; none when left out.
-        """
-        frame, count = self.frame, None
-        while frame is not None and not keep(frame):
-            frame, count = frame.outer, frame.first
-        if count is None or self.slopes is None:
+    def unframed(self, keep: Frame | None = None) -> "Form":
+        """Return a set whose symbols of a frame are added to the radius, but for that to keep."""
+        if self.frame is None or self.frame == keep or self.slopes is None:
             return self
+        count, ends = self.frame.first, (self.low, self.high)
         radius = self.radius + np.abs(self.slopes[count:]).sum(0) + SLACK * self.size
-        ends = self.low, self.high
-        return Form(self.centre, self.slopes[:count], radius, self.size, self.dtype, *ends, frame)
+        return Form(self.centre, self.slopes[:count], radius, self.size, self.dtype, *ends)
 
 
 def overflown(low: Reals, high: Reals, highest: float) -> tuple[Reals, Reals]:
@@ -262,11 +249,7 @@ def spanned(low: Reals, high: Reals, dtype: np.dtype, units: float = 1.0) -> For
 def alike(forms: Sequence[Form]) -> tuple[list[Form], Frame | None, int]:
     """Return forms converted to a common frame, and the number of its symbols."""
     frame = max((f.frame for f in forms if f.frame is not None), default=None)
-    around, known = frame, set[int]()
-    while around is not None:
-        known.add(around.number)
-        around = around.outer
-    forms = [f.unframed(lambda each: each.number in known) for f in forms]
+    forms = [f.unframed(frame) for f in forms]
     return forms, frame, max((0 if f.slopes is None else len(f.slopes) for f in forms), default=0)
 
 

@@ -62,7 +62,7 @@ def framed(carry: Sequence[Form | Whole], boxes: int, features: int) -> list[For
     new = np.concatenate([slopes[:features], sides.transpose(2, 0, 1)])
     radius = np.where(bounded, rest + 4 * SLACK * np.abs(noise).sum(2), np.inf)
     size = np.minimum(size, np.maximum(*map(np.abs, ends)))
-    frame = Frame(next(_NUMBERS), features, len(new))
+    frame = Frame(next(_NUMBERS), features)
     for i, value, stop, each in zip(kept, kept.values(), np.cumsum(sizes), sizes, strict=True):
         part, shape = slice(stop - each, stop), (boxes, *value.shape)
         pieces = [array[:, part].reshape(shape) for array in (centre, radius, size, *ends)]

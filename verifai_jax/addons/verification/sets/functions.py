@@ -200,17 +200,16 @@ FUNCTIONS: dict[str, Callable[[Form], Form]] = {
     "expm1": Function(np.expm1, _single(np.log), range=(-1.0, np.inf)),
     "log": Function(np.log, _single(lambda a: 1 / a), _POSITIVE, rises=True),
     "log1p": Function(np.log1p, _single(lambda a: 1 / a - 1), (-1.0, np.inf)),
-    "sqrt": Function(np.sqrt, _single(lambda a: 1 / (4 * a * a)), _POSITIVE, range=_POSITIVE,
-                     rises=True),
+    "sqrt": Function(np.sqrt, _single(lambda a: 1 / (4 * a * a)), _POSITIVE, range=_POSITIVE),
     # Of zero, which may be a negative one, it is an infinity of either sign.
     "rsqrt": lambda x: _but(_RSQRT(x), x.bounds()[0] > 0),
     # Of numbers that are not normal it has the size of the root of the smallest that is.
     "cbrt": Function(np.cbrt, _even(lambda a: (3 * a) ** -1.5), units=40.0, tiny=1e26),
     "tanh": Function(np.tanh, _even(lambda a: np.arccosh(1 / np.sqrt(a))), range=(-1.0, 1.0),
                      rises=True),
-    "logistic": Function(special.expit, _even(
-        lambda a: special.logit(a / (0.5 + np.sqrt(np.maximum(0.25 - a, 0))))
-    ), range=(0.0, 1.0), rises=True),
+    "logistic": Function(special.expit, _even(lambda a: special.logit(a / (
+        0.5 + np.sqrt(np.maximum(0.25 - a, 0))
+    ))), range=(0.0, 1.0), rises=True),
     "sinh": Function(np.sinh, _even(np.arccosh), units=60.0),
     "cosh": Function(np.cosh, _single(np.arcsinh), units=60.0, range=(1.0, np.inf)),
     "asinh": Function(np.arcsinh, _even(lambda a: np.sqrt(1 / a**2 - 1))),
@@ -228,9 +227,7 @@ FUNCTIONS: dict[str, Callable[[Form], Form]] = {
         x - np.pi / 2 for x in _periodic(np.arccos, 2 * np.pi)(a, low + np.pi / 2, high + np.pi / 2)
     ]),
     "tan": _tangent,
-    "floor": _whole(np.floor),
-    "ceil": _whole(np.ceil),
-    "sign": _whole(np.sign), "neg": negative,
+    "floor": _whole(np.floor), "ceil": _whole(np.ceil), "sign": _whole(np.sign), "neg": negative,
 }  # fmt: skip
 """Functions of one number, by the name of JAX's primitive."""
 
@@ -291,16 +288,13 @@ def greater(a: Form, b: Form) -> Form:
     ends = np.where(nothing, -np.inf, lowest), np.where(nothing, np.inf, top)
     if a.slopes is None and b.slopes is None:
         return Form.between(*ends, a.dtype)
-    mixed = ~(ours | theirs)
-    if not np.any(mixed):
-        return chosen([ours, theirs], [a, b])
     ramp = add(b, _RAMP(difference(a, b)))
     size = np.maximum(np.abs(ends[0]), np.abs(ends[1]))
     both = rounded(
         ramp.centre, ramp.slopes, ramp.radius, np.broadcast_to(size, ramp.size.shape),
         a.dtype, ends, ramp.frame, exact=True,
     )  # fmt: skip
-    return chosen([ours, theirs, mixed], [a, b, both])
+    return chosen([ours, theirs, ~(ours | theirs)], [a, b, both])
 
 
 def lesser(a: Form, b: Form) -> Form:

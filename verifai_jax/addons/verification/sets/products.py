@@ -44,9 +44,8 @@ def _contracted(
              for c, n in zip(name, v.shape, strict=True)}  # fmt: skip
     terms = math.prod(sizes[c] for c in joint[1])
     for form, other, (own, its) in ((a, b, names), (b, a, names[::-1])):
-        if isinstance(form, Whole) or isinstance(other, Whole):
-            continue
-        if is_point(other) and np.isfinite(other.centre).all():
+        real = isinstance(form, Form) and isinstance(other, Form)
+        if real and is_point(other) and np.isfinite(other.centre).all():
             return _times(form, other.centre[0], f"...{own},{its}->...{result}", dtype, terms)
     axes = result + "".join(joint[1])
 
@@ -80,8 +79,9 @@ def _times(a: Form, numbers: np.ndarray, names: str, dtype: np.dtype, terms: int
     if a.radius.sum() > WORTH * a.spread.sum():
         one = np.eye(math.prod(a.shape))
         matrix = times(one.reshape(len(one), *a.shape), numbers).reshape(len(one), -1)
-        own = sums.radius - gross * (1 - SLACK)
-        sums.common = through_layer(matrix, a, own, gross)
+        # Their rounding, and that of factors that go back through the matrix.
+        own = sums.radius - gross * (1 - (terms + 1) * SLACK)
+        sums.common = through_layer(matrix, a, own)
         if sums.common is not None:
             sums.radius = refined(sums.radius, sums.common)
     return sums
