@@ -87,28 +87,17 @@ def verify(
     work.sample(0 if continuous else samples)
     seconds = time.perf_counter() - started
     return Verification(
-        **described(problem),
-        columns=problem.space.coordinates,
-        boxes=work.boxes,
+        **described(problem), columns=problem.space.coordinates, boxes=work.boxes,
         shares=enclosure.ranges.shares(work.boxes.low),
         upper_shares=enclosure.ranges.shares(work.boxes.high),
-        scales=tuple(enclosure.ranges.scales()),
-        constraint=problem.space.where is not None,
-        tails={
-            name: 2 * OUTERMOST * sum(domain.tailed)
-            for name, domain in problem.space.domains.items() if any(domain.tailed)
-        },
-        precision=precision,
-        confidence=confidence,
+        scales=tuple(enclosure.ranges.scales()), constraint=problem.space.where is not None,
+        tails={name: 2 * OUTERMOST * sum(domain.tailed)
+               for name, domain in problem.space.domains.items() if any(domain.tailed)},
+        precision=precision, confidence=confidence, continuous=continuous, version=__version__,
         looked_at=work.looked_at + (0 if before is None else before.looked_at),
         simulations=work.evaluator.simulations + (0 if before is None else before.simulations),
-        seconds=seconds + (0 if before is None else before.seconds),
-        stopped=stopped,
-        notes=(
-            *([f"{work.contradicted} {CONTRADICTED}"] if work.contradicted else []),
-            *formula_notes(problem),
-        ),
-        continuous=continuous,
-        version=__version__,
+        seconds=seconds + (0 if before is None else before.seconds), stopped=stopped,
+        notes=(*([f"{work.contradicted} {CONTRADICTED}"] if work.contradicted else []),
+               *formula_notes(problem)),
         sources=sources.to_json(),
     )  # fmt: skip

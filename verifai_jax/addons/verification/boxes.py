@@ -89,12 +89,6 @@ class Boxes:
     def __getitem__(self, rows: Int[np.ndarray, " m"] | Bool[np.ndarray, " n"]) -> "Boxes":
         return Boxes(*(getattr(self, field.name)[rows] for field in fields(self)))
 
-    def within(self, low: Float[np.ndarray, " dim"], high: Float[np.ndarray, " dim"]) -> "Boxes":
-        """Return the intersections of the boxes with the box between two corners, as open boxes."""
-        lower, upper = np.maximum(self.low, low), np.minimum(self.high, high)
-        some = (lower < upper).all(axis=1)
-        return Boxes.between(lower[some], upper[some], self.inside[some])
-
     def with_more(self, others: "Boxes") -> "Boxes":
         """Return these boxes followed by others."""
         pairs = ((getattr(self, f.name), getattr(others, f.name)) for f in fields(self))

@@ -34,10 +34,8 @@ def between_samples(problem: Problem) -> Problem:
             f"{problem.name!r} is a {type(loop).__name__}. Leave it out to verify the system in "
             "discrete time"
         )
-    for given, name in (
-        (loop.switches, "switches"), (loop.terminate, "terminate"), (loop.exact_step, "exact_step"),
-    ):  # fmt: skip
-        if given:
+    for name in ("switches", "terminate", "exact_step"):
+        if getattr(loop, name):
             raise ProblemError(
                 "continuous=True needs a plant that moves continuously for the whole duration; "
                 f"the system of problem {problem.name!r} has {name}=. Leave one of the two out"

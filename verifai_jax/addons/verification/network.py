@@ -99,9 +99,8 @@ def verify_network(
         if point is not None:
             # The box is rounded outwards by a unit of single precision, but not the counterexample.
             exact = cases[number]
-            inputs = np.clip(
-                np.asarray(_inputs(case, varying, point), float), exact.low, exact.high
-            )
+            inputs = np.asarray(_inputs(case, varying, point), float)
+            inputs = np.clip(inputs, exact.low, exact.high)
             outputs = jnp.ravel(act(jnp.asarray(inputs, jnp.float32)))
             if float(exact.margin(jnp.asarray(inputs, jnp.float32), outputs)) <= 0:
                 share = sum(masses) / len(cases)

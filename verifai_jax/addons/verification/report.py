@@ -14,10 +14,8 @@ from verifai_jax.addons.verification.result import Verification
 from verifai_jax.core.messages.text import format_percent
 from verifai_jax.problem.problem import Problem
 
-SAMPLED = (
-    "The bound on what is undecided rests on independent samples of it, and holds whenever one "
-    "stops."
-)
+SAMPLED = ("The bound on what is undecided rests on independent samples of it, and holds whenever "
+           "one stops.")  # fmt: skip
 """Assumption of the upper bound of the failure probability."""
 MAX_BOXES = 40
 """Boxes of a table, the most probable of each verdict."""
@@ -50,30 +48,22 @@ def verification_page(result: Verification, about: About, problem: Problem | Non
         some = f"about {shares[1]}" if result.cut.any() else shares[1]
         found = f"Boxes of {some} {of} contain a point that fails for certain."
         claims.append(Claim("C3", found, (boxes,), rests))
+    named = [
+        ("proved: no point fails", proved), ("broken: a point fails for certain", broken),
+        ("of these, every point fails", result.throughout), ("undecided", undecided),
+    ]  # fmt: skip
     parts: list[tuple[str, Child, Child]] = [
-        (name, format_percent(part.mass), format_percent(part.volume))
-        for name, part in (
-            ("proved: no point fails", proved),
-            ("broken: a point fails for certain", broken),
-            ("of these, every point fails", result.throughout),
-            ("undecided", undecided),
-        )
+        (name, format_percent(part.mass), format_percent(part.volume)) for name, part in named
     ]
     columns = ["verdict", "mass", "lowest", "highest", "failure_bound"]
-    ends, heads = (
-        [f"{name} {end}" for name in names for end in ("from", "to")]
-        for names in (result.columns, [with_unit(name, about.units) for name in result.columns])
-    )
+    both = result.columns, [with_unit(name, about.units) for name in result.columns]
+    ends, heads = ([f"{n} {end}" for n in names for end in ("from", "to")] for names in both)
     largest: Any = result.table.groupby("verdict", sort=False).head(MAX_BOXES // 3)
-    rows = [
-        [f"{v:z.4g}" if isinstance(v, float) else str(v) for v in values]
-        for values in largest[[*columns, *ends]].itertuples(index=False)
-    ]
+    cells = largest[[*columns, *ends]].itertuples(index=False)
+    rows = [[f"{v:z.4g}" if isinstance(v, float) else str(v) for v in each] for each in cells]
     largest_boxes = "The most probable boxes, between these values of the features."
-    open_part = (
-        f"{shares[2]} {of} is undecided; at most {format_percent(result.failure_bound)} of it "
-        f"fails, at {sure}."
-    )
+    failing = format_percent(result.failure_bound)
+    open_part = f"{shares[2]} {of} is undecided; at most {failing} of it fails, at {sure}."
     python = (
         f"vj.verify(problem, boxes={result.looked_at}, precision={result.precision!r}, "
         f"confidence={result.confidence}, continuous={result.continuous})"
@@ -84,18 +74,14 @@ def verification_page(result: Verification, about: About, problem: Problem | Non
         result.name, "evidence report on a verification", headline,
         "fails" if broken.mass else "open", claims, model,
         about=subject_of("verification", problem, model, result.formulas),
-        answers=[
-            ("What was the prior?", "see what was asked", "asked"),
-            ("How many boxes are there?", boxes, "found"),
-            ("How probable is a failure?", f"{bounds}, at {sure}", "found"),
-            ("Which assumption is under what is proved?", verified, "limits"),
-        ],
+        answers=[("What was the prior?", "see what was asked", "asked"),
+                 ("How many boxes are there?", boxes, "found"),
+                 ("How probable is a failure?", f"{bounds}, at {sure}", "found"),
+                 ("Which assumption is under what is proved?", verified, "limits")],
         asked=[paragraph(f"Where no {what} of {result.name} fails, for certain."), *asked],
-        found=[
-            table(["part", "of the prior", "of the volume"], parts),
-            picture(drawn, "The parts, two coordinates at a time"),
-            table([*columns, *heads], rows, largest_boxes),
-        ],
+        found=[table(["part", "of the prior", "of the volume"], parts),
+               picture(drawn, "The parts, two coordinates at a time"),
+               table([*columns, *heads], rows, largest_boxes)],
         limits=[open_part, verified, SAMPLED, MODEL, *tails, *result.notes],
         reproduce=[preformatted(python), paragraph(f"Made with verifai_jax {result.version}.")],
     )  # fmt: skip

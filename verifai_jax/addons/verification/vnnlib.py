@@ -25,8 +25,6 @@ CASES = 4096
 """Alternatives of a property, multiplied out, at most."""
 MAX_DEPTH = 100
 """Brackets within brackets, at most."""
-
-
 Linear: TypeAlias = dict[str, float]
 """A sum: the factors of variables, which are `X_0`, `Y_0` and so on, and a number, that of `""`."""
 

@@ -1,6 +1,7 @@
 """Networks of several layers: bounds are as tight as those of backward linear relaxation."""
 
 import itertools
+from fractions import Fraction
 
 import jax
 import jax.numpy as jnp
@@ -118,3 +119,97 @@ def test_a_network_in_a_loop_leaves_the_symbols_of_the_loop_as_they_are():
     least, greatest = bounds(turns, low, low + 0.02)
     growth = np.sqrt(1.01) ** 200
     assert np.all(greatest - least < 0.02 * np.sqrt(2) * growth + 0.15)
+
+
+def zonotope(layers, low, high):
+    """Return bounds of a ReLU network over one box, with an array of all symbols."""
+    centre, symbols = (low + high) / 2, np.diag((high - low) / 2)
+    for k, (matrix, shift) in enumerate(layers):
+        centre, symbols = centre @ matrix + shift, symbols @ matrix
+        spread = np.abs(symbols).sum(0)
+        least, greatest = centre - spread, centre + spread
+        if k + 1 == len(layers):
+            return least, greatest
+        slope = np.clip(greatest, 0, None) / np.where(greatest > 0, greatest - least, 1)
+        slope = np.where(least >= 0, 1, slope)
+        half = np.where((least < 0) & (greatest > 0), -slope * least / 2, 0)
+        centre, symbols = slope * centre + half, np.vstack([symbols * slope, np.diag(half)])
+
+
+def test_the_way_back_gives_what_all_symbols_give():
+    layers, random = weights(5), np.random.default_rng(5)
+    low = random.uniform(-1, 0.8, (4, 3))
+    least, greatest = bounds(lambda x: network(layers, x), low, low + 0.3)
+    for i in range(4):
+        bottom, top = zonotope(layers, low[i], low[i] + 0.3)
+        np.testing.assert_allclose(greatest[i], top, atol=2e-3 * (top - bottom).max())
+        np.testing.assert_allclose(least[i], bottom, atol=2e-3 * (top - bottom).max())
+
+
+def test_many_boxes_go_back_from_few_results_alone():
+    """What is not known of the layers between costs less than a tenth in small boxes."""
+    layers, random = weights(1), np.random.default_rng(1)
+    low = random.uniform(-1, 0.8, (90, 3))
+    function = lambda x: network(layers, x)[:2]  # noqa: E731
+    many = bounds(function, low, low + 0.02)
+    few = [bounds(function, low[i : i + 30], low[i : i + 30] + 0.02) for i in (0, 30, 60)]
+    few = np.concatenate([least for least, _ in few]), np.concatenate([most for _, most in few])
+    assert np.mean((many[1] - many[0]) / (few[1] - few[0])) < 1.1
+
+
+def winding(random):
+    """Return a network whose units are scaled, divided, cut, turned around, and skip layers."""
+    matrices = [jnp.asarray(random.normal(size=s) / np.sqrt(s[0]), jnp.float32)
+                for s in ((3, 16), (16, 16), (16, 12), (12, 12), (12, 2))]  # fmt: skip
+
+    def function(x):
+        a = jax.nn.relu(x @ matrices[0]) - 0.2
+        b = jnp.tanh(a @ matrices[1]) / 3 + 0.5 * a
+        c = jnp.clip(-(b.reshape(4, 4).T.ravel() @ matrices[2]), -1.5, 1.0)
+        d = c[::-1] - jax.nn.sigmoid(c @ matrices[3])
+        return jnp.concatenate([d @ matrices[4], (2 * d[2:4] - c[:2]) ** 2])
+
+    return function
+
+
+@pytest.mark.thorough
+def test_networks_that_wind_contain_their_values():
+    for seed in range(4):
+        random = np.random.default_rng(seed)
+        function = winding(random)
+        low = random.uniform(-1, 0.8, (70 if seed == 3 else 8, 3))
+        high = low + random.uniform(0.001, 0.6, (len(low), 1))
+        least, greatest = bounds(function, low, high)
+        points = low[:, None] + random.random((len(low), 1000, 3)) * (high - low)[:, None]
+        seen = np.asarray(jax.vmap(jax.vmap(function))(np.float32(points)), float)
+        assert np.all(least <= seen.min(1))
+        assert np.all(greatest >= seen.max(1))
+
+
+def test_the_way_back_covers_its_own_rounding():
+    """Exact values, of weights of which large ones cancel, in double precision."""
+    random = np.random.default_rng(3)
+    layers = [random.integers(-4, 5, s) for s in ((2, 8), (8, 8), (8, 8), (8, 1))]
+    for k in (1, 2, 3):
+        layers[k][1::2] = -layers[k][::2]
+        layers[k] = layers[k] * 2**20 + random.integers(-1, 2, layers[k].shape)
+    fractions = [np.array(matrix.tolist(), object) for matrix in layers]
+    with jax.enable_x64(True):
+        arrays = [jnp.asarray(matrix, jnp.float64) for matrix in layers]
+
+        def function(x):
+            for matrix in arrays[:-1]:
+                x = jax.nn.relu(x @ matrix)
+            return x @ arrays[-1]
+
+        low = random.uniform(-1, 1, (30, 2))
+        program = jax.make_jaxpr(function)(jax.ShapeDtypeStruct((2,), np.float64))
+        leaf = Form.leaf(low, low + 1e-9, np.eye(2), np.dtype(np.float64))
+        (result,) = Interpreter(30, 2)(program, [leaf])
+    least, greatest = as_form(result).bounds()
+    for share in (0.0, 0.3, 1.0):
+        for i, point in enumerate(low + share * 1e-9):
+            x = np.array([Fraction(min(p, q)) for p, q in zip(point, low[i] + 1e-9, strict=True)])
+            for matrix in fractions[:-1]:
+                x = np.maximum(x @ matrix, Fraction(0))
+            assert Fraction(least[i, 0]) <= (x @ fractions[-1])[0] <= Fraction(greatest[i, 0])

@@ -25,28 +25,12 @@ Move = Callable[[Params, np.ndarray, int], np.ndarray]
 """A function of the parameters of a step, an array and the number of its leading axes."""
 
 
-def _moving(*names: str) -> Callable[[Move], Move]:
-    """Register a function that moves the elements of one array, behind leading axes."""
-
-    def register(function: Move) -> Move:
-        def apply(t: Interpreter, step: Equation, inputs: list[Value]) -> list[Value]:
-            params = {**step.params, "to": step.outvars[0].aval.shape}
-            return [inputs[0].moved(lambda array, lead: function(params, array, lead))]
-
-        rule(*names)(apply)
-        return function
-
-    return register
-
-
-@_moving("reshape", "squeeze", "expand_dims")
 def _reshape(params: Params, array: np.ndarray, lead: int) -> np.ndarray:
     if params.get("dimensions") is not None and "new_sizes" in params:
         raise NotImplementedError("a reshape that permutes")
     return array.reshape(*array.shape[:lead], *params["to"])
 
 
-@_moving("broadcast_in_dim")
 def _broadcast(params: Params, array: np.ndarray, lead: int) -> np.ndarray:
     shape = [1] * len(params["to"])
     for axis, size in zip(params["broadcast_dimensions"], array.shape[lead:], strict=True):
@@ -55,26 +39,26 @@ def _broadcast(params: Params, array: np.ndarray, lead: int) -> np.ndarray:
     return np.broadcast_to(array.reshape(*front, *shape), (*front, *params["to"]))
 
 
-@_moving("transpose")
-def _transpose(params: Params, array: np.ndarray, lead: int) -> np.ndarray:
-    return np.transpose(array, (*range(lead), *(axis + lead for axis in params["permutation"])))
-
-
-@_moving("rev")
-def _reverse(params: Params, array: np.ndarray, lead: int) -> np.ndarray:
-    return np.flip(array, tuple(axis + lead for axis in params["dimensions"]))
-
-
-@_moving("slice")
 def _slice(params: Params, array: np.ndarray, lead: int) -> np.ndarray:
     strides = params["strides"] or (1,) * len(params["to"])
     cells = zip(params["start_indices"], params["limit_indices"], strides, strict=True)
     return array[(..., *(slice(*each) for each in cells))]
 
 
-@_moving("tile")
-def _tile(params: Params, array: np.ndarray, lead: int) -> np.ndarray:
-    return np.tile(array, (*(1,) * lead, *params["reps"]))
+_MOVES: dict[str, Move] = {
+    "reshape": _reshape, "squeeze": _reshape, "expand_dims": _reshape, "slice": _slice,
+    "broadcast_in_dim": _broadcast,
+    "transpose": lambda p, a, lead: a.transpose(*range(lead), *np.add(p["permutation"], lead)),
+    "rev": lambda p, a, lead: np.flip(a, tuple(axis + lead for axis in p["dimensions"])),
+    "tile": lambda p, a, lead: np.tile(a, (*(1,) * lead, *p["reps"])),
+}  # fmt: skip
+"""What primitives do with the elements of one array, behind leading axes."""
+
+
+@rule(*_MOVES)
+def _moved(t: Interpreter, step: Equation, inputs: list[Value]) -> list[Value]:
+    params, move = {**step.params, "to": step.outvars[0].aval.shape}, _MOVES[step.primitive.name]
+    return [inputs[0].moved(lambda array, lead: move(params, array, lead))]
 
 
 def together(values: Sequence[Value], join: Callable[[list[np.ndarray], int], np.ndarray]) -> Value:
@@ -124,9 +108,6 @@ def _split(t: Interpreter, step: Equation, inputs: list[Value]) -> list[Value]:
 
     ranges = [range(end - size, end) for size, end in zip(sizes, np.cumsum(sizes), strict=True)]
     return [value.moved(functools.partial(cut, cells)) for cells in ranges]
-
-
-# Sums, products, extremes
 
 
 @rule("reduce_sum")

@@ -57,10 +57,8 @@ def _cond(t: Interpreter, step: Equation, inputs: list[Value]) -> list[Value]:
     branches, (which, *operands) = step.params["branches"], inputs
     index = as_whole(which)
     if index.dtype != bool:
-        index = Whole(
-            np.clip(index.low, 0, len(branches) - 1), np.clip(index.high, 0, len(branches) - 1),
-            index.dtype,
-        )  # fmt: skip
+        ends = (np.clip(end, 0, len(branches) - 1) for end in (index.low, index.high))
+        index = Whole(*ends, index.dtype)
     first, last = int(index.low.min()), int(index.high.max())
     results = [t.closed(branches[number], operands) for number in range(first, last + 1)]
     if len(results) == 1:
@@ -74,28 +72,21 @@ def _while(t: Interpreter, step: Equation, inputs: list[Value]) -> list[Value]:
     params = step.params
     before, inside = params["cond_nconsts"], params["body_nconsts"]
     asked, shared = inputs[:before], inputs[before : before + inside]
-    state, ended = inputs[before + inside :], None
-    reached: list[Value] = list(state)
+    reached = state = inputs[before + inside :]
+    certain = started = np.zeros(1, bool)
     condition: Program = params["cond_jaxpr"]
     for _ in range(PASSES):
         (goes_on,) = t.closed(condition, [*asked, *state])
         on = as_whole(goes_on)
         # Boxes that may end here, and have not ended for certain before.
-        ends = ~on.true if ended is None else ~on.true & ~ended[0]
-        if ended is None:
-            reached, certain = list(state), np.zeros(ends.shape, bool)
-            started = ends
-        else:
-            certain, started = ended
+        ends, old = ~on.true & ~certain, reached
+        reached = state
+        if started.any():
             which = Whole((ends & ~started).astype(np.int64), ends.astype(np.int64),
                           np.dtype(bool))  # fmt: skip
-            reached = [
-                select(of_rank(which, old), [old, new])
-                for old, new in zip(reached, state, strict=True)
-            ]
-            started = started | ends
-        certain = certain | on.false
-        ended = certain, started
+            pairs = zip(old, state, strict=True)
+            reached = [select(of_rank(which, a), [a, b]) for a, b in pairs]
+        started, certain = started | ends, certain | on.false
         if np.all(certain):
             return reached
         state = t.closed(params["body_jaxpr"], [*shared, *state])

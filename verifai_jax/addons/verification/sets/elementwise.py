@@ -55,7 +55,9 @@ def _two(t: Interpreter, step: Equation, inputs: list[Value]) -> list[Value]:
         return [_OF_TWO[name](a, b)]
     b = as_whole(b)
     # What all boxes share may wrap around, as the machine's numbers do.
-    if name not in whole.OPERATIONS or (a.common is not None and b.common is not None):
+    if name not in whole.OPERATIONS or (
+        a.dtype != np.bool_ and a.common is not None and b.common is not None
+    ):
         return t.concrete(step, inputs)
     return [whole.OPERATIONS[name](a, b)]
 

@@ -19,7 +19,7 @@ import numpy as np
 from jax.extend.core import Primitive
 from jaxtyping import Array, PyTree
 
-from verifai_jax.addons.verification.sets.form import SLACK, Form, Reals, add, joined, scaled
+from verifai_jax.addons.verification.sets.form import SLACK, Form, add, joined, scaled
 from verifai_jax.addons.verification.sets.interpreter import Interpreter, Value, as_form, rule
 from verifai_jax.addons.verification.sets.series import Rates
 
@@ -93,7 +93,7 @@ class _Step:
             length, now, during, fine = seconds / parts, state, state, np.ones(self.boxes, bool)
             for i in range(parts):
                 begin = add(time, Form.constant(np.array(i * length), time.dtype))
-                span = _hull(add(begin, _between(np.zeros(1), np.full(1, length), time)))
+                span = _hull(add(begin, Form.between(np.zeros(1), np.full(1, length), time.dtype)))
                 box, stays = self.box(span, now, length)
                 fine &= stays
                 if parts < PARTS[-1] and not (fine | lost).all():
@@ -121,7 +121,7 @@ class _Step:
         begins = [form.bounds() for form in state]
         ends, lost, stays = begins, self.unbounded(state), np.zeros(self.boxes, bool)
         for _ in range(TRIES):
-            now = [_between(low, high, span) for low, high in ends]
+            now = [Form.between(low, high, span.dtype) for low, high in ends]
             (rates,) = self.rates(self.t, self.apart, [span, *now], 0)
             reached, inside = [], np.ones(self.boxes, bool)
             for (low, high), end, rate in zip(begins, ends, rates, strict=True):
@@ -147,7 +147,7 @@ class _Step:
             ends = wider
             if (stays | lost).all():
                 break
-        return [_between(low, high, span) for low, high in ends], stays
+        return [Form.between(low, high, span.dtype) for low, high in ends], stays
 
     def moved(
         self, begin: Form, span: Form, state: list[Form], box: list[Form], length: float
@@ -163,13 +163,9 @@ class _Step:
             after[i] = add(after[i], scaled(_hull(last), share))
             # Between its ends a solution is a chord and at most an eighth of its second derivative.
             low, high = scaled(_hull(bend), np.array(-(length**2) / 8)).bounds()
-            arc = _between(np.minimum(low, 0), np.maximum(high, 0), span)
+            arc = Form.between(np.minimum(low, 0), np.maximum(high, 0), span.dtype)
             during.append(add(joined(state[i], after[i]), arc))
         return during, after
-
-
-def _between(low: Reals, high: Reals, like: Form) -> Form:
-    return Form.between(low, high, like.dtype)
 
 
 def _hull(form: Form) -> Form:

@@ -24,10 +24,10 @@ import jax.numpy as jnp
 import numpy as np
 from jax.typing import DTypeLike
 
+from verifai_jax.addons.verification.sets.layers import SLACK, Common, picked, summed
+
 Reals = np.ndarray
 """Numbers of double precision, `[boxes, *shape]`; `[1, *shape]` if they are those of all boxes."""
-SLACK = 2.0**-45
-"""Share of a number by which a result is widened for the rounding of its own bounds."""
 
 
 class Rounding(NamedTuple):
@@ -47,18 +47,10 @@ def rounding(dtype: DTypeLike) -> Rounding:
 
 
 class Frame(NamedTuple):
-    """Symbols in addition to those of the features: of a step of a loop, or of a network layer.
-
-    - `number`: a number greater than those of earlier frames.
-    - `first`, `stop`: the range of its symbols among all.
-    - `outer`: the enclosing frame, whose symbols come before; None if only features do.
-    """
+    """Symbols of a step of a loop, after so many of features; later frames have greater numbers."""
 
     number: int
     first: int
-    stop: int
-    outer: "Frame | None" = None
-    of_layer: bool = False
 
 
 class Form:
@@ -69,20 +61,24 @@ class Form:
     - `size`: a bound on the absolute value.
     - `low`, `high`: an additional interval; None without one.
     - `frame`: the frame of the symbols that are not features; None if there are none.
+    - `common`: the parts of the radius that are those of layers; None if it has none.
     - `dtype`: the type in which the simulation computes it.
     """
 
     __slots__ = (
-        "_bounds", "_spread", "centre", "dtype", "frame", "high", "low", "radius", "size", "slopes",
+        "_bounds", "_spread", "centre", "common", "dtype", "frame", "high", "low", "radius", "size",
+        "slopes",
     )  # fmt: skip
 
     def __init__(
         self, centre: Reals, slopes: Reals | None, radius: Reals, size: Reals, dtype: np.dtype,
         low: Reals | None = None, high: Reals | None = None, frame: Frame | None = None,
+        common: Common | None = None,
     ) -> None:  # fmt: skip
         self.centre, self.slopes, self.radius, self.size = centre, slopes, radius, size
         self.dtype, self.low, self.high = dtype, low, high
         self.frame = frame if slopes is not None else None
+        self.common = common if slopes is not None else None
         self._bounds: tuple[Reals, Reals] | None = None
         self._spread: Reals | None = None
 
@@ -148,23 +144,28 @@ class Form:
 
     def moved(self, move: Callable[[np.ndarray, int], np.ndarray]) -> "Form":
         """Return the numbers rearranged by `move(array, leading)`."""
+        common = self.common
+        if common is not None:
+            numbers = np.arange(self.centre[0].size)
+            moved = move(numbers.reshape(1, *self.shape), 1).ravel()
+            common = picked(common, move(common.own, 1), moved, len(numbers))
         return Form(
             move(self.centre, 1), None if self.slopes is None else move(self.slopes, 2),
             move(self.radius, 1), move(self.size, 1), self.dtype,
             None if self.low is None else move(self.low, 1),
-            None if self.high is None else move(self.high, 1), self.frame,
+            None if self.high is None else move(self.high, 1), self.frame, common,
         )  # fmt: skip
 
     def of_type(self, dtype: np.dtype) -> "Form":
         """Return the same numbers in another type that represents them exactly."""
-        ends = self.low, self.high
-        return Form(self.centre, self.slopes, self.radius, self.size, dtype, *ends, self.frame)
+        rest = self.low, self.high, self.frame, self.common
+        return Form(self.centre, self.slopes, self.radius, self.size, dtype, *rest)
 
     def forget(self, where: np.ndarray) -> None:
         """Make the set unbounded at some numbers."""
         if not np.any(where):
             return
-        self._bounds = self._spread = None
+        self._bounds = self._spread = self.common = None
         for name, value in (
             ("centre", 0.0), ("slopes", 0.0), ("radius", np.inf), ("size", np.inf),
             ("low", -np.inf), ("high", np.inf),
@@ -172,20 +173,13 @@ class Form:
             if getattr(self, name) is not None:
                 setattr(self, name, np.where(where, value, getattr(self, name)))
 
-    def unframed(self, keep: Callable[[Frame], bool] = lambda frame: False) -> "Form":
-        """Return a set without the symbols of inner frames, which are added to the radius.
-
-        **Arguments:**
-        - `keep`: a frame to keep, with all frames outside of it; none when left out.
-        """
-        frame, count = self.frame, None
-        while frame is not None and not keep(frame):
-            frame, count = frame.outer, frame.first
-        if count is None or self.slopes is None:
+    def unframed(self, keep: Frame | None = None) -> "Form":
+        """Return a set whose symbols of a frame are added to the radius, but for that to keep."""
+        if self.frame is None or self.frame == keep or self.slopes is None:
             return self
+        count, ends = self.frame.first, (self.low, self.high)
         radius = self.radius + np.abs(self.slopes[count:]).sum(0) + SLACK * self.size
-        ends = self.low, self.high
-        return Form(self.centre, self.slopes[:count], radius, self.size, self.dtype, *ends, frame)
+        return Form(self.centre, self.slopes[:count], radius, self.size, self.dtype, *ends)
 
 
 def overflown(low: Reals, high: Reals, highest: float) -> tuple[Reals, Reals]:
@@ -230,7 +224,8 @@ def rounded(
 
 def widened(low: Reals, high: Reals, share: float, smallest: float) -> tuple[Reals, Reals]:
     """Return ends that are apart by a share of each more; what is tiny keeps its sign."""
-    low, high = low - share * np.abs(low), high + share * np.abs(high)
+    if share:
+        low, high = low - share * np.abs(low), high + share * np.abs(high)
     if np.abs(low).min(initial=1.0) < smallest:
         low = np.where(np.abs(low) < smallest, np.where(low < 0, -smallest, 0.0), low)
     if np.abs(high).min(initial=1.0) < smallest:
@@ -254,11 +249,7 @@ def spanned(low: Reals, high: Reals, dtype: np.dtype, units: float = 1.0) -> For
 def alike(forms: Sequence[Form]) -> tuple[list[Form], Frame | None, int]:
     """Return forms converted to a common frame, and the number of its symbols."""
     frame = max((f.frame for f in forms if f.frame is not None), default=None)
-    around, known = frame, set[int]()
-    while around is not None:
-        known.add(around.number)
-        around = around.outer
-    forms = [f.unframed(lambda each: each.number in known) for f in forms]
+    forms = [f.unframed(frame) for f in forms]
     return forms, frame, max((0 if f.slopes is None else len(f.slopes) for f in forms), default=0)
 
 
@@ -315,6 +306,7 @@ def add(a: Form, b: Form, sign: float = 1.0) -> Form:
     centre = a.centre + b.centre if sign > 0 else a.centre - b.centre
     form = rounded(centre, slopes, a.radius + b.radius, a.size + b.size, a.dtype, None, frame)
     form.low, form.high = ends or (None, None)
+    form.common = summed(form.radius, [(a, 1.0), (b, sign)])
     return form
 
 
@@ -339,7 +331,8 @@ def negative(a: Form) -> Form:
     slopes = None if a.slopes is None else -a.slopes
     low = None if a.high is None else -a.high
     high = None if a.low is None else -a.low
-    return Form(-a.centre, slopes, a.radius, a.size, a.dtype, low, high, a.frame)
+    common = summed(a.radius, [(a, -1.0)])
+    return Form(-a.centre, slopes, a.radius, a.size, a.dtype, low, high, a.frame, common)
 
 
 def is_point(a: Form) -> bool:
@@ -359,9 +352,11 @@ def scaled(a: Form, by: Reals) -> Form:
     exact = bool(((np.frexp(scale)[0] == 0.5) & (scale >= 1) | (scale == 0)).all())
     if slopes is None and ends is not None and np.isfinite(size).all():
         return spanned(*ends, a.dtype, 0 if exact else 1)
-    return rounded(
+    form = rounded(
         a.centre * by, slopes, a.radius * scale, size, a.dtype, ends, a.frame, exact=exact
     )
+    form.common = summed(form.radius, [(a, by)])
+    return form
 
 
 def interval_product(low: Reals, high: Reals, first: Reals, last: Reals) -> tuple[Reals, Reals]:

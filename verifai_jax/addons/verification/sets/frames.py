@@ -1,9 +1,8 @@
-"""Symbols of loops and of layers, which keep nonlinear uncertainties correlated.
+"""Symbols of loops, which keep nonlinear uncertainties correlated.
 
 If each step of a loop enclosed the set of states in a box, the boxes would grow. Here the
 uncertainties of a loop's carried numbers are symbols, which the next step treats like those of the
-features. Once there are many, the shortest are replaced by those of one parallelepiped. The
-uncertainties of a layer's units stay symbols up to a result of few numbers.
+features. Once there are many, the shortest are replaced by those of one parallelepiped.
 
 Source: R. Lohner, Enclosing the solutions of ordinary initial and boundary value problems (1987);
 N. Nedialkov, K. Jackson, G. Corliss, Validated solutions of initial value problems for ordinary
@@ -23,12 +22,6 @@ from verifai_jax.addons.verification.sets.whole import Whole
 
 WIDEST = 24
 """Numbers that a loop carries at most for its symbols to be worth their cost, which is squared."""
-MANY = 512
-"""Symbols at most of a layer and those before it."""
-FEW = 8
-"""Numbers of a result that do not carry the symbols of layers on: what follows would cost more."""
-WORTH = 0.002
-"""Share of the spread from which on what is not linear gets symbols of its own."""
 FINE, COARSE, FINE_BOXES = (20, 15), (6, 4), 64
 """Symbols for each number that a loop carries, beyond which they are made fewer, and how many are
 left then: the longest, and those of one parallelepiped around the others. If all become a
@@ -69,7 +62,7 @@ def framed(carry: Sequence[Form | Whole], boxes: int, features: int) -> list[For
     new = np.concatenate([slopes[:features], sides.transpose(2, 0, 1)])
     radius = np.where(bounded, rest + 4 * SLACK * np.abs(noise).sum(2), np.inf)
     size = np.minimum(size, np.maximum(*map(np.abs, ends)))
-    frame = Frame(next(_NUMBERS), features, len(new))
+    frame = Frame(next(_NUMBERS), features)
     for i, value, stop, each in zip(kept, kept.values(), np.cumsum(sizes), sizes, strict=True):
         part, shape = slice(stop - each, stop), (boxes, *value.shape)
         pieces = [array[:, part].reshape(shape) for array in (centre, radius, size, *ends)]
@@ -78,24 +71,6 @@ def framed(carry: Sequence[Form | Whole], boxes: int, features: int) -> list[For
         low, high = (None, None) if np.isfinite(pieces[1]).all() else (pieces[3], pieces[4])
         out[i] = Form(pieces[0], own, pieces[1], pieces[2], value.dtype, low, high, frame)
     return out
-
-
-def of_layer(units: Form, features: int) -> Form:
-    """Return the numbers of a layer with each radius as a symbol."""
-    outer, bounded = units.frame, np.isfinite(units.radius)
-    first = features if outer is None else outer.stop
-    count = int(np.prod(units.shape, dtype=np.int64))
-    if first + count > MANY or units.radius[bounded].sum() <= WORTH * units.spread[bounded].sum():
-        return units
-    each = np.eye(count).reshape(count, 1, *units.shape)
-    own = np.where(bounded, units.radius, 0.0)[None] * each
-    old = padded(units, first)
-    old = np.broadcast_to(old, (first, *np.broadcast_shapes(old.shape[1:], own.shape[1:])))
-    return Form(
-        units.centre, np.concatenate([old, np.broadcast_to(own, (count, *old.shape[1:]))]),
-        np.where(bounded, 0.0, np.inf), units.size, units.dtype, units.low, units.high,
-        Frame(next(_NUMBERS), first, first + count, outer, of_layer=True),
-    )  # fmt: skip
 
 
 def _reduced(noise: np.ndarray, of_each: int) -> tuple[np.ndarray, np.ndarray]:

@@ -27,6 +27,7 @@ from verifai_jax.addons.verification.sets.form import (
     scaled,
     unknown,
 )
+from verifai_jax.addons.verification.sets.layers import summed
 
 Criticals = Callable[[Reals, Reals, Reals], Sequence[Reals]]
 """A function `(slope, low, high)` to points between which `f(x) - slope * x` is monotone."""
@@ -48,6 +49,7 @@ class Function(NamedTuple):
     - `domain`: the interval outside of which it is NaN.
     - `units`, `tiny`: its error in units of rounding, and of the smallest normal number.
     - `range`: an interval that contains all results, including rounding.
+    - `rises`: whether its greatest values are at the ends of intervals.
     """
 
     value: Callable[[Reals], Reals]
@@ -56,45 +58,50 @@ class Function(NamedTuple):
     units: float = UNITS
     tiny: float = TINY
     range: tuple[float, float] = (-np.inf, np.inf)
+    rises: bool = False
 
     def __call__(self, x: Form) -> Form:
         """Return the set of its values on a set."""
         (low, high), (first, last) = x.bounds(), self.domain
-        outside = unknown(low, high) | (low < first) | (high > last) | (low > high)
-        inside_low, inside_high = np.clip(low, first, last), np.clip(high, first, last)
-        points = self._points(np.zeros_like(low), inside_low, inside_high)
+        outside, points = unknown(low, high) | (low > high), [low, high]
+        if np.isfinite(first) or np.isfinite(last):
+            outside |= (low < first) | (high > last)
+            points = [np.clip(low, first, last), np.clip(high, first, last)]
         values = [self.value(point) for point in points]
-        lowest, highest = _extremes(values)
-        slope = (values[1] - values[0]) / (inside_high - inside_low)
-        slope = np.where(np.isfinite(slope) & (inside_high > inside_low), slope, 0.0)
-        points = self._points(slope, inside_low, inside_high)
-        below, above = _extremes([self.value(point) - slope * point for point in points])
-        usable = np.isfinite(below) & np.isfinite(above) & np.isfinite(x.spread) & ~outside
-        slope = np.where(usable, slope, 0.0)
+        slope = (values[1] - values[0]) / (points[1] - points[0])
+        slope = np.where(np.isfinite(slope), slope, 0.0)
+        extremes = [] if self.rises else self._points(np.zeros_like(low), *points)
+        lowest, highest = _extremes([*values, *(self.value(point) for point in extremes)])
+        inner = self._points(slope, *points)
+        points, values = points + inner, values + [self.value(point) for point in inner]
+        below, above = _extremes([v - slope * p for v, p in zip(values, points, strict=True)])
         size = np.maximum(np.abs(lowest), np.abs(highest))
-        offset = np.where(usable, below / 2 + above / 2, 0.0)
-        error = np.where(usable, above / 2 - below / 2, np.inf)
+        offset, error, radius = below / 2 + above / 2, above / 2 - below / 2, x.radius
+        usable = np.isfinite(offset) & np.isfinite(x.spread) & ~outside
+        if not usable.all():
+            slope, offset, radius = (np.where(usable, a, 0.0) for a in (slope, offset, radius))
+            error, size = np.where(usable, error, np.inf), np.where(outside, np.inf, size)
+            lowest = np.where(outside, -np.inf, lowest)
+            highest = np.where(outside, np.inf, highest)
         # Numbers of double precision between which the slope and the offset are rounded.
         error = error + 4 * SLACK * (np.abs(offset) + np.abs(slope) * (x.size + np.abs(x.centre)))
-        radius = np.where(usable, np.abs(slope) * x.radius, 0.0) + error
-        ends = np.where(outside, -np.inf, lowest), np.where(outside, np.inf, highest)
+        ends, radius = (lowest, highest), np.abs(slope) * radius + error
         if self.units:
             tiny = self.tiny * rounding(x.dtype).smallest
             ends, radius = (ends[0] - tiny, ends[1] + tiny), radius + tiny
-        size = np.where(outside, np.inf, size)
         slopes = None if x.slopes is None else x.slopes * slope
         form = rounded(
             slope * x.centre + offset, slopes, radius, size, x.dtype, ends, x.frame, self.units
         )
         if self.range != (-np.inf, np.inf) and form.low is not None and form.high is not None:
-            form.low = np.where(outside, form.low, np.clip(form.low, *self.range))
-            form.high = np.where(outside, form.high, np.clip(form.high, *self.range))
+            form.low = np.where(outside, -np.inf, np.clip(form.low, *self.range))
+            form.high = np.where(outside, np.inf, np.clip(form.high, *self.range))
+        form.common = summed(form.radius, [(x, slope)])
         return form
 
     def _points(self, slope: Reals, low: Reals, high: Reals) -> list[Reals]:
         inner = self.criticals(slope, low, high)
-        inner = [np.clip(np.where(np.isnan(x), low, x), low, high) for x in inner]
-        return [low, high, *inner]
+        return [np.clip(np.where(np.isnan(x), low, x), low, high) for x in inner]
 
 
 def _extremes(values: Sequence[Reals]) -> tuple[Reals, Reals]:
@@ -187,21 +194,22 @@ def _of_power(n: int) -> Function:
 
 
 FUNCTIONS: dict[str, Callable[[Form], Form]] = {
-    "exp": Function(np.exp, _single(np.log), range=_POSITIVE),
+    "exp": Function(np.exp, _single(np.log), range=_POSITIVE, rises=True),
     "exp2": Function(np.exp2, _single(lambda a: np.log2(a / np.log(2))), units=140.0,
                      range=_POSITIVE),
     "expm1": Function(np.expm1, _single(np.log), range=(-1.0, np.inf)),
-    "log": Function(np.log, _single(lambda a: 1 / a), _POSITIVE),
+    "log": Function(np.log, _single(lambda a: 1 / a), _POSITIVE, rises=True),
     "log1p": Function(np.log1p, _single(lambda a: 1 / a - 1), (-1.0, np.inf)),
     "sqrt": Function(np.sqrt, _single(lambda a: 1 / (4 * a * a)), _POSITIVE, range=_POSITIVE),
     # Of zero, which may be a negative one, it is an infinity of either sign.
     "rsqrt": lambda x: _but(_RSQRT(x), x.bounds()[0] > 0),
     # Of numbers that are not normal it has the size of the root of the smallest that is.
     "cbrt": Function(np.cbrt, _even(lambda a: (3 * a) ** -1.5), units=40.0, tiny=1e26),
-    "tanh": Function(np.tanh, _even(lambda a: np.arccosh(1 / np.sqrt(a))), range=(-1.0, 1.0)),
-    "logistic": Function(special.expit, _even(
-        lambda a: special.logit(a / (0.5 + np.sqrt(np.maximum(0.25 - a, 0))))
-    ), range=(0.0, 1.0)),
+    "tanh": Function(np.tanh, _even(lambda a: np.arccosh(1 / np.sqrt(a))), range=(-1.0, 1.0),
+                     rises=True),
+    "logistic": Function(special.expit, _even(lambda a: special.logit(a / (
+        0.5 + np.sqrt(np.maximum(0.25 - a, 0))
+    ))), range=(0.0, 1.0), rises=True),
     "sinh": Function(np.sinh, _even(np.arccosh), units=60.0),
     "cosh": Function(np.cosh, _single(np.arcsinh), units=60.0, range=(1.0, np.inf)),
     "asinh": Function(np.arcsinh, _even(lambda a: np.sqrt(1 / a**2 - 1))),
@@ -209,8 +217,8 @@ FUNCTIONS: dict[str, Callable[[Form], Form]] = {
     "atanh": Function(np.arctanh, _even(lambda a: np.sqrt(1 - 1 / a)), (-1.0, 1.0)),
     "asin": Function(np.arcsin, _even(lambda a: np.sqrt(1 - 1 / a**2)), (-1.0, 1.0)),
     "acos": Function(np.arccos, _even(lambda a: np.sqrt(1 - 1 / a**2)), (-1.0, 1.0)),
-    "atan": Function(np.arctan, _even(lambda a: np.sqrt(1 / a - 1))),
-    "erf": Function(special.erf, _even(lambda a: np.sqrt(-np.log(a * _ROOT_PI / 2)))),
+    "atan": Function(np.arctan, _even(lambda a: np.sqrt(1 / a - 1)), rises=True),
+    "erf": Function(special.erf, _even(lambda a: np.sqrt(-np.log(a * _ROOT_PI / 2))), rises=True),
     "erfc": Function(special.erfc, _even(lambda a: np.sqrt(-np.log(-a * _ROOT_PI / 2)))),
     "abs": Function(np.abs, _single(np.zeros_like), units=0.0, range=_POSITIVE),
     "square": _of_power(2),
@@ -219,12 +227,17 @@ FUNCTIONS: dict[str, Callable[[Form], Form]] = {
         x - np.pi / 2 for x in _periodic(np.arccos, 2 * np.pi)(a, low + np.pi / 2, high + np.pi / 2)
     ]),
     "tan": _tangent,
-    "floor": _whole(np.floor),
-    "ceil": _whole(np.ceil),
-    "sign": _whole(np.sign), "neg": negative,
+    "floor": _whole(np.floor), "ceil": _whole(np.ceil), "sign": _whole(np.sign), "neg": negative,
 }  # fmt: skip
 """Functions of one number, by the name of JAX's primitive."""
-_RAMP = Function(lambda x: np.maximum(x, 0.0), _single(np.zeros_like), units=0.0, range=_POSITIVE)
+
+
+def _above(knot: Reals | float) -> Function:
+    """Return the maximum with a number."""
+    return Function(lambda x: np.maximum(x, knot), lambda *_: [knot], units=0.0, rises=True)
+
+
+_RAMP = _above(0.0)._replace(range=_POSITIVE)
 
 
 def nearest(x: Form, to_even: bool) -> Form:
@@ -256,6 +269,8 @@ def _widened(x: Form, units: float) -> Form:
     """Widen a result by more units of rounding: XLA may divide by multiplying."""
     margin = rounding(x.dtype).unit * units
     x.radius = x.radius + margin * x.size
+    if x.common is not None:
+        x.common = x.common._replace(own=x.common.own + margin * x.size)
     if x.low is not None and x.high is not None:
         x.low, x.high = x.low - margin * np.abs(x.low), x.high + margin * np.abs(x.high)
     return x
@@ -263,6 +278,9 @@ def _widened(x: Form, units: float) -> Form:
 
 def greater(a: Form, b: Form) -> Form:
     """Return the maximum: `b + max(a - b, 0)`, which preserves common dependencies."""
+    for one, other in ((a, b), (b, a)):
+        if is_point(other) and one.slopes is not None and np.isfinite(other.centre).all():
+            return _above(other.centre)(one)
     (low, high), (first, last) = a.bounds(), b.bounds()
     nothing = unknown(low, high) | unknown(first, last)
     ours, theirs = (low >= last) & ~nothing, (first >= high) & ~nothing
@@ -270,16 +288,13 @@ def greater(a: Form, b: Form) -> Form:
     ends = np.where(nothing, -np.inf, lowest), np.where(nothing, np.inf, top)
     if a.slopes is None and b.slopes is None:
         return Form.between(*ends, a.dtype)
-    mixed = ~(ours | theirs)
-    if not np.any(mixed):
-        return chosen([ours, theirs], [a, b])
     ramp = add(b, _RAMP(difference(a, b)))
     size = np.maximum(np.abs(ends[0]), np.abs(ends[1]))
     both = rounded(
         ramp.centre, ramp.slopes, ramp.radius, np.broadcast_to(size, ramp.size.shape),
         a.dtype, ends, ramp.frame, exact=True,
     )  # fmt: skip
-    return chosen([ours, theirs, mixed], [a, b, both])
+    return chosen([ours, theirs, ~(ours | theirs)], [a, b, both])
 
 
 def lesser(a: Form, b: Form) -> Form:

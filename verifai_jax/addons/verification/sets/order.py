@@ -40,11 +40,8 @@ def _top(t: Interpreter, step: Equation, inputs: list[Value]) -> list[Value]:
     number = np.broadcast_to(np.arange(value.shape[axis]).reshape(shape), value.shape)
     numbers = constant(number, np.dtype(step.outvars[1].aval.dtype))
     greatest, which = _sorted([negative(value), numbers], axis, stable=True)
-    first = [
-        each.moved(lambda array, lead: array.take(range(count), axis + lead))
-        for each in (negative(as_form(greatest)), which)
-    ]
-    return first
+    both = negative(as_form(greatest)), which
+    return [v.moved(lambda array, lead: array.take(range(count), axis + lead)) for v in both]
 
 
 def _sorted(values: list[Value], axis: int, stable: bool) -> list[Value]:

@@ -5,14 +5,19 @@ import math
 from collections.abc import Sequence
 from typing import Any
 
+import jax
 import numpy as np
 
-from verifai_jax.addons.verification.sets.arrays import add_up, times_each, together
+from verifai_jax.addons.verification.sets.arrays import add_up, times_each
 from verifai_jax.addons.verification.sets.form import Form, is_point, rounded
-from verifai_jax.addons.verification.sets.frames import FEW, of_layer
 from verifai_jax.addons.verification.sets.interpreter import Interpreter, Value, constant, rule
+from verifai_jax.addons.verification.sets.layers import SLACK, refined, through_layer
 from verifai_jax.addons.verification.sets.whole import Whole
+from verifai_jax.core.compute.precision import in_precision
 
+WORTH = 0.002
+"""Share of the spread from which on what is not linear is worth remembering."""
+WINDOW = ("window_strides", "padding", "lhs_dilation", "rhs_dilation")
 Axes = tuple[Sequence[int], Sequence[int]]
 
 
@@ -37,17 +42,11 @@ def _contracted(
     result = "".join(joint[0]) + free[0] + free[1]
     sizes = {c: n for name, v in zip(names, (a, b), strict=True)
              for c, n in zip(name, v.shape, strict=True)}  # fmt: skip
-    count, terms = (math.prod(sizes[c] for c in each) for each in (result, joint[1]))
+    terms = math.prod(sizes[c] for c in joint[1])
     for form, other, (own, its) in ((a, b, names), (b, a, names[::-1])):
-        if isinstance(form, Whole) or isinstance(other, Whole):
-            continue
-        if is_point(other) and np.isfinite(other.centre).all():
-            text = f"...{own},{its}->...{result}"
-            few = count < FEW
-            if not few:
-                form = of_layer(form, t.features)
-            sums = _times(form, other.centre[0], text, dtype, terms)
-            return sums.unframed(lambda frame: not frame.of_layer) if few else sums
+        real = isinstance(form, Form) and isinstance(other, Form)
+        if real and is_point(other) and np.isfinite(other.centre).all():
+            return _times(form, other.centre[0], f"...{own},{its}->...{result}", dtype, terms)
     axes = result + "".join(joint[1])
 
     def spread(name: str, array: np.ndarray, lead: int) -> np.ndarray:
@@ -68,50 +67,50 @@ def _contracted(
 def _times(a: Form, numbers: np.ndarray, names: str, dtype: np.dtype, terms: int) -> Form:
     """Return sums of so many products of a form and exact numbers, as einsum names them."""
     times = functools.partial(np.einsum, names, optimize=["einsum_path", (0, 1)])
-    slopes = None if a.slopes is None else times(a.slopes, numbers)
-    size = np.abs(numbers)
-    return rounded(
-        times(a.centre, numbers), slopes, times(a.radius, size), times(a.size, size), dtype,
-        None, a.frame, units=terms + 1.0,
-    )  # fmt: skip
+    shape = np.broadcast_shapes(a.centre.shape, a.radius.shape, a.size.shape)
+    centre, radius, size = (np.broadcast_to(x, shape) for x in (a.centre, a.radius, a.size))
+    gross, size = times(np.stack([radius, size]), np.abs(numbers))
+    if a.slopes is None:
+        return rounded(times(centre, numbers), None, gross, size, dtype, units=terms + 1.0)
+    shape = np.broadcast_shapes((1, *shape), a.slopes.shape)
+    parts = [np.broadcast_to(x, (len(x), *shape[1:])) for x in (a.slopes, centre[None])]
+    linear = times(np.concatenate(parts), numbers)
+    sums = rounded(linear[-1], linear[:-1], gross, size, dtype, None, a.frame, units=terms + 1.0)
+    if a.radius.sum() > WORTH * a.spread.sum():
+        one = np.eye(math.prod(a.shape))
+        matrix = times(one.reshape(len(one), *a.shape), numbers).reshape(len(one), -1)
+        # Their rounding, and that of factors that go back through the matrix.
+        own = sums.radius - gross * (1 - (terms + 1) * SLACK)
+        sums.common = through_layer(matrix, a, own)
+        if sums.common is not None:
+            sums.radius = refined(sums.radius, sums.common)
+    return sums
 
 
 @rule("conv_general_dilated")
 def _convolution(t: Interpreter, step: Any, inputs: list[Value]) -> list[Value]:
     """Collect the numbers that each result is a sum of, zeros for padding, and multiply those."""
     params, (image, kernel) = step.params, inputs
-    forms = params["dimension_numbers"]
+    forms, shape = params["dimension_numbers"], step.outvars[0].aval.shape
     groups, batches = params["feature_group_count"], params["batch_group_count"]
     dtype, parts = np.dtype(step.outvars[0].aval.dtype), groups * batches
-    size = int(np.prod(image.shape, dtype=np.int64))
-    numbers = np.arange(size).reshape(image.shape).transpose(forms.lhs_spec)
     depth, inner, *taps = (kernel.shape[axis] for axis in forms.rhs_spec)
-    points = [step.outvars[0].aval.shape[axis] for axis in forms.out_spec[2:]]
-    grids = list[np.ndarray]()
-    for i, (n, position, tap) in enumerate(zip(numbers.shape[2:], points, taps, strict=True)):
-        along = np.arange(position)[:, None] * params["window_strides"][i] - params["padding"][i][0]
-        along = along + np.arange(tap) * params["rhs_dilation"][i]
-        gap = params["lhs_dilation"][i]
-        inside = (along >= 0) & (along <= (n - 1) * gap) & (along % gap == 0)
-        grids.append(np.where(inside, along // gap, n))
-    # The number after the last one, along any axis, is the zero that stands for padding.
-    numbers = np.pad(numbers, [(0, 0), (0, 0)] + [(0, 1)] * len(points), constant_values=size)
-    for i, grid in enumerate(grids):
-        numbers = numbers.take(grid, 2 + 2 * i)
-    rank, each = len(points), image.shape[forms.lhs_spec[0]] // batches
-    evens, odds = (range(start, 2 + 2 * rank, 2) for start in (2, 3))
-    numbers = numbers.transpose(0, 1, *evens, *odds)
-    numbers = numbers.reshape(batches, each, groups, inner, *points, -1)
-    numbers = numbers.transpose(0, 2, 1, *range(4, 4 + rank), 3, 4 + rank)
+    points, each = [shape[a] for a in forms.out_spec[2:]], image.shape[forms.lhs_spec[0]] // batches
+    numbers = np.arange(1.0, math.prod(image.shape) + 1).reshape(image.shape)
+    with in_precision("float64"):
+        patches = jax.lax.conv_general_dilated_patches(
+            numbers, taps, *(params[name] for name in WINDOW), dimension_numbers=forms
+        )
+    # Zeros stand for padding.
+    numbers = np.asarray(patches, np.int64).transpose(forms.out_spec) - 1
+    numbers = numbers.reshape(batches, each, groups, inner * math.prod(taps), -1)
     # One part is a product of matrices, which is faster than one with an axis for parts.
     several = () if parts == 1 else (parts,)
-    numbers = numbers.reshape(*several, -1, int(np.prod([inner, *taps], dtype=np.int64)))
+    numbers = numbers.transpose(0, 2, 1, 4, 3).reshape(*several, -1, numbers.shape[3])
     flat = image.moved(lambda array, lead: array.reshape(*array.shape[:lead], -1))
-    if isinstance(flat, Form) and isinstance(kernel, Form) and is_point(kernel):
-        flat = of_layer(flat, t.features)
-    zero = constant(np.zeros(1), flat.dtype)
-    flat = together([flat, zero], lambda arrays, lead: np.concatenate(arrays, lead))
-    picked = flat.moved(lambda array, lead: array[..., numbers])
+    picked = flat.moved(lambda array, lead: array[..., np.maximum(numbers, 0)])
+    if (numbers < 0).any():
+        picked = times_each(picked, constant(1 * (numbers >= 0), flat.dtype))
 
     def arranged(array: np.ndarray, lead: int) -> np.ndarray:
         array = array.transpose(*range(lead), *(lead + axis for axis in forms.rhs_spec))
@@ -123,7 +122,7 @@ def _convolution(t: Interpreter, step: Any, inputs: list[Value]) -> list[Value]:
     def placed(array: np.ndarray, lead: int) -> np.ndarray:
         front = array.shape[:lead]
         array = array.reshape(*front, parts, each, *points, depth // parts)
-        order = (1, 0, 2 + rank, *range(2, 2 + rank))
+        order = (1, 0, 2 + len(points), *range(2, 2 + len(points)))
         array = array.transpose(*range(lead), *(lead + axis for axis in order))
         array = array.reshape(*front, each, depth, *points)
         back = np.argsort(forms.out_spec)

@@ -218,7 +218,7 @@ class Rates:
             if name == "div":
                 rest = _dotted([find(number, i) for i in range(k)], b[:0:-1])
                 rest = _sum([a[k], rest and negative(rest)])
-                return rest and quotient(*_two(rest, b[0]))
+                return rest and quotient(*levelled([rest, b[0]]))
             if name in CURVED:
                 pairs = [(*both, i) for both in self.slopes(number) for i in range(1, k + 1)]
                 moves = [(find(each, i), np.array(i / k)) for each, _, i in pairs]
@@ -248,13 +248,9 @@ class Rates:
         return [[coefficient(i, k) or zeros(i) for i in self.results] for k in orders]
 
 
-def _two(a: Any, b: Any) -> Any:
-    return levelled([a, b])
-
-
 def _dotted(first: Sequence[Any], second: Sequence[Any]) -> Form | None:
     """Return the sum of products of two rows, in which None is zero."""
-    pairs = [_two(a, b) for a, b in zip(first, second, strict=True) if a and b]
+    pairs = [levelled([a, b]) for a, b in zip(first, second, strict=True) if a and b]
     if len(pairs) > 1 and _are_intervals([form for pair in pairs for form in pair]):
         a, b = (_stacked([pair[i] for pair in pairs]) for i in (0, 1))
         return _total(np.stack(interval_product(a[0], a[1], b[0], b[1])), pairs[0][0])
@@ -266,7 +262,7 @@ def _sum(terms: Sequence[Any]) -> Form | None:
     forms = [term for term in terms if term is not None]
     if len(forms) > 1 and _are_intervals(forms):
         return _total(_stacked(levelled(forms)), forms[0])
-    return functools.reduce(lambda a, b: add(*_two(a, b)), forms) if forms else None
+    return functools.reduce(lambda a, b: add(*levelled([a, b])), forms) if forms else None
 
 
 def _are_intervals(forms: Sequence[Form]) -> bool:

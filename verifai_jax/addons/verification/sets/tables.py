@@ -88,9 +88,7 @@ def _search(t: Interpreter, program: Program, inputs: list[Value]) -> list[Value
     return [Whole(np.where(lost, 0, first), np.where(lost, len(edges), last), dtype)]
 
 
-_SEARCHES: dict[Any, Any] = {
-    side: partial(jnp.searchsorted, side=side) for side in ("left", "right")
-}
+_SEARCHES = {side: partial(jnp.searchsorted, side=side) for side in ("left", "right")}
 
 
 def _sin_cos(t: Interpreter, program: Program, inputs: list[Value]) -> list[Value] | None:
@@ -102,7 +100,7 @@ def _sin_cos(t: Interpreter, program: Program, inputs: list[Value]) -> list[Valu
     for name in ("sin", "cos"):
         form = FUNCTIONS[name](angle)
         # Its error is 1.2e-7, and beyond 1e5 it is NaN.
-        form.radius = form.radius + 2.4e-7
+        form.radius, form.common = form.radius + 2.4e-7, None
         if form.low is not None and form.high is not None:
             form.low, form.high = form.low - 2.4e-7, form.high + 2.4e-7
         form.forget((low < -1e5) | (high > 1e5))

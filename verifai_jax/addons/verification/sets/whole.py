@@ -183,12 +183,10 @@ def _inverted(a: Whole) -> Whole:
 
 
 FUNCTIONS: dict[str, Callable[[Whole], Whole]] = {
-    "abs": _absolute,
+    "abs": _absolute, "not": _inverted, "square": lambda a: power(a, 2),
     "neg": lambda a: Whole(exactly(np.negative, a.high), exactly(np.negative, a.low), a.dtype),
-    "not": _inverted,
     "sign": lambda a: Whole(np.sign(a.low), np.sign(a.high), a.dtype),
-    "square": lambda a: power(a, 2),
-}
+}  # fmt: skip
 """Operations on one set, by the name of JAX's primitive."""
 COMPARISONS = ("eq", "ne", "lt", "le", "gt", "ge")
 
