@@ -95,12 +95,16 @@ class Blocks:
         plans = []
         for group in group_policies(policies):
             numbers, together = group.numbers, group.traced
-            problem = _checked_problem(problem_of, policies[numbers[0]], numbers[0])
+            known = _known_problems(problem_of, group.structure) if together else []
+            problem = known[0] if known else None
+            if problem is None:
+                problem = _checked_problem(problem_of, policies[numbers[0]], numbers[0])
             first = problem if first is None else first
             _check_same(first, problem, numbers[0])
             problems = [problem]
-            if together and not problem.black_box:
+            if together and not problem.black_box and not known:
                 together = self._traceable(problem_of, group.weights[0], numbers)
+                known += [problem] if together else []
             if not together or problem.black_box:
                 others = [_checked_problem(problem_of, policies[n], n) for n in numbers[1:]]
                 for number, other in zip(numbers[1:], others, strict=True):
@@ -292,6 +296,19 @@ class Blocks:
         return True
 
 
+def _known_problems(problem_of: Callable[[Any], Problem], structure: str) -> list[Problem]:
+    """Return a list for the checked problem of a structure that JAX traces, kept between calls."""
+    try:
+        return _kept_problems(problem_of, structure)
+    except TypeError:  # It cannot be hashed.
+        return []
+
+
+@lru_cache(maxsize=16)
+def _kept_problems(problem_of: Callable[[Any], Problem], structure: str) -> list[Problem]:
+    return []
+
+
 def _shipment(problem_of: Callable[[Any], Problem], executor: Executor) -> Shipment[Any]:
     """Return the shipment of `problem_of`, made once, so that workers keep its programs."""
     try:
@@ -309,14 +326,14 @@ class _Samples:
     """The sequence of independent samples of the prior that the constraint accepts."""
 
     def __init__(self, space: FeatureSpace, key: Any) -> None:
-        self._space, self._drawn = space, 0
+        self._space, self._key, self._drawn = space, key, 0
         self._points = np.zeros((0, space.dim), np.float32)
-        self._draw = jax.jit(lambda index: uniform_points(key, index, space.dim))
 
     def __call__(self, first: int, count: int) -> Float[np.ndarray, "count d"]:
         barren = 0
         while len(self._points) < first + count:
-            u = np.asarray(self._draw(self._drawn + np.arange(DRAWN, dtype=np.uint32)))
+            numbers = self._drawn + np.arange(DRAWN, dtype=np.uint32)
+            u = np.asarray(_drawn(self._key, numbers, self._space.dim))
             self._drawn += DRAWN
             if self._space.where is not None:
                 u = u[self.accepted(u)]
@@ -330,6 +347,9 @@ class _Samples:
 
     def accepted(self, u: Float[np.ndarray, "n d"]) -> Bool[np.ndarray, " n"]:
         return np.asarray(self._space.accepts_points(u))
+
+
+_drawn = jax.jit(uniform_points, static_argnums=2)
 
 
 def _from_memo(known: Arrays, count: int) -> Verdicts:

@@ -339,7 +339,8 @@ class RunningSweep:
 
         return certify(
             self.study.problem, policies, p=p, certification=certification, seed=seed,
-            remember=remember, run_on=RunOn(executor=self.executor), progress=progress,
+            only_safe=True, remember=remember, run_on=RunOn(executor=self.executor),
+            progress=progress,
         )  # fmt: skip
 
     # The record
