@@ -126,9 +126,7 @@ def certify(
     rounds = -(-certified.attack_simulations // lanes)
     if tie is None:
         tie = min(p / 10, SETTLED / (len(policies) * samples))
-    allocation = Allocation(
-        p, confidence, samples, budget, lanes, tie, safest=not only_safe
-    )
+    allocation = Allocation(p, confidence, samples, budget, lanes, tie, safest=not only_safe)
     sampled = [PolicyRecord() for _ in policies]
     attacked = [PolicyRecord() for _ in policies]
     report = _Report(progress, len(policies) * rounds * lanes, budget)

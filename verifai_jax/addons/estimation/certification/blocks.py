@@ -29,6 +29,7 @@ from verifai_jax.addons.estimation.certification.simulators import (
 from verifai_jax.core.compute.executors import Executor
 from verifai_jax.core.compute.precision import truncate_silently
 from verifai_jax.core.user_code.source_collection import sources_of
+from verifai_jax.core.user_code.sources import Sources
 from verifai_jax.core.values.trace import Status
 from verifai_jax.evaluation.raising import Raising
 from verifai_jax.evaluation.verdicts import Verdicts
@@ -96,15 +97,18 @@ class Blocks:
         for group in group_policies(policies):
             numbers, together = group.numbers, group.traced
             known = _known_problems(problem_of, group.structure) if together else []
-            problem = known[0] if known else None
-            if problem is None:
+            if known:
+                problem, sources = known[0]
+            else:
                 problem = _checked_problem(problem_of, policies[numbers[0]], numbers[0])
+                sources = sources_of(problem, problem_of, made=problem.made_in or ())
+            self.sources = sources if first is None else self.sources
             first = problem if first is None else first
             _check_same(first, problem, numbers[0])
             problems = [problem]
             if together and not problem.black_box and not known:
                 together = self._traceable(problem_of, group.weights[0], numbers)
-                known += [problem] if together else []
+                known += [(problem, sources)] if together else []
             if not together or problem.black_box:
                 others = [_checked_problem(problem_of, policies[n], n) for n in numbers[1:]]
                 for number, other in zip(numbers[1:], others, strict=True):
@@ -138,7 +142,6 @@ class Blocks:
         )
         self._samples = _Samples(self.space, points_key)
         self._digests = [digest(policy, i) for i, policy in enumerate(policies)]
-        self.sources = sources_of(first, problem_of, made=first.made_in or ())
         self._about = f"{_common_digest(first, seed, lanes)}/{self.sources.code[:16]}"
 
     @property
@@ -296,7 +299,9 @@ class Blocks:
         return True
 
 
-def _known_problems(problem_of: Callable[[Any], Problem], structure: str) -> list[Problem]:
+def _known_problems(
+    problem_of: Callable[[Any], Problem], structure: str
+) -> list[tuple[Problem, Sources]]:
     """Return a list for the checked problem of a structure that JAX traces, kept between calls."""
     try:
         return _kept_problems(problem_of, structure)
@@ -305,7 +310,9 @@ def _known_problems(problem_of: Callable[[Any], Problem], structure: str) -> lis
 
 
 @lru_cache(maxsize=16)
-def _kept_problems(problem_of: Callable[[Any], Problem], structure: str) -> list[Problem]:
+def _kept_problems(
+    problem_of: Callable[[Any], Problem], structure: str
+) -> list[tuple[Problem, Sources]]:
     return []
 
 
