@@ -1,28 +1,30 @@
 """Certified-safe configurations per processor hour, beside Optuna with rejax and Monte Carlo.
 
-    python benchmarks/safe_sweeps.py cartpole --configurations 32
-    python benchmarks/safe_sweeps.py mountain_car lane_keeping --sides ours halving stopping
+    python benchmarks/safe_sweeps.py cartpole --configurations 32 --seeds 0 1 2
+    python benchmarks/safe_sweeps.py mountain_car lane_keeping --sides ours rejax
     python benchmarks/safe_sweeps.py cartpole --check 100000        # counts ten certificates again
 
-Each side gets the same space of hyper-parameters, steps, network and number of configurations. The
-sides are
+Each side gets the same space of hyper-parameters, maximum number of steps, network and number of
+configurations. The sides are
 
-- `ours`: `vj.sweep`, with its attack and its certificates;
-- `halving`: the same with successive halving by nominal return;
-- `stopping`: the same, where only configurations end whose checkpoint is shown to be unsafe;
+- `ours`: `vj.sweep` with a narrow cross-entropy search, where a training ends at the first of seven
+  checkpoints that passes a test, and the last policy of each training is certified;
+- `halton`: `vj.sweep` with its defaults: Halton points, and all trainings go to their end;
+- `learning`: the search of `ours`, and all trainings go to their end;
 - `rejax`: Optuna's TPE proposes for the best nominal return, rejax trains with hyper-parameters as
   arguments of one program, and each policy is simulated in one program at independent samples, as
   many as show it to be safe if none fails or one in four hundred does, with Clopper-Pearson bounds
   that hold together (Bonferroni). It needs `pip install optuna rejax gymnax`, and is left out in
   words without them.
 
-Times are of this process's processors. Each side runs once before, with two configurations and
+Times are of this process's processors. Each side runs once before, with four configurations and
 other seeds, so that programs are compiled; what that took is printed apart. `first` is the
 processor time until the first configuration was trained that is safe in the end, on average over
 the order of the configurations, with the certificates of all up to there.
 """
 
 import argparse
+import collections
 import dataclasses
 import functools
 import math
@@ -43,6 +45,9 @@ from specs.cartpole import balance_with
 from specs.mountain_car import climb_with, trained_on
 from verifai_jax.addons.estimation.intervals import upper_bound
 from verifai_jax.addons.rl import PPO, Continuous, Discrete, Policy, evaluate
+from verifai_jax.addons.training.sweeps.running import RunningSweep
+from verifai_jax.addons.training.sweeps.training_runs import TrainingRuns
+from verifai_jax.search.cross_entropy import CrossEntropy
 
 HIDDEN = (64, 64)
 CONFIDENCE, P = 0.95, 0.01
@@ -67,8 +72,8 @@ class Case:
     ranges: dict[str, Any]
     settings: dict[str, Any]
 
-    def study(self) -> vj.Study:
-        """Return the study of our side."""
+    def study(self, checkpoints: int = 0) -> vj.Study:
+        """Return the study of our side, with so many checkpoints before the end."""
         ppo = PPO(anneal=False, hidden=HIDDEN, value_hidden=HIDDEN, **self.settings)
         return vj.Study(
             "safe_sweeps",
@@ -76,7 +81,7 @@ class Case:
             trainer=vj.Trainer(self.task, ppo, steps=self.steps, nominal=self.nominal),
             problem=self.problem,
             p=P,
-            checkpoints=(self.steps // 4, self.steps // 2),
+            checkpoints=[self.steps * i // (checkpoints + 1) for i in range(1, checkpoints + 1)],
         )
 
 
@@ -113,25 +118,45 @@ class Outcome:
     first: float
 
 
-def our_side(case: Case, configurations: int, seed: int, *, halving: Any) -> Outcome:
+NARROW = CrossEntropy(min_elite=4, widening=1.0)
+EARLY = vj.Halving(reduction=1, until_safe=True)
+STAGES = {
+    "training": (TrainingRuns, "train"),
+    "returns": (RunningSweep, "_measure_returns"),
+    "tests": (RunningSweep, "_without_passed"),
+    "search": (RunningSweep, "_screen"),
+    "certifying": (RunningSweep, "_certify"),
+}
+spent: dict[str, float] = collections.defaultdict(float)
+
+
+def count_time(stage: str) -> None:
+    """Count the processor time of a stage of our sweeps from now on."""
+    owner, name = STAGES[stage]
+    method = getattr(owner, name)
+
+    @functools.wraps(method)
+    def timed(*arguments: Any, **options: Any) -> Any:
+        began = time.process_time()
+        try:
+            return method(*arguments, **options)
+        finally:
+            spent[stage] += time.process_time() - began
+
+    setattr(owner, name, timed)
+
+
+def our_side(case: Case, configurations: int, seed: int, *, search: Any, halving: Any) -> Outcome:
     """Sweep with this package."""
-    study = case.study()
-    if halving is None:
-        study = vj.Study(
-            study.name, study.space, study.trainer, study.problem, p=P
-        )  # Its checkpoints would only be more policies to certify.
+    study = case.study(0 if halving is None else 7)
+    spent.clear()
     before = time.process_time()
-    result = vj.sweep(study, configurations=configurations, seed=seed, halving=halving)
+    result = vj.sweep(study, search, configurations=configurations, seed=seed, halving=halving)
     total = time.process_time() - before
-    walls = result.record.seconds
-    seconds = {name: total * wall / sum(walls.values()) for name, wall in walls.items()}
+    seconds = {**spent, "other": total - sum(spent.values())}
     table = result.table
     last = table.loc[table.groupby("configuration")["steps"].idxmax()]
     safe = last["verdict"].str.startswith("safe").tolist()
-    counts = {"attack": 256 * len(table), "samples": int(table["simulations"].sum())}
-    share = counts["attack"] / max(1, sum(counts.values()))
-    certifying = seconds.pop("certifying", 0.0)
-    seconds |= {"attacking": share * certifying, "certifying": (1 - share) * certifying}
     return Outcome(safe, seconds, [result.policy(i) for i in last.index], until_first(safe, total))
 
 
@@ -278,20 +303,18 @@ def main() -> None:
     """Print what each side finds in an hour of a processor."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("cases", nargs="+", choices=list(CASES))
-    sides = ["ours", "halving", "stopping", "rejax"]
+    sides = ["ours", "halton", "learning", "rejax"]
     parser.add_argument("--sides", nargs="+", choices=sides, default=sides)
     parser.add_argument("--configurations", type=int, default=32)
-    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--seeds", type=int, nargs="+", default=[0])
     parser.add_argument("--check", type=int, default=0, help="fresh simulations of a certificate")
     chosen = parser.parse_args()
-    halvings = {
-        "ours": None,
-        "halving": vj.Halving(reduction=3),
-        "stopping": vj.Halving(reduction=1, p=0.9),
-    }
+    for stage in STAGES:
+        count_time(stage)
+    own = {"ours": (NARROW, EARLY), "halton": ("halton", None), "learning": (NARROW, None)}
     for name in chosen.cases:
         case = CASES[name]
-        print(f"{name}: {chosen.configurations} configurations of {case.steps:,} steps")
+        print(f"{name}: {chosen.configurations} configurations of {case.steps:,} steps at most")
         for side in chosen.sides:
             if side == "rejax":
                 try:
@@ -300,24 +323,42 @@ def main() -> None:
                     print(f"  {side}: left out, {error}")
                     continue
             else:
-                run = functools.partial(our_side, case, halving=halvings[side])
+                search, halving = own[side]
+                run = functools.partial(our_side, case, search=search, halving=halving)
             before = time.process_time()
-            run(2, chosen.seed + 999)
+            run(4, 999)
             compiling = time.process_time() - before
-            found = run(chosen.configurations, chosen.seed)
-            total = sum(found.seconds.values())
-            parts = ", ".join(f"{s:.1f} s {n}" for n, s in found.seconds.items())
-            print(
-                f"  {side:9} {sum(found.safe)} safe in {total:.1f} CPU s ({parts}): "
-                f"{3600 * sum(found.safe) / total:,.0f} an hour; first after {found.first:.1f} s; "
-                f"{compiling:.0f} s before, compiling",
-                flush=True,
-            )
-            if chosen.check:
-                safe = [p for p, good in zip(found.policies, found.safe, strict=True) if good][:10]
-                rates = [failure_rate(case, policy, chosen.check) for policy in safe]
-                wrong = sum(rate >= P for rate in rates)
-                print(f"    of {len(safe)} certificates counted again {wrong} are wrong: {rates}")
+            print(f"  {side}: {compiling:.0f} s before, compiling")
+            every = []
+            for seed in chosen.seeds:
+                every.append(run(chosen.configurations, seed))
+                show(f"seed {seed}", every[-1:])
+                if chosen.check:
+                    count_again(case, every[-1], chosen.check)
+            show("together", every)
+
+
+def show(name: str, outcomes: list[Outcome]) -> None:
+    """Print what some runs of a side found, and in which time."""
+    safe = sum(sum(one.safe) for one in outcomes)
+    stages = list(dict.fromkeys(stage for one in outcomes for stage in one.seconds))
+    seconds = {stage: sum(one.seconds.get(stage, 0.0) for one in outcomes) for stage in stages}
+    total = sum(seconds.values())
+    parts = ", ".join(f"{took:.1f} s {stage}" for stage, took in seconds.items())
+    first = float(np.mean([one.first for one in outcomes]))
+    print(
+        f"    {name:9} {safe} safe in {total:.1f} CPU s ({parts}): {3600 * safe / total:,.0f} an "
+        f"hour; first after {first:.1f} s",
+        flush=True,
+    )
+
+
+def count_again(case: Case, found: Outcome, count: int) -> None:
+    """Print the failure rates of ten certified policies in fresh simulations."""
+    safe = [p for p, good in zip(found.policies, found.safe, strict=True) if good][:10]
+    rates = [failure_rate(case, policy, count) for policy in safe]
+    wrong = sum(rate >= P for rate in rates)
+    print(f"    of {len(safe)} certificates counted again {wrong} are wrong: {rates}")
 
 
 if __name__ == "__main__":

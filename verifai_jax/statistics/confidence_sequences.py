@@ -51,19 +51,26 @@ def anytime_interval(
 
     def border(k: int, end: float) -> float:
         limit = log_mixture(k, n) + math.log(1 - confidence)
-        return border_between(k / n, end, lambda rate: float(log_likelihood(k, n, rate)) >= limit)
+        return border_between(k / n, end, lambda rates: log_likelihood(k, n, rates) >= limit)
 
     low, high = border(failures, 0.0), border(failures + undecided, 1.0)
     return Rate(failures, n, low, high, confidence, at_any_time=True, undecided=undecided)
 
 
-def border_between(within: float, outside: float, inside: Callable[[float], bool]) -> float:
-    """Find where an interval ends, between the estimate, which is inside, and an end of [0, 1]."""
-    if inside(outside):
+def border_between(
+    within: float, outside: float, inside: Callable[[np.ndarray], np.ndarray]
+) -> float:
+    """Find where an interval ends, between the estimate, which is inside, and an end of [0, 1].
+
+    `inside` says of several rates at once whether they belong to the interval.
+    """
+    if inside(np.array([outside]))[0]:
         return outside
-    for _ in range(60):
-        middle = (within + outside) / 2
-        within, outside = (middle, outside) if inside(middle) else (within, middle)
+    for _ in range(12):
+        between = np.linspace(within, outside, 33)[1:-1]
+        count = int(np.argmin([*inside(between), False]))
+        rates = [within, *between, outside]
+        within, outside = float(rates[count]), float(rates[count + 1])
     return outside
 
 

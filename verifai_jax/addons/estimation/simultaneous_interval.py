@@ -50,10 +50,10 @@ def simultaneous_interval(
     limit = required_evidence(confidence, among)
     estimate = failures / simulations
     low = border_between(
-        estimate, 0.0, lambda rate: float(evidence_above(failures, simulations, rate)) < limit
+        estimate, 0.0, lambda rates: evidence_above(failures, simulations, rates) < limit
     )
     high = border_between(
-        estimate, 1.0, lambda rate: float(evidence_below(failures, simulations, rate)) < limit
+        estimate, 1.0, lambda rates: evidence_below(failures, simulations, rates) < limit
     )
     return Rate(failures, simulations, low, high, confidence, at_any_time=True)
 

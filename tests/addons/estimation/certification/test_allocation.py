@@ -131,3 +131,19 @@ def test_the_budget_bounds_all_samples():
     some = allocation.next(np.array([0, 0, 40]), np.full(3, 64))
     assert 0 <= some.sum() <= 1
     assert not allocation.next(np.array([0, 0, 40]), np.array([128, 64, 64])).any()
+
+
+def test_only_what_may_be_safe_is_sampled_further():
+    rule = Allocation(p=0.01, samples=512, budget=4 * 4 * 512, safest=False)
+    failures, simulations = np.zeros(4, int), np.zeros(4, int)
+    rates = np.array([0.0, 0.02, 0.5, 0.003])
+    while (blocks := rule.next(failures, simulations)).any():
+        simulations += 64 * blocks
+        failures = np.round(rates * simulations).astype(int)
+    # One without failures takes what its certificate needs, one of half takes a block, and one
+    # above p takes the minimum, as no more samples make it safe.
+    assert simulations[0] == 576
+    assert simulations[1] == 512
+    assert simulations[2] == 64
+    assert 576 < simulations[3] <= 512 + rule.budget // 4
+    assert (rule.undecided(failures, simulations) == [False, True, False, False]).all()

@@ -401,3 +401,20 @@ def test_problems_that_do_not_fit():
 
     with pytest.raises(ValueError, match=r"the same features and formulas.*those of policy 1"):
         certify(by_width, [threshold(0.5), threshold(0.5, 100)])
+
+
+@pytest.mark.thorough
+def test_the_search_for_safe_policies_spends_little_on_others(certificates):
+    found = certify(
+        problem_of, POLICIES, p=0.1, certification=vj.Certification(samples=128), seed=3,
+        only_safe=True,
+    )  # fmt: skip
+    assert [row.verdict for row in found.rows] == [row.verdict for row in certificates.rows]
+    assert found.safe == (0, 1, 3)
+    for row, whole, rate in zip(found.rows, certificates.rows, RATES, strict=True):
+        # Fewer samples of the same stream; the attack ends with the block that fails first.
+        assert row.simulations <= whole.simulations
+        assert row.rate.low <= rate <= row.rate.high
+        assert (row.attacks == 256) == (row.attack_failures == 0)
+    assert max(found[i].simulations for i in found.unsafe) <= 128
+    assert [found[i].attacks for i in found.unsafe] == [64, 64]

@@ -62,6 +62,16 @@ def train_anew(key, hyperparameters, steps=8):
     return Gain(np.float32(weights))
 
 
+def train_reporting(key, hyperparameters, steps=8, checkpoint=None):
+    """Train once for all checkpoints, and report after each step."""
+    rng, weights = np.random.default_rng(seed_of(key)), np.zeros(2)
+    for step in range(1, steps + 1):
+        weights, returns = trained(rng, weights, hyperparameters, 1)
+        if hyperparameters["rate"] < 0.4 or step < 3:
+            checkpoint(step, Gain(np.float32(weights)), returns[0])
+    return Gain(np.float32(weights))
+
+
 def study(function, **options):
     trainer = vj.Trainer(
         function, steps=8, example=lambda observation: observation[:1], observation=np.zeros(2)

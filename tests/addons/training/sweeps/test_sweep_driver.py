@@ -247,6 +247,7 @@ CASES = {
     "halton": {"configurations": 5},
     "cross_entropy": {"configurations": 6, "search": "cross_entropy", "batch": 2},
     "halving": {"configurations": 6, "halving": Halving(2)},
+    "until safe": {"configurations": 6, "halving": Halving(1, until_safe=True)},
     "halving by safety": {"configurations": 6, "halving": Halving(2, by="safety")},
 }
 
@@ -354,6 +355,35 @@ def test_only_configurations_that_are_shown_to_be_unsafe_end():
     assert np.all(true[going] < 0.6)
     ended = set(table.loc[stopped, "configuration"])
     assert set(table.loc[table["steps"] == 128, "configuration"]) == set(range(8)) - ended
+
+
+def test_a_training_ends_where_its_policy_passes_and_only_its_last_policy_is_certified():
+    study, p = drifting(p=0.2), 0.2
+    result = sweep(
+        study, configurations=8, certification=vj.Certification(samples=512),
+        halving=Halving(reduction=1, until_safe=True),
+    )  # fmt: skip
+    table = result.table
+    rates = quick_certificates(
+        None, [result.policy(i) for i in table.index], p=p, seed=99, remember=lambda _, f: f(),
+        certification=vj.Certification(samples=20_000),
+    ).rows  # fmt: skip
+    true = np.array([one.failures / one.simulations for one in rates])
+    last = table.groupby("configuration")["steps"].transform("max") == table["steps"]
+    assert (table["status"] == "trained").all()
+    assert ((table["simulations"] > 0) == last).all()
+    early = last & (table["steps"] < 128)
+    assert 0 < early.sum() < last.sum() == 8
+    # The test of 256 samples at half of p errs by four standard deviations at most.
+    error = 4 * np.sqrt(0.25 * p / 256)
+    assert np.all(true[early] < p / 2 + error)
+    assert np.all(true[~last] > p / 2 - error)
+    assert table["nominal_return"].notna().all()
+    # The rows that there are, are those of the sweep that ends nobody.
+    plain = sweep(study, configurations=8, certification=vj.Certification(samples=8)).table
+    both = table.merge(plain, on=["configuration", "steps"])
+    assert len(both) == len(table)
+    np.testing.assert_array_equal(both["nominal_return_x"], both["nominal_return_y"])
 
 
 @pytest.mark.thorough

@@ -7,16 +7,18 @@ import time
 from pathlib import Path
 from types import SimpleNamespace
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from checked_types import unchecked
 from drifting import Point, closed_loop
 from misbehaving_training import train_badly
-from numpy_training import study, sweep, train, train_anew
+from numpy_training import seed_of, study, sweep, train, train_anew, train_reporting, trained
 
 import verifai_jax as vj
 from verifai_jax.addons.training.sweeps import StudyError
-from verifai_jax.addons.training.sweeps.function_runs import FunctionRuns
+from verifai_jax.addons.training.sweeps.function_runs import FunctionRuns, _reported, train_once
 
 HERE = Path(__file__).parent
 
@@ -86,10 +88,48 @@ def test_killed_and_resumed_it_is_the_undisturbed_table(tmp_path):
 @pytest.mark.slow
 def test_one_that_cannot_resume_trains_anew_and_one_that_raises_is_a_row(caplog):
     found = sweep(train_anew)
-    assert "train_anew has no argument resume: it trains anew up to each checkpoint" in caplog.text
+    assert (
+        "train_anew has neither an argument resume nor checkpoint: it trains anew up to each"
+        in caplog.text
+    )
     wrong = found.table[found.table["rate"] == 0.5]
     assert all("the rate is too great" in status for status in wrong["status"])
     assert (found.table.loc[found.table["rate"] < 0.5, "status"] == "trained").all()
+
+
+def test_a_training_reports_its_checkpoints_and_how_far_it_is(tmp_path):
+    call = {"values": {"rate": 0.1}, "steps": 8, "folder": str(tmp_path / "8.part")}
+    seen = np.zeros(2)
+    with unchecked():  # The pool passes the arrays on as if they were a trace.
+        found = train_once(train_reporting, seen, {**call, "checkpoints": [4]}, seed=3)
+    rng = np.random.default_rng(seed_of(jax.random.key(3)))
+    weights, returns = trained(rng, np.zeros(2), {"rate": 0.1}, 8)
+    np.testing.assert_array_equal(found["steps"], np.arange(1, 9))
+    np.testing.assert_array_equal(found["mean_return"], returns)
+    np.testing.assert_array_equal(found["4/mean_return"], returns[:4])
+    again, _ = trained(
+        np.random.default_rng(seed_of(jax.random.key(3))), np.zeros(2), {"rate": 0.1}, 4
+    )
+    for prefix, expected in (("", weights), ("4/", again)):
+        held = [a for n, a in found.items() if n.startswith(f"{prefix}array/")]
+        assert any(np.array_equal(np.ravel(a), np.float32(expected)) for a in held), prefix
+    assert _reported(tmp_path / "8.part") == 8
+    assert _reported(tmp_path / "other.part") == 0
+    with (
+        unchecked(),
+        pytest.raises(ValueError, match="checkpoint was not called at 4 steps or after them"),
+    ):
+        train_once(train_reporting, seen, {**call, "values": {"rate": 0.5}, "checkpoints": [4]}, 3)
+
+
+@pytest.mark.slow
+def test_one_call_of_a_training_gives_all_its_rows():
+    reported, anew = sweep(train_reporting), sweep(train_anew)
+    wrong = reported.table[reported.table["rate"] == 0.5]
+    assert all("checkpoint was not called at 4 steps" in status for status in wrong["status"])
+    for name in ("steps", "failures", "simulations", "verdict"):
+        rows = [found.table.loc[found.table["rate"] < 0.4, name] for found in (reported, anew)]
+        np.testing.assert_array_equal(*rows)
 
 
 @pytest.mark.slow

@@ -62,6 +62,7 @@ def certify(
     p: float = 0.01,
     certification: Certification | None = None,
     seed: int = 0,
+    only_safe: bool = False,
     tie: float | None = None,
     remember: Remember | None = None,
     progress: ProgressReport | bool | None = None,
@@ -79,6 +80,10 @@ def certify(
     - `certification`: the attack on each policy and the samples of its certificate.
     - `seed`: the seed of samples and search. All policies get the same samples, which differ from
       those of a training with this seed.
+    - `only_safe`: whether to simulate only what shows policies to be safe: one that is shown to be
+      unsafe by fewer than `samples` gets no more, one whose rate is near `p` stays undecided if its
+      part of the budget is too small, the attack on a policy ends with the block in which it finds
+      a failure, and no samples are drawn to name the safest.
     - `tie`: failure rates that differ by less than this count as equally safe. The default is `p /
       10` or less, such that resolving it takes about as many samples as the minimum for all
       policies together.
@@ -121,13 +126,15 @@ def certify(
     rounds = -(-certified.attack_simulations // lanes)
     if tie is None:
         tie = min(p / 10, SETTLED / (len(policies) * samples))
-    allocation = Allocation(p, confidence, samples, budget, lanes, tie)
+    allocation = Allocation(p, confidence, samples, budget, lanes, tie, safest=not only_safe)
     sampled = [PolicyRecord() for _ in policies]
     attacked = [PolicyRecord() for _ in policies]
     report = _Report(progress, len(policies) * rounds * lanes, budget)
     stopped, margins = "decided", np.full(len(policies), np.nan)
     try:
-        attack_policies(blocks, attacked, attacker, rounds, report.attacked)
+        attack_policies(
+            blocks, attacked, attacker, rounds, report.attacked, until_failure=only_safe
+        )
         margins = np.array([one.lowest for one in attacked])
         stopped = _sample(blocks, sampled, allocation, margins, report)
     except KeyboardInterrupt:
@@ -203,8 +210,10 @@ def _sample(
             sampled[number].add(blocks.points(block), verdicts, block * blocks.lanes)
             report.sampled(blocks.lanes, undecided)
     open_ = allocation.undecided(failures, simulations).any()
+    if open_ or not allocation.safest:
+        return "budget" if open_ else "decided"
     named = find_leader(failures, simulations, allocation.tie, margins).chance >= allocation.sure
-    return "decided" if named and not open_ else "budget"
+    return "decided" if named else "budget"
 
 
 def _counts(records: list[PolicyRecord]) -> tuple[np.ndarray, np.ndarray]:

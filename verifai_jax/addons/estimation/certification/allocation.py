@@ -90,7 +90,10 @@ class Allocation:
     - `budget`: maximum number of samples of all policies together.
     - `tie`: rates that differ by less count as equal. For a leader without a failure about `2.5 /
       tie` samples decide.
-    - `verdicts`, `safest`: whether to decide the verdicts, and the safest policy.
+    - `verdicts`, `safest`: whether to decide the verdicts, and the safest policy. Without the
+      safest, samples only look for safe policies: one that is shown to be unsafe by fewer than
+      `samples` gets no more, and beyond them each gets its part of the budget at most, while that
+      may show it to be safe.
     """
 
     p: float = 0.01
@@ -117,6 +120,9 @@ class Allocation:
         """
         k, n = np.asarray(failures), np.asarray(simulations)
         missing = np.maximum(-(-(self.samples - n) // self.block), 0)
+        if not self.safest:
+            unsafe = self._is_shown(evidence_above, k, n)
+            missing = np.where(unsafe, 0, np.minimum(missing, np.maximum(n // self.block, 1)))
         if missing.any():
             return missing
         left = (self.budget - int(n.sum())) // self.block
@@ -133,11 +139,16 @@ class Allocation:
         self, failures: Int[np.ndarray, " n"], simulations: Int[np.ndarray, " n"]
     ) -> Bool[np.ndarray, " n"]:
         """Return the policies whose verdict is open, including those without samples."""
-        simulations = np.maximum(simulations, 1)
+        known = [self._is_shown(e, failures, simulations) for e in (evidence_below, evidence_above)]
+        return ~(known[0] | known[1])
+
+    def _is_shown(
+        self, evidence: Callable[..., np.ndarray], failures: Int[np.ndarray, " n"],
+        simulations: Int[np.ndarray, " n"],
+    ) -> Bool[np.ndarray, " n"]:  # fmt: skip
         limit = required_evidence(self.confidence, len(failures))
         p = np.full(len(failures), self.p)
-        safe = evidence_below(failures, simulations, p) > limit
-        return ~(safe | (evidence_above(failures, simulations, p) > limit))
+        return evidence(failures, np.maximum(simulations, 1), p) > limit
 
     def _grown(self, n: Int[np.ndarray, " n"]) -> Int[np.ndarray, " n"]:
         """Return the blocks of a round for policies with `n` samples."""
@@ -174,9 +185,10 @@ class Allocation:
         if not len(where):
             return blocks
         more = self._missing(k[where], n[where], len(n))
+        reach = math.inf if self.safest else self.budget / len(n)
         for index in np.argsort(more, kind="stable"):
             i, missing = where[index], more[index]
-            if not math.isfinite(missing) or missing > left * self.block:
+            if not math.isfinite(missing) or missing > min(left * self.block, reach):
                 break
             # What it shows on the way may change what is missing.
             wanted = math.ceil(missing / self.block)
@@ -198,7 +210,8 @@ class Allocation:
         steps = np.geomspace(self.block, maximum, 32)
         smallest = np.full(len(failures), np.inf)
         k, n = failures[:, None].astype(float), simulations[:, None] + steps
-        for evidence, level in ((evidence_below, 0.25), (evidence_above, 0.75)):
+        sides = ((evidence_below, 0.25), (evidence_above, 0.75))
+        for evidence, level in sides if self.safest else sides[:1]:
             rates = betaincinv(k + 0.5, simulations[:, None] - k + 0.5, level)
             found = evidence(k + rates * steps, n, np.full(n.shape, self.p)) > limit
             first = np.where(found.any(axis=1), steps[np.argmax(found, axis=1)], np.inf)

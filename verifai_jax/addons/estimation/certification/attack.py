@@ -82,7 +82,7 @@ def check_attack(problem: Problem, search: str | Search) -> Search:
 
 def attack_policies(
     blocks: Blocks, records: list[PolicyRecord], search: Search, rounds: int,
-    report: Callable[[int], None],
+    report: Callable[[int], None], *, until_failure: bool = False,
 ) -> None:  # fmt: skip
     """Attack every policy in rounds of one block each, and add the simulations to `records`.
 
@@ -92,6 +92,7 @@ def attack_policies(
     - `search`: the search of each policy.
     - `rounds`: number of blocks for each policy.
     - `report(simulations)`: called after each block, to show progress.
+    - `until_failure`: whether the attack on a policy ends with the block that shows a failure.
     """
     attackers = [
         Proposals(
@@ -102,7 +103,7 @@ def attack_policies(
     for round_ in range(rounds):
         chosen = []
         for number, attacker in enumerate(attackers):
-            if attacker.exhausted:
+            if attacker.exhausted or (until_failure and records[number].failures):
                 continue
             points = np.asarray(attacker.next(blocks.lanes), np.float32)
             if len(points):

@@ -29,6 +29,7 @@ from verifai_jax.addons.estimation.certification.simulators import (
 from verifai_jax.core.compute.executors import Executor
 from verifai_jax.core.compute.precision import truncate_silently
 from verifai_jax.core.user_code.source_collection import sources_of
+from verifai_jax.core.user_code.sources import Sources
 from verifai_jax.core.values.trace import Status
 from verifai_jax.evaluation.raising import Raising
 from verifai_jax.evaluation.verdicts import Verdicts
@@ -95,12 +96,19 @@ class Blocks:
         plans = []
         for group in group_policies(policies):
             numbers, together = group.numbers, group.traced
-            problem = _checked_problem(problem_of, policies[numbers[0]], numbers[0])
+            known = _known_problems(problem_of, group.structure) if together else []
+            if known:
+                problem, sources = known[0]
+            else:
+                problem = _checked_problem(problem_of, policies[numbers[0]], numbers[0])
+                sources = sources_of(problem, problem_of, made=problem.made_in or ())
+            self.sources = sources if first is None else self.sources
             first = problem if first is None else first
             _check_same(first, problem, numbers[0])
             problems = [problem]
-            if together and not problem.black_box:
+            if together and not problem.black_box and not known:
                 together = self._traceable(problem_of, group.weights[0], numbers)
+                known += [(problem, sources)] if together else []
             if not together or problem.black_box:
                 others = [_checked_problem(problem_of, policies[n], n) for n in numbers[1:]]
                 for number, other in zip(numbers[1:], others, strict=True):
@@ -134,7 +142,6 @@ class Blocks:
         )
         self._samples = _Samples(self.space, points_key)
         self._digests = [digest(policy, i) for i, policy in enumerate(policies)]
-        self.sources = sources_of(first, problem_of, made=first.made_in or ())
         self._about = f"{_common_digest(first, seed, lanes)}/{self.sources.code[:16]}"
 
     @property
@@ -292,6 +299,23 @@ class Blocks:
         return True
 
 
+def _known_problems(
+    problem_of: Callable[[Any], Problem], structure: str
+) -> list[tuple[Problem, Sources]]:
+    """Return a list for the checked problem of a structure that JAX traces, kept between calls."""
+    try:
+        return _kept_problems(problem_of, structure)
+    except TypeError:  # It cannot be hashed.
+        return []
+
+
+@lru_cache(maxsize=16)
+def _kept_problems(
+    problem_of: Callable[[Any], Problem], structure: str
+) -> list[tuple[Problem, Sources]]:
+    return []
+
+
 def _shipment(problem_of: Callable[[Any], Problem], executor: Executor) -> Shipment[Any]:
     """Return the shipment of `problem_of`, made once, so that workers keep its programs."""
     try:
@@ -309,14 +333,14 @@ class _Samples:
     """The sequence of independent samples of the prior that the constraint accepts."""
 
     def __init__(self, space: FeatureSpace, key: Any) -> None:
-        self._space, self._drawn = space, 0
+        self._space, self._key, self._drawn = space, key, 0
         self._points = np.zeros((0, space.dim), np.float32)
-        self._draw = jax.jit(lambda index: uniform_points(key, index, space.dim))
 
     def __call__(self, first: int, count: int) -> Float[np.ndarray, "count d"]:
         barren = 0
         while len(self._points) < first + count:
-            u = np.asarray(self._draw(self._drawn + np.arange(DRAWN, dtype=np.uint32)))
+            numbers = self._drawn + np.arange(DRAWN, dtype=np.uint32)
+            u = np.asarray(_drawn(self._key, numbers, self._space.dim))
             self._drawn += DRAWN
             if self._space.where is not None:
                 u = u[self.accepted(u)]
@@ -330,6 +354,9 @@ class _Samples:
 
     def accepted(self, u: Float[np.ndarray, "n d"]) -> Bool[np.ndarray, " n"]:
         return np.asarray(self._space.accepts_points(u))
+
+
+_drawn = jax.jit(uniform_points, static_argnums=2)
 
 
 def _from_memo(known: Arrays, count: int) -> Verdicts:

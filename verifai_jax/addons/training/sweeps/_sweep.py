@@ -113,7 +113,11 @@ def sweep(
 
 def _given(halving: Halving) -> dict[str, Any]:
     """Return the options of a halving as they are recorded, without those that are left out."""
-    return {name: value for name, value in asdict(halving).items() if value is not None}
+    return {
+        name: value
+        for name, value in asdict(halving).items()
+        if value is not None and value is not False
+    }
 
 
 def check_options(
@@ -143,6 +147,8 @@ def count_policies(study: Study, configurations: int, halving: Halving | None) -
     several_lengths = STEPS in study.space.domains
     checkpoints = 1 + sum(several_lengths or at < study.trainer.steps for at in study.checkpoints)
     left, total = configurations, 0
+    if halving is not None and halving.until_safe:
+        checkpoints = 1  # Only the last policy of a training is certified.
     for _ in range(checkpoints):
         total += left
         left = left if halving is None else halving.survivors(left)

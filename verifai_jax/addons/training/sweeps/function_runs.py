@@ -16,6 +16,7 @@ import random
 import shutil
 import sys
 import tempfile
+import threading
 import time
 import weakref
 from collections.abc import Callable, Hashable, Mapping, Sequence
@@ -34,7 +35,7 @@ from verifai_jax.addons.training.sweeps.clock import Clock
 from verifai_jax.addons.training.sweeps.fingerprint import digest
 from verifai_jax.addons.training.sweeps.record import Curve
 from verifai_jax.addons.training.sweeps.study import Study
-from verifai_jax.addons.training.sweeps.trainer import STEPS, FunctionTrainer, resumes, whole_number
+from verifai_jax.addons.training.sweeps.trainer import STEPS, FunctionTrainer, takes, whole_number
 from verifai_jax.addons.training.sweeps.training_runs import (
     RunCheckpoint,
     TrainingRun,
@@ -73,10 +74,12 @@ class FunctionRuns(TrainingRuns):
             weakref.finalize(self, shutil.rmtree, self._folder, ignore_errors=True)
         else:
             self._folder = cache.path.parent / "trainings"
-        if study.checkpoints and not resumes(self._trainer.train):
+        self._calls_back = takes(trainer.train, "checkpoint")
+        if study.checkpoints and not (self._calls_back or takes(trainer.train, "resume")):
             log.warning(
-                "%s has no argument resume: it trains anew up to each checkpoint",
-                self._trainer.name,
+                "%s has neither an argument resume nor checkpoint: it trains anew up to each "
+                "checkpoint",
+                trainer.name,
             )
 
     def add(self, values: Mapping[str, object], seed: int) -> int:
@@ -96,12 +99,17 @@ class FunctionRuns(TrainingRuns):
                 self._recall(number, at)
                 if (number, at) in self._checkpoints:
                     self._advanced(number, at)
-                elif number not in self.errors:
+                elif number not in self.errors and at in self._calls_of(number, rung):
                     waiting.append(number)
             if waiting:
                 self._call(waiting, at)
         if not further:
             self.forget(numbers)
+
+    def _calls_of(self, number: int, rung: int) -> range:
+        """Return the checkpoints up to which a run is trained by a call of their own."""
+        last = min(rung, self.rungs(number) - 1)
+        return range(last if self._calls_back else 0, last + 1)
 
     def forget(self, numbers: Sequence[int]) -> None:
         for number in numbers:
@@ -114,6 +122,10 @@ class FunctionRuns(TrainingRuns):
             run = self.runs[number]
             steps, folder = run.checkpoints[at], str(self._begin(number, at))
             calls.append({"values": dict(run.values), "steps": steps, "folder": folder})
+            earlier = enumerate(run.checkpoints[:at])
+            calls[-1]["checkpoints"] = [
+                c for i, c in earlier if (number, i) not in self._checkpoints
+            ]
             if number in self.starts:
                 calls[-1]["starts"] = self.starts[number]
         seeds = [self.runs[number].seed for number in numbers]
@@ -130,12 +142,26 @@ class FunctionRuns(TrainingRuns):
             futures = [self._submit(attempt, self._train, call, seed) for call, seed in pairs]
             gather(futures, ended, check=self.clock.check)
         else:
-            for index, outcome in self._pool.outcomes(calls, seeds, self.clock.limit):
-                if outcome.status == Status.OK:
-                    ended(index, cast("Arrays", outcome.trace))
-                elif outcome.message:  # Others had not begun when the time was over.
-                    ended(index, outcome.message)
+            over = threading.Event()
+            if self._calls_back:
+                threading.Thread(target=self._show, args=(calls, over), daemon=True).start()
+            try:
+                for index, outcome in self._pool.outcomes(calls, seeds, self.clock.limit):
+                    if outcome.status == Status.OK:
+                        ended(index, cast("Arrays", outcome.trace))
+                    elif outcome.message:  # Others had not begun when the time was over.
+                        ended(index, outcome.message)
+            finally:
+                over.set()
         self.clock.check()
+
+    def _show(self, calls: Sequence[Mapping[str, Any]], over: threading.Event) -> None:
+        """Show how far the trainings are that report it; runs in a thread."""
+        while not over.wait(1.0):
+            steps = [_reported(Path(call["folder"])) for call in calls]
+            if running := [(n, call["steps"]) for n, call in zip(steps, calls, strict=True) if n]:
+                done, total = (sum(each) for each in zip(*running, strict=True))
+                self.clock.advance(0, f"in training: {done:,} of {total:,} steps")
 
     def _begin(self, number: int, at: int) -> Path:
         """Make the folder of a call, with what the call before it left."""
@@ -149,9 +175,17 @@ class FunctionRuns(TrainingRuns):
 
     def _end(self, number: int, at: int, arrays: Arrays) -> None:
         """Store a finished call, and then let go of the one before it."""
-        folder = self._folder_of(number, at)
+        folder, run = self._folder_of(number, at), self.runs[number]
         shutil.rmtree(folder, ignore_errors=True)
         folder.with_suffix(".part").rename(folder)
+        for earlier in range(at if self._calls_back else 0):
+            prefix = f"{run.checkpoints[earlier]}/"
+            some = {n.removeprefix(prefix): a for n, a in arrays.items() if n.startswith(prefix)}
+            if some and (number, earlier) not in self._checkpoints:
+                self.cache.put({self.cache_name(number, earlier): some})
+                self._set_checkpoint(number, earlier, some)
+                self._advanced(number, earlier)
+        arrays = {name: array for name, array in arrays.items() if not name[0].isdigit()}
         self.cache.put({self.cache_name(number, at): arrays})
         self._set_checkpoint(number, at, arrays)
         if at:
@@ -228,8 +262,8 @@ def train_once(
     **Arguments:**
     - `train`: the training function, see `Trainer`.
     - `observation`: an example observation for policies that do not define their input, or None.
-    - `call`: the hyper-parameters `values`, the total `steps`, the `folder` to resume from, and
-      `starts`, whether the function receives it.
+    - `call`: the hyper-parameters `values`, the total `steps`, the `folder` to resume from, the
+      earlier `checkpoints`, and `starts`, whether the function receives it.
     - `seed`: training seed.
     **Returns:** the arrays, which the pool passes on unchanged.
     """
@@ -237,25 +271,73 @@ def train_once(
     np.random.seed(seed)  # noqa: NPY002 - what other frameworks draw from.
     if (torch := sys.modules.get("torch")) is not None:
         torch.manual_seed(seed)
-    options: dict[str, Any] = {"resume": Path(call["folder"])} if resumes(train) else {}
+    folder = Path(call["folder"])
+    reports = _Reports(call["checkpoints"], folder, observation)
+    given = {"resume": folder, "checkpoint": reports}
+    options: dict[str, Any] = {name: value for name, value in given.items() if takes(train, name)}
     if "starts" in call:
         options["starts"] = call["starts"]
     began = time.perf_counter()
     made = train(jax.random.key(seed), dict(call["values"]), steps=call["steps"], **options)
     seconds = time.perf_counter() - began
-    curve: Mapping[str, Any] = {"steps": (), "mean_return": ()}
+    curve: Mapping[str, Any] = reports.curve
     if isinstance(made, tuple) and len(made) == 2 and isinstance(made[1], Mapping):
         made, curve = (made[0], made[1]) if {*made[1]} == {*curve} else (made, curve)
+    if "checkpoint" in options and (
+        missing := [at for at in call["checkpoints"] if at > reports.last]
+    ):
+        raise ValueError(f"checkpoint was not called at {missing[0]} steps or after them")
+    return cast(Trace, {**_encode(made, observation, curve, seconds), **reports.taken})
+
+
+class _Reports:
+    """What a training function reports: how far it is, its returns, and policies at checkpoints.
+
+    `taken` has the arrays of the policies, with the steps of their checkpoints before the names.
+    """
+
+    def __init__(self, checkpoints: Sequence[int], folder: Path, observation: Any) -> None:
+        self.taken: dict[str, np.ndarray] = {}
+        self.curve: dict[str, list[float]] = {"steps": [], "mean_return": []}
+        self.last, self._began = 0, time.perf_counter()
+        self._checkpoints, self._folder, self._observation = checkpoints, folder, observation
+
+    def __call__(self, steps: int, policy: Any, mean_return: float | None = None) -> None:
+        """Report a policy after so many environment steps; see `Trainer`."""
+        if steps <= self.last:
+            raise ValueError(f"checkpoint was called at {steps} steps after {self.last} steps")
+        passed = [at for at in self._checkpoints if self.last < at <= steps]
+        self.last = int(steps)
+        if mean_return is not None:
+            self.curve["steps"].append(steps)
+            self.curve["mean_return"].append(mean_return)
+        for at in passed:
+            seconds = time.perf_counter() - self._began
+            arrays = _encode(policy, self._observation, self.curve, seconds)
+            self.taken |= {f"{at}/{name}": array for name, array in arrays.items()}
+        self._folder.with_suffix(".steps").write_text(str(self.last))
+
+
+def _reported(folder: Path) -> int:
+    """Return the steps that a training with this folder has reported; 0 before the first."""
+    try:
+        return int(folder.with_suffix(".steps").read_text() or 0)
+    except OSError:
+        return 0
+
+
+def _encode(
+    made: Any, observation: Any, curve: Mapping[str, Any], seconds: float
+) -> dict[str, np.ndarray]:
     graph, arrays, start = load(made, observation=observation).as_graph(observation)
     held = {**arrays, **{name: s for (name, _), s in zip(graph.memory, start, strict=True)}}
-    found = {
+    return {
         "graph": np.frombuffer(json.dumps(graph.to_json()).encode(), np.uint8),
         "steps": np.asarray(curve["steps"], np.int64),
         "mean_return": np.asarray(curve["mean_return"], np.float64),
         "seconds": np.asarray(seconds, np.float64),
         **{f"{ARRAY}{name}": array for name, array in held.items()},
     }
-    return cast(Trace, found)
 
 
 def attempt(

@@ -2,6 +2,7 @@
 
     sweep(study, configurations=64, halving=Halving(reduction=3))
     sweep(study, configurations=64, halving=Halving(reduction=1, p=0.5))    # the unsafe ones end
+    sweep(study, configurations=64, halving=Halving(1, until_safe=True))    # those that pass end
 
 Source: Jamieson and Talwalkar, Non-stochastic best arm identification and hyperparameter
 optimization (2016), figure 1; Li et al., A system for massively parallel hyperparameter tuning
@@ -25,7 +26,7 @@ class Halving:
 
     **Arguments:**
     - `reduction`: greater than 1; the share 1/reduction of the configurations continues, rounded
-      up. It may be 1 if `p` is given.
+      up. It may be 1 with `p` or `until_safe`.
     - `by`: the criterion. `"return"` is the nominal return at the checkpoint; `"safety"` is the
       failure rate of the closed loop in a few simulations, then the worst robustness, then the
       return.
@@ -34,6 +35,9 @@ class Halving:
       sampling stops, for all policies and checkpoints together, with the confidence of the sweep's
       `Certification`. A policy that fails now may be safe after more training, so choose what no
       training overcomes in the steps that are left.
+    - `until_safe`: a configuration also ends at a checkpoint where the policies of all its seeds
+      pass a test: at most half of the study's `p` of 256 samples fail, which no certificate uses.
+      Only the last policy of a training is certified then, since no earlier one passed.
     **Raises:** `ValueError` for a reduction of 1 or less, and for a `p` that is no probability;
     `UnknownNameError` for another criterion.
     """
@@ -41,10 +45,11 @@ class Halving:
     reduction: float = 3.0
     by: str = RETURN
     p: float | None = None
+    until_safe: bool = False
 
     def __post_init__(self) -> None:
         number = isinstance(self.reduction, int | float) and not isinstance(self.reduction, bool)
-        ends = self.p is not None and self.reduction == 1
+        ends = (self.p is not None or self.until_safe) and self.reduction == 1
         if not (number and (ends or 1 < self.reduction < math.inf)):
             raise ValueError(f"reduction must be greater than 1; got {self.reduction!r}")
         if self.p is not None:

@@ -35,6 +35,8 @@ SCREENING = 64
 """Samples of a policy, and simulations of the attack on it, by which a search or halving chooses.
 
 Certificates take fresh samples."""
+TEST = 256
+"""Samples of the test that ends a training with `Halving(until_safe=True)`."""
 _MAX_BARREN = 64
 """Rounds of a search without a new configuration before proposals end."""
 FOR_TRAINING = 2 / 3
@@ -53,11 +55,15 @@ def runs_of(
 
 @dataclass(eq=False)
 class _Configuration:
-    """One configuration: values, training runs, and the checkpoint at which halving stopped it."""
+    """One configuration: values, training runs, and the checkpoint at which halving stopped it.
+
+    - `passed`: whether it was stopped as its policies passed the test of `until_safe`.
+    """
 
     values: Hyperparameters
     runs: tuple[int, ...]
     stopped: int | None = None
+    passed: bool = False
 
 
 @dataclass(eq=False)
@@ -139,17 +145,24 @@ class RunningSweep:
             self.runs.train(runs, max(map(self.runs.rungs, runs)) - 1)
             self._measure_returns(runs)
             return
+        compares = self.halving.reduction > 1
         for rung in range(last + 1):
             self.runs.train(self._runs_of(numbers), rung, further=rung < last)
-            self._measure_returns(self._runs_of(numbers))
+            if compares:
+                self._measure_returns(self._runs_of(numbers))
             if rung < last:
                 left = self._without_unsafe(numbers, rung, self.halving.p, last)
-                values = self._halving_objectives(self.halving.by, left, rung)
-                selected = self.halving.select(values)
+                if self.halving.until_safe:
+                    left = self._without_passed(left, rung)
+                selected = left
+                if compares:
+                    values = self._halving_objectives(self.halving.by, left, rung)
+                    selected = self.halving.select(values)
                 for number in set(numbers) - set(selected):
                     self.configurations[number].stopped = rung
                     self.runs.forget(self.configurations[number].runs)
                 numbers = selected
+        self._measure_returns(runs)
 
     def _without_unsafe(
         self, numbers: Sequence[int], rung: int, p: float | None, rungs: int
@@ -166,16 +179,32 @@ class RunningSweep:
         never = {entry for group in groups.values() for entry in group if entry not in found}
         return [number for number in numbers if not {*groups[number]} <= unsafe | never]
 
+    def _without_passed(self, numbers: Sequence[int], rung: int) -> list[int]:
+        """Return the configurations with a policy at a rung that does not pass the test."""
+        groups = {number: self._entries_of(number, rung) for number in numbers}
+        entries = [entry for group in groups.values() for entry in group if self._is_finite(entry)]
+        p, confidence = self.study.p, self.certified.confidence
+        for samples in (SCREENING, TEST):  # Most that do not pass show it by the first ones.
+            found = self._quick_certificates(entries, [3, rung], p, confidence, samples, 0)
+            fails = {entry: columns_of(one)["failures"] for entry, one in found.items()}
+            entries = [entry for entry in entries if fails[entry] <= TEST * p / 2]
+        for number, group in groups.items():
+            self.configurations[number].passed = {*group} <= {*entries}
+        return [number for number in numbers if not self.configurations[number].passed]
+
     def _quick_certificates(
-        self, entries: Sequence[tuple[int, int]], stream: Sequence[int], p: float, confidence: float
-    ) -> dict[tuple[int, int], Certificate]:
+        self, entries: Sequence[tuple[int, int]], stream: Sequence[int], p: float,
+        confidence: float, samples: int = SCREENING, attack: int = SCREENING,
+    ) -> dict[tuple[int, int], Certificate]:  # fmt: skip
         """Certify policies by few simulations, to choose among configurations."""
+        if not entries:
+            return {}
         # Other samples than those of the certificates.
         words = np.random.SeedSequence([self.options["seed"], *stream]).generate_state(1)
-        samples = min(SCREENING, self.options["samples"])
+        samples = min(samples, self.options["samples"])
         screening = replace(
             self.certified, samples=samples, budget=samples * len(entries), confidence=confidence,
-            attack_simulations=min(SCREENING, self.options["attack_simulations"]),
+            attack_simulations=min(attack, self.options["attack_simulations"]),
         )  # fmt: skip
         policies = [self._policy(entry) for entry in entries]
         certificates = self._certify_policies(policies, screening, int(words[0]), p, progress=None)
@@ -280,9 +309,7 @@ class RunningSweep:
         returns = [self.returns[entry] for entry in finite]
         if self.return_range is None and returns:
             self.return_range = min(returns), max(returns)
-        safety: dict[tuple[int, int], Certificate] = {}
-        if finite:
-            safety = self._quick_certificates(finite, [1], self.study.p, self.certified.confidence)
+        safety = self._quick_certificates(finite, [1], self.study.p, self.certified.confidence)
         objectives: dict[int, float | None] = {}
         for number, group in entries.items():
             values = [self._objective(entry, safety.get(entry)) for entry in group]
@@ -307,6 +334,8 @@ class RunningSweep:
             for rung in range(self.runs.rungs(run))
             if self._is_finite((run, rung))
         ]
+        if self.halving is not None and self.halving.until_safe:
+            entries = list({run: (run, rung) for run, rung in entries}.values())
         if not entries:
             return None
         total = len(entries) * self.options["samples"]
@@ -339,7 +368,8 @@ class RunningSweep:
 
         return certify(
             self.study.problem, policies, p=p, certification=certification, seed=seed,
-            remember=remember, run_on=RunOn(executor=self.executor), progress=progress,
+            only_safe=True, remember=remember, run_on=RunOn(executor=self.executor),
+            progress=progress,
         )  # fmt: skip
 
     # The record
@@ -370,7 +400,8 @@ class RunningSweep:
             checkpoint, entry = self.runs.checkpoint(run, rung), (run, rung)
             if checkpoint is None:
                 continue
-            status = record.TRAINED if configuration.stopped != rung else record.STOPPED
+            ended = configuration.stopped == rung and not configuration.passed
+            status = record.STOPPED if ended else record.TRAINED
             status = status if checkpoint.finite else record.NONFINITE
             value, safety = self.returns.get(entry, float("nan")), self.safety.get(entry)
             known = {"checkpoint": checkpoint, "nominal_return": value, "safety": safety}

@@ -53,7 +53,9 @@ class Trainer:
     receives the random key of the training seed, a dictionary of plain values, and the total number
     of environment steps. `resume` is a folder, empty at first: files written there at one
     checkpoint are there again when the function is called for the next. A function without this
-    argument trains from the start up to each checkpoint. Processes are used again for other calls,
+    argument trains from the start up to each checkpoint, unless it has the argument `checkpoint`: a
+    function to call while it trains, `checkpoint(steps, policy, mean_return)`, which shows progress
+    and takes the policies at the study's checkpoints. Processes are used again for other calls,
     so nothing that a call leaves in global variables may matter. It returns anything that
     `vj.policy` accepts, or `(policy, {"steps": [...], "mean_return": [...]})` with its learning
     curve.
@@ -364,9 +366,9 @@ class FunctionTrainer(Trainer):
             ) from error
 
 
-def resumes(train: Train) -> bool:
-    """Return whether a training function accepts the folder of its last checkpoint."""
-    return "resume" in inspect.signature(train).parameters
+def takes(train: Train, name: str) -> bool:
+    """Return whether a training function has an argument of this name."""
+    return name in inspect.signature(train).parameters
 
 
 def _observation_shape(task: Task) -> tuple[int, ...]:
