@@ -108,7 +108,9 @@ def last_chance(
         search = EscapeSearch(means, course, decisions, forks, rounds, seed)
         search.climbs &= gradients
         last, following = search.bracket()
+        time = lambda decision: round(decision * means.period * dt, 9)  # noqa: E731
         proved, notes = None, [*note_on_key(problem, number or 0), *search.notes]
+        notes += [f"an escape from {time(i):zg} s failed simulated alone" for i in search.lost]
         if isinstance(means, Controls):
             if proof_seconds > 0 and following < decisions:
                 proved, why = first_proved(search, means, following, precision, proof_seconds)
@@ -118,7 +120,6 @@ def last_chance(
                 notes.append("the policy's own actions leave the bounds of the actions")
         broken = broken_at(problem.formulas[failing.worst], failing.trace, problem.end).values()
         first = min((int(np.argmax(at)) for at in broken), default=length - 1)
-        time = lambda decision: round(decision * means.period * dt, 9)  # noqa: E731
         kept = sorted(search.alone, reverse=True)[:MAX_ESCAPES]
         return LastChance(
             number, means.who, float(np.asarray(failing.trace.clock())[first]),
@@ -131,8 +132,9 @@ def last_chance(
 
 def _escape(search: EscapeSearch, failing: Replay, instant: int, time: Any) -> Escape:
     """Return an escape as a result shows it."""
-    found, means, more, did = search.found[instant], search.means, {}, ["the other policy"]
+    found, means, did = search.found[instant], search.means, ["the other policy"]
     stop, (trace, rho) = int(found.stop), search.alone[instant]
+    more: dict[str, Any] = {}
     if isinstance(means, Controls):
         actions = means.actions(np.asarray(found.numbers), np)[instant:stop]
         own, more = means.own(search.forks)[instant:stop].mean(0), {"actions": actions}

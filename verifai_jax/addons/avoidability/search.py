@@ -111,7 +111,7 @@ class EscapeSearch:
         self.tried: dict[int, Proposals] = {}
         self.found: dict[int, Choice] = {}
         self.alone: dict[int, tuple[Trace, float]] = {}
-        self.simulations, self.notes = 0, list[str]()
+        self.simulations, self.notes, self.lost = 0, list[str](), list[int]()
         self.climbs = means.shape[1] > 0 and not all(means.levels)
 
     def bracket(self) -> tuple[int, int]:
@@ -167,7 +167,7 @@ class EscapeSearch:
             rho[some], escaped[some] = (part[: len(starts) - begin] for part in judged)
         self.simulations += len(starts)
         count_done(len(starts))
-        if self.means.constraint is not None:
+        if self.means.constraint is not None and len(starts):
             escaped &= np.asarray(self.means.constraint(np.float32(plans[0][:, 0])))
         return rho, escaped
 
@@ -238,7 +238,8 @@ class EscapeSearch:
         found, tried = self.found.pop(instant), []
         stops = np.arange(instant + 1, int(found.stop) if self.means.ends else 0)
         numbers = np.repeat(np.asarray(found.numbers)[None], len(stops), axis=0)
-        if (escaped := self.judge(np.full(len(stops), instant), numbers, stops)[1]).any():
+        escaped = self.judge(np.full(len(stops), instant), numbers, stops)[1]
+        if escaped.any():
             tried = [found._replace(stop=np.int32(stops[np.argmax(escaped)]))]
         for choice in (*tried, found):
             verdict, trace = self.means.alone(self.forks, choice)
@@ -247,7 +248,7 @@ class EscapeSearch:
                 self.found[instant] = choice
                 self.alone[instant] = jax.tree.map(np.asarray, trace), float(rho[0])
                 return True
-        self.notes.append(f"an escape from decision {instant} failed when simulated alone")
+        self.lost.append(instant)
         return False
 
 

@@ -5,6 +5,7 @@ installed. Kernels take a minute to compile, once for a machine.
 """
 
 import sys
+from typing import Any
 
 import jax
 import numpy as np
@@ -40,11 +41,15 @@ def balls(option="", more="", **options):
 
 # The last row is lost at once.
 ROWS = {
-    "v": np.float32([0.0, 0.5, 1.0, 2.0, -1.0, 1e12]),
-    "step": np.float32([0.6, 0.45, 0.8, 0.5, 0.6, 0.6]),
-    "weight": np.float32([4.0, 1.0, 2.0, 4.0, 8.0, 4.0]),
+    "v": np.array([0.0, 0.5, 1.0, 2.0, -1.0, 1e12], np.float32),
+    "step": np.array([0.6, 0.45, 0.8, 0.5, 0.6, 0.6], np.float32),
+    "weight": np.array([4.0, 1.0, 2.0, 4.0, 8.0, 4.0], np.float32),
 }
 KEYS = jax.random.split(jax.random.key(0), 6)
+
+
+def rolled(system) -> Any:
+    return system.simulate_batch(ROWS, KEYS)
 
 
 def close(here, there, atol):
@@ -95,7 +100,7 @@ class TestAgainstC:
         close(here, there, 2e-3)
 
     def test_contacts_and_fixed_geoms_that_features_move(self):
-        here, there = (balls(backend=b).simulate_batch(ROWS, KEYS) for b in ("warp", "native"))
+        here, there = (rolled(balls(backend=b)) for b in ("warp", "native"))
         np.testing.assert_array_equal(here.signals["step"][:, 0, 0], ROWS["step"])
         assert here.signals["on"].max() == 1
         close(here, there, 1e-5)
@@ -104,7 +109,7 @@ class TestAgainstC:
     def test_contacts_that_do_not_fit_are_computed_again_with_more_room(self, monkeypatch):
         from verifai_jax.addons.simulators.mujoco.warp_rollout import WarpBatch
 
-        wanted, made, old = balls(backend="warp").simulate_batch(ROWS, KEYS), [], WarpBatch._make
+        wanted, made, old = rolled(balls(backend="warp")), [], WarpBatch._make
 
         def small(self):
             self.capacity = self.capacity or {"nconmax": 1, "njmax": 4}
@@ -112,7 +117,7 @@ class TestAgainstC:
             return old(self)
 
         monkeypatch.setattr(WarpBatch, "_make", small)
-        close(balls(backend="warp").simulate_batch(ROWS, KEYS), wanted, 0.0)
+        close(rolled(balls(backend="warp")), wanted, 0.0)
         assert made[-1]["njmax"] > 4
 
     def test_a_search_without_gradients_finds_and_confirms_a_failure(self):
