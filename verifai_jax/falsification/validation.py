@@ -75,9 +75,11 @@ def check_search(problem: object, search: object) -> Search:
 
 
 def _why_not_traced(system: System) -> str:
-    """Return the reason why none of a system's backends can be traced by JAX; empty if one can."""
-    if not system.backends or "mjx" in system.backends:
+    """Return which of a system's backends JAX traces, or why none is; empty without backends."""
+    if not system.backends:
         return ""
+    if "mjx" in system.backends:
+        return ", or the backend 'mjx', which has gradients"
     return f". It does not run on mjx: {system.why_not('mjx')}"
 
 

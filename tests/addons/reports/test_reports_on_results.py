@@ -11,6 +11,7 @@ from click.testing import CliRunner
 from planted_sweep import SPACE, planted_rows, record_of
 
 import verifai_jax as vj
+from verifai_jax.addons.estimation.commands.compare import stored_candidate
 from verifai_jax.addons.estimation.comparison.result import Compared, Comparison
 from verifai_jax.addons.estimation.paired_rates import paired_rates
 from verifai_jax.addons.estimation.result import Estimate
@@ -52,7 +53,8 @@ def test_an_estimate(tmp_path):
 def test_a_comparison(tmp_path):
     rates = paired_rates(5, 60, 4000, 0.95)
     pairs = pd.DataFrame({"a<b>": np.linspace(0, 1, 65), "worse": [True] * 60 + [False] * 5})
-    compared = Compared("new", rates, 20, 0.002, pairs, pairs, PROBLEM.space)
+    calm = paired_rates(1, 3, 4000, 0.95), 3, 5
+    compared = Compared("new", rates, 20, 0.002, pairs, pairs, PROBLEM.space, calm)
     path = Comparison("old", (compared,), 8000, "decided", 1.0, 7).report(tmp_path / "c.html")
     text = path.read_text()
     assert "new is worse, compared with old. All verdicts hold together at 95 %." in text
@@ -60,6 +62,10 @@ def test_a_comparison(tmp_path):
     assert "10 of 65, in the order of sampling." in text
     assert str(rates) in claims_of(path)[0]["claim"]
     assert re.search(r"seed=7", text)
+    without = (
+        "new: without disturbances it fails in 0.125 % of the same pairs, the baseline in 0.075"
+    )
+    assert without in " ".join(text.split())
 
 
 def test_what_a_command_wrote_as_json(tmp_path, monkeypatch):
@@ -75,11 +81,19 @@ def test_what_a_command_wrote_as_json(tmp_path, monkeypatch):
     assert CliRunner().invoke(main, ["report", "estimate.json"]).exit_code == 0
     assert "Fails with probability 0.0012" in (tmp_path / "estimate.html").read_text()
     rates = paired_rates(5, 60, 4000, 0.95)
-    one = {"name": "new", "margin": 0.002, "both_fail": 20, **as_plain(rates)}
-    whole = {"command": "compare", "baseline": "old", "candidates": [one], "simulations": 8000}
+    frame, calm = pd.DataFrame(), (paired_rates(1, 3, 4000, 0.95), 3, 5)
+    one = Compared("new", rates, 20, 0.002, frame, frame, PROBLEM.space, calm)
+    stored_one = stored_candidate(one)
+    whole = {"command": "compare", "baseline": "old", "candidates": [stored_one]}
+    whole["simulations"] = 8000
     whole |= {"stopped": "decided", "seconds": 1.0, "seed": 7, "notes": []}
     stored.write_text(json.dumps(whole))
-    assert read_result(stored, PROBLEM.space).candidates[0].rates == rates
+    again = read_result(stored, PROBLEM.space).candidates[0]
+    assert (again.rates, again.undisturbed, str(again)) == (rates, calm, str(one))
+    # A file of before has no arm without disturbances.
+    del stored_one["undisturbed"]
+    stored.write_text(json.dumps(whole))
+    assert read_result(stored, PROBLEM.space).candidates[0].undisturbed is None
     with pytest.raises(ValueError, match="give a problem that was compared"):
         read_result(stored)
 

@@ -48,7 +48,7 @@ class TestWithScenic:
         import scenic
 
         own, steered = [], []
-        for seed in range(5):
+        for seed in range(10):
             random.seed(seed)
             np.random.seed(seed)  # noqa: NPY002 - what Scenic draws from
             own.append(scenes_until_failure(scenic.scenarioFromString(PROGRAM, mode2D=True)))

@@ -7,51 +7,36 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from verifai_jax.addons.avoidability.means import Controls, OtherPolicy, Surroundings
-from verifai_jax.addons.avoidability.proof import first_proved
+from verifai_jax.addons.avoidability.means import Controls, Means, OtherPolicy, Surroundings
 from verifai_jax.addons.avoidability.result import Escape, LastChance
-from verifai_jax.addons.avoidability.search import EscapeSearch, Programs, escaping
+from verifai_jax.addons.avoidability.search import EscapeSearch, first_proved
 from verifai_jax.core.compute.compilation import Slot
 from verifai_jax.core.compute.keys import run_keys
 from verifai_jax.core.compute.precision import in_precision
 from verifai_jax.core.display.progress import shows_progress
 from verifai_jax.core.messages.checks import check_count
 from verifai_jax.core.messages.errors import suggests_options, unknown_name
-from verifai_jax.core.values.trace import Trace
 from verifai_jax.counterexamples.fixed_key import note_on_key
 from verifai_jax.counterexamples.selection import Row, problem_of, select_row
 from verifai_jax.evaluation.replay import Replay, replay
 from verifai_jax.falsification.run import Run
 from verifai_jax.mtl.blame import broken_at
 from verifai_jax.problem.problem import Problem
-from verifai_jax.systems.actions import Action
 from verifai_jax.systems.base import System
 
-INSTANTS = 16
-"""Instants that are searched at once."""
-FURTHER = (0, 1, 3, 7)
-"""Instants after the bracket, as their distance from its end, that are searched once more."""
-MAX_ESCAPES = 4
-"""Escapes that a result keeps."""
-PROGRAMS: Slot[tuple[Any, ...], Programs] = Slot("escapes")
+MAX_ESCAPES, AT_AN_END = 4, 0.02
+"""Escapes that a result keeps; and the share of its range within which an action is at a bound."""
+PROGRAMS: Slot[tuple[Any, ...], Means] = Slot("escapes")
 
 
 @suggests_options
 @shows_progress("looking for the last chance in", "simulations")
 def last_chance(
-    run: Run | Problem,
-    row: Row = None,
-    *,
-    by: str | System = "controller",
-    actions: Action | tuple[Any, Any] | None = None,
-    features: Iterable[str] = (),
-    forks: int = 2048,
-    rounds: int = 12,
-    gradients: bool = True,
-    proof_seconds: float = 20.0,
-    seed: int = 0,
+    run: Run | Problem, row: Row = None, *, by: str | System = "controller",
+    actions: tuple[Any, Any] | None = None, features: Iterable[str] = (), forks: int = 2048,
+    rounds: int = 12, gradients: bool = True, proof_seconds: float = 20.0, seed: int = 0,
     progress: bool | None = None,
-) -> LastChance:
+) -> LastChance:  # fmt: skip
     """Find the last instant at which a failure could still have been avoided, as a bracket.
 
     Forks of the failing simulation begin at many instants and go on with other actions. The result
@@ -105,120 +90,75 @@ def last_chance(
                 f"{'the simulation' if number is None else f'row {number}'} of {problem.name!r} "
                 f"does not fail when simulated again: {str(failing).splitlines()[0]}"
             )
-        given = jax.tree.map(jnp.asarray, failing.features)
+        given, length = jax.tree.map(jnp.asarray, failing.features), failing.trace.length
+        dt = float(failing.trace.dt or 1.0)
         names = (features,) if isinstance(features, str) else tuple(features)
 
-        def make() -> Programs:
+        def make() -> Means:
             if isinstance(by, System):
-                return Programs(problem, OtherPolicy(problem, by))
+                return OtherPolicy(problem, by)
             if by == "environment":
-                return Programs(problem, Surroundings(problem, names))
-            trace = jax.eval_shape(problem.system, given, failing.key)
-            return Programs(problem, Controls(problem, trace.length, trace.dt or 1.0, actions))
+                return Surroundings(problem, names)
+            return Controls(problem, length, dt, actions)
 
-        programs = problem.programs.get(PROGRAMS, (by, repr(actions), names, precision), make)
-        course = programs.course(given, failing.key)
-        search = EscapeSearch(programs, course, forks, rounds, seed)
-        search.climbs &= gradients
-        bracket = _Bracket(search, failing)
-        return bracket.result(precision, proof_seconds)
-
-
-class _Bracket:
-    """The refinement of the bracket, in numbers of decisions."""
-
-    def __init__(self, search: EscapeSearch, failing: Replay) -> None:
-        self.search, self.means, self.failing = search, search.means, failing
-        self.tried: set[int] = set()
-        self.alone: dict[int, tuple[Trace, float]] = {}
+        means = problem.programs.get(PROGRAMS, (by, repr(actions), names, precision), make)
         # A decision at the last sample changes nothing.
-        self.count = -(-(failing.trace.length - 1) // self.means.period)
-
-    def result(self, precision: str, proof_seconds: float) -> LastChance:
-        """Search, prove, and return the result."""
-        last, following = self.refined()
-        search, means, problem = self.search, self.means, self.failing.problem
-        proved, notes = None, [*note_on_key(problem, self.failing.row or 0), *search.notes]
+        decisions = -(-(length - 1) // means.period)
+        course = means.course(given, failing.key)
+        search = EscapeSearch(means, course, decisions, forks, rounds, seed)
+        search.climbs &= gradients
+        last, following = search.bracket()
+        time = lambda decision: round(decision * means.period * dt, 9)  # noqa: E731
+        proved, notes = None, [*note_on_key(problem, number or 0), *search.notes]
+        notes += [f"an escape from {time(i):zg} s failed simulated alone" for i in search.lost]
         if isinstance(means, Controls):
-            if proof_seconds > 0 and following < self.count:
-                ends = (following, self.count)
-                proved, why = first_proved(search, means, *ends, precision, proof_seconds)
+            if proof_seconds > 0 and following < decisions:
+                proved, why = first_proved(search, means, following, precision, proof_seconds)
                 notes += [why] if why else []
-            own, slack = means.own(search.forks)[: self.count], 1e-3 * (means.high - means.low)
+            own, slack = means.own(course)[:decisions], 1e-3 * (means.high - means.low)
             if np.any((own < means.low - slack) | (own > means.high + slack)):
                 notes.append("the policy's own actions leave the bounds of the actions")
-        formula = problem.formulas[self.failing.worst]
-        broken = broken_at(formula, self.failing.trace, problem.end).values()
-        first = min((int(np.argmax(at)) for at in broken), default=self.failing.trace.length - 1)
+        broken = broken_at(problem.formulas[failing.worst], failing.trace, problem.end).values()
+        first = min((int(np.argmax(at)) for at in broken), default=length - 1)
+        kept = sorted(search.alone, reverse=True)[:MAX_ESCAPES]
         return LastChance(
-            self.failing.row, means.who, float(np.asarray(self.failing.trace.clock())[first]),
-            None if last < 0 else self.time(last), self.time(following),
-            None if proved is None else self.time(proved),
-            tuple(self.escape(i) for i in sorted(self.alone, reverse=True)[:MAX_ESCAPES]),
-            tuple(map(self.time, sorted(self.tried))), search.simulations, self.failing,
-            tuple(notes),
+            number, means.who, float(np.asarray(failing.trace.clock())[first]),
+            None if last < 0 else time(last), time(following),
+            None if proved is None else time(proved),
+            tuple(_escape(search, failing, i, time) for i in kept),
+            tuple(map(time, sorted(search.tried))), search.simulations, failing, tuple(notes),
         )  # fmt: skip
 
-    def time(self, instant: int) -> float:
-        return round(instant * self.means.period * float(self.failing.trace.dt or 1.0), 9)
 
-    def refined(self) -> tuple[int, int]:
-        """Return the last instant with an escape, -1 without one, and the next one tried."""
-        low, high = -1, self.count
-        while True:
-            while high - low > 1:
-                count = INSTANTS if self.means.shape[1] else self.count
-                spread = np.linspace(low + 1, high - 1, min(count, high - low - 1))
-                tried = np.unique(spread.round().astype(int)).tolist()
-                low = max([low, *self.explored(tried)])
-                high = min((i for i in tried if i > low), default=high)
-            # No escape at one instant says nothing of later ones: search some again, longer.
-            later = [high + by for by in FURTHER if high + by < self.count]
-            if not self.means.shape[1] or not self.explored(later, 2):
-                return low, high
-            low = max(self.alone)
-            high = min((i for i in self.tried if i > low), default=self.count)
+def _escape(search: EscapeSearch, failing: Replay, instant: int, time: Any) -> Escape:
+    """Return an escape as a result shows it."""
+    found, means, did = search.found[instant], search.means, ["the other policy"]
+    stop, (trace, rho) = int(found.stop), search.alone[instant]
+    more: dict[str, Any] = {}
+    if isinstance(means, Controls):
+        actions = means.actions(np.asarray(found.numbers), np)[instant:stop]
+        own, more = means.own(search.forks)[instant:stop].mean(0), {"actions": actions}
+        names = [f"action[{i}]" for i in range(len(own))] if len(own) > 1 else ["action"]
+        of_each = zip(names, map(_course, actions.T, means.low, means.high), own, strict=True)
+        did = [f"{name} {what} instead of {mean:z.3g} on average" for name, what, mean in of_each]
+    elif isinstance(means, Surroundings):
+        new = means.space.rows(jax.tree.map(np.asarray, means.space.features_at(found.numbers)))
+        old = failing.columns()
+        changed = {n: (v[0], old[n]) for n, v in new.items() if v[0] != old[n]}
+        did, more = (
+            [f"{n} {v} instead of {o}" for n, (v, o) in changed.items()],
+            {"features": changed},
+        )
+    ends = time(stop) if means.ends and stop < means.shape[0] else None
+    return Escape(time(instant), ends, rho, trace, ", ".join(did), **more)
 
-    def explored(self, instants: list[int], effort: int = 1) -> list[int]:
-        """Return the instants with an escape that a simulation alone confirms."""
-        self.tried.update(instants)
-        found = self.search.found
-        for instant in self.search.explore(instants, effort):
-            for escape in (self._shortened(instant), found[instant]):
-                verdict, trace = self.search.programs.alone(self.search.forks, escape)
-                rho, kept = escaping(*(np.asarray(part)[None] for part in verdict))
-                if kept[0]:
-                    found[instant] = escape
-                    self.alone[instant] = jax.tree.map(np.asarray, trace), float(rho[0])
-                    break
-            else:
-                del found[instant]
-                note = f"an escape from {self.time(instant):zg} s failed when simulated alone"
-                self.search.notes.append(note)
-        return [i for i in instants if i in self.alone]
 
-    def _shortened(self, instant: int) -> Any:
-        """Return an escape with the earliest stop, after which the policy goes on."""
-        found = self.search.found[instant]
-        stops = np.arange(instant + 1, int(found.stop) + 1) if self.means.ends else np.zeros(0, int)
-        if not len(stops):
-            return found
-        numbers = np.repeat(np.asarray(found.numbers)[None], len(stops), axis=0)
-        escaped = self.search.judge(np.full(len(stops), instant), numbers, stops)[1]
-        return found._replace(stop=np.int32(stops[np.argmax(escaped)])) if escaped.any() else found
-
-    def escape(self, instant: int) -> Escape:
-        """Return an escape as a result shows it."""
-        found, means, details = self.search.found[instant], self.means, {}
-        stop, numbers = int(found.stop), np.asarray(found.numbers)
-        if isinstance(means, Controls):
-            details["actions"] = means.actions(numbers, np)[instant:stop]
-            details["own"] = means.own(self.search.forks)[instant:stop]
-            details["bounds"] = means.low, means.high
-        elif isinstance(means, Surroundings):
-            new = means.space.rows(jax.tree.map(np.asarray, means.space.features_at(found.numbers)))
-            old = self.failing.columns()
-            details["features"] = {n: (v[0], old[n]) for n, v in new.items() if v[0] != old[n]}
-        ends = means.ends and stop < means.shape[0]
-        trace, rho = self.alone[instant]
-        return Escape(self.time(instant), self.time(stop) if ends else None, rho, trace, **details)
+def _course(values: np.ndarray, low: float, high: float) -> str:
+    """Describe the values of one entry of the actions."""
+    said = []
+    for end, word in ((low, "lowest"), (high, "highest")):
+        share = float(np.mean(np.abs(values - end) <= AT_AN_END * (high - low)))
+        if share > 0.99:
+            return f"at its {word}, {end:z.4g},"
+        said += [f"at its {word}, {end:z.4g}, for {share:.0%} of the time"] * (share >= 0.1)
+    return ", ".join([*said, f"{values.mean():z.3g} on average"])

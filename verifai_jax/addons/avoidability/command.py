@@ -8,6 +8,9 @@ from verifai_jax.cli.arguments import option
 from verifai_jax.cli.exit_codes import check_again
 from verifai_jax.cli.json_output import command, draw, give_result, say
 
+GIVEN = ("row", "by", "failed", "avoidable_until", "no_escape_from", "proved_from", "simulations")
+"""Fields of the result that are written as JSON."""
+
 
 @command()
 @arguments.RUN
@@ -30,9 +33,8 @@ def last_chance(
 
     found = run(arguments.load_judged_run(folder, target), row, **options)
     say(found)
-    names = ("row", "by", "failed", "avoidable_until", "no_escape_from", "proved_from")
-    give_result(**{name: getattr(found, name) for name in names}, text=str(found))
-    give_result(simulations=found.simulations, escape=str(found.escape or ""))
+    fields = {name: getattr(found, name) for name in GIVEN}
+    give_result(**fields, escape=str(found.escape or ""), text=str(found))
     if pictures:
         draw(found, (into or folder) / f"last-chance-{found.row}.png")
     check_again(found.replay.finding, even_if_changed)

@@ -12,9 +12,10 @@ from jaxtyping import Array, Float, Int, Key, PyTree
 
 from verifai_jax.core.messages.errors import check_names
 from verifai_jax.core.values.trace import Trace
+from verifai_jax.evaluation.verdicts import boolean_semantics, trace_verdict
 from verifai_jax.features import FeatureSpace
+from verifai_jax.mtl import smooth
 from verifai_jax.problem.problem import Problem
-from verifai_jax.systems.actions import Action, Discrete
 from verifai_jax.systems.base import System
 from verifai_jax.systems.channels import Instant, Link, Side
 from verifai_jax.systems.forks import Fork
@@ -51,54 +52,69 @@ class Steering(Link):
 
 
 class Means:
-    """The means by which somebody could have avoided a failure.
+    """The means by which `who` could have avoided a failure, and their compiled programs.
 
-    - `who`: the subject of a sentence; `system`: the system in which forks go on.
     - `shape`: `(steps, entries)` of a choice; `levels`: number of values of each entry, 0 for real
-      numbers; `period`: samples between two decisions.
-    - `ends`: whether a choice may stop before the end, so that the policy goes on.
-    - `constraint`: a function that says which points `[n, entries]` are admissible; None for all.
+      numbers; `period`: samples between two decisions; `ends`: whether a choice may stop before the
+      end, so that the policy goes on; `constraint`: says which `[n, entries]` are admissible.
     """
 
     who: str
-    system: System
     shape: tuple[int, int] = (1, 0)
     levels: tuple[int, ...] = ()
     period: int = 1
     ends: bool = False
     constraint: Callable[..., Any] | None = None
 
-    def course(self, features: Mapping[str, Any], key: Any) -> Fork:
-        """Return all forks of the undisturbed simulation; traced by JAX."""
-        return self.system.forks(features, key)
+    def __init__(self, problem: Problem, system: System) -> None:
+        self.problem, self.system = problem, system
+        self.course = jax.jit(self._course)
+        self.judge = jax.jit(jax.vmap(self._judged, in_axes=(None, None, 0)))
+        slope = jax.grad(self._objective, argnums=2, allow_int=True)
+        self.climb = jax.jit(jax.vmap(slope, in_axes=(None, None, 0, None)))
+        self.alone = jax.jit(lambda forks, choice: self._verdict(self._alone(forks, choice)))
 
     def fork(self, fork: Fork, choice: Choice) -> Fork:
         """Return a fork that goes on with a choice; traced by JAX."""
         raise NotImplementedError
 
-    def replayed(self, forks: Fork, choice: Choice) -> Trace:
-        """Return the trace of one choice; traced by JAX."""
-        return self.system.go_on(self.fork(forks.at(choice.start * self.period), choice))
+    def _course(self, features: Mapping[str, Any], key: Any) -> Fork:
+        """Return all forks of the undisturbed simulation."""
+        return self.problem.system.forks(features, key)
+
+    def _trace(self, forks: Fork, first: Any, choice: Choice) -> Trace:
+        fork = self.fork(forks.at(choice.start * self.period), choice)
+        return self.system.go_on(fork, first)
+
+    def _alone(self, forks: Fork, choice: Choice) -> Trace:
+        return self._trace(forks, 0, choice)
+
+    def _verdict(self, trace: Trace) -> Any:
+        verdict = trace_verdict(self.problem, trace)
+        return (*verdict, boolean_semantics(self.problem, trace)), trace
+
+    def _judged(self, forks: Fork, first: Int[Array, ""], choice: Choice) -> Any:
+        return self._verdict(self._trace(forks, first, choice))[0]
+
+    def _objective(self, forks: Fork, first: Any, choice: Choice, temperature: Any) -> Any:
+        trace = self._trace(forks, first, choice)
+        return jnp.min(trace_verdict(self.problem, trace, smooth(temperature))[0])
 
 
 class Controls(Means):
-    """Any actions between the lowest and the highest, by default those that the system names.
-
-    **Raises:** `ValueError` for a system without a policy, and for missing or wrong bounds.
-    """
+    """Any actions between the lowest and the highest, by default those that the system names."""
 
     who, ends = "the controller", True
 
     def __init__(
-        self, problem: Problem, length: int, dt: float, actions: Action | tuple[Any, Any] | None
+        self, problem: Problem, length: int, dt: float, actions: tuple[Any, Any] | None
     ) -> None:
+        super().__init__(problem, problem.system.with_links((Steering(),)))
         passing = problem.system.passing(problem.space.feature_form)
         forms = jax.tree.leaves(passing.action)
         size = sum(form.size for form in forms)
         whole = [not jnp.issubdtype(form.dtype, jnp.floating) for form in forms]
         given = passing.bounds if actions is None else actions
-        if isinstance(given, Action):
-            given = (0, given.n - 1) if isinstance(given, Discrete) else (given.low, given.high)
         if given is None:
             raise ValueError(
                 f"the actions in problem {problem.name!r} have no bounds, so nothing would be "
@@ -119,34 +135,41 @@ class Controls(Means):
         self.levels = tuple(counts) if all(whole) else (0,) * size
         self.period = round(passing.period / dt)
         self.shape = -(-(length - 1) // self.period), size
-        self.system = problem.system.with_links((Steering(),))
+        self.advance = jax.jit(jax.vmap(self._advance, in_axes=(None, None, 0, 0)))
 
     def actions(self, numbers: Any, xp: Any = jnp) -> Any:
-        """Return the actions of a choice."""
         width = self.high - self.low
         if self.levels[0]:
             return self.low + xp.floor(xp.minimum(numbers * (width + 1), width))
         return xp.clip(self.low + numbers * width, self.low, self.high)
 
-    def steered(self, features: PyTree, choice: Choice) -> dict[str, Any]:
-        """Return features with the actions of a choice."""
-        return {**features, PLAN: (choice.start, self.actions(choice.numbers), choice.stop)}
-
     def fork(self, fork: Fork, choice: Choice) -> Fork:
-        return fork._replace(features=self.steered(fork.features, choice))
+        plan = choice.start, self.actions(choice.numbers), choice.stop
+        return fork._replace(features={**fork.features, PLAN: plan})
 
-    def course(self, features: Mapping[str, Any], key: Any) -> Fork:
+    def _course(self, features: Mapping[str, Any], key: Any) -> Fork:
         never = jnp.int32(self.shape[0] + 1)
-        steered = self.steered(features, Choice(never, jnp.zeros(self.shape), never))
-        return self.system.forks(steered, key)._replace(features=features)
+        plan = never, jnp.zeros(self.shape), never
+        return self.system.forks({**features, PLAN: plan}, key)._replace(features=features)
 
-    def replayed(self, forks: Fork, choice: Choice) -> Trace:
+    def _alone(self, forks: Fork, choice: Choice) -> Trace:
         # From the start, without a fork.
-        return self.system(self.steered(forks.features, choice), forks.key)
+        return self.system(self.fork(forks, choice).features, forks.key)
 
     def own(self, forks: Fork) -> Float[np.ndarray, "decisions entries"]:
         """Return the actions of the policy in the undisturbed simulation."""
         return np.asarray(forks.state.links[0])[1 :: self.period]
+
+    def _advance(self, forks: Fork, decision: Any, state: Any, numbers: Any) -> Any:
+        """Return the state one decision later, and the extremes of all signals so far."""
+        plan = Choice(jnp.int32(0), jnp.broadcast_to(numbers, self.shape), decision + 1)
+        rollout = self.system.rollout(self.fork(forks, plan).features, forks.key)
+        loop, low, high = state
+        for k in range(self.period):
+            loop, signals = rollout.sample(loop, decision * self.period + k)
+            low = jax.tree.map(jnp.minimum, low, signals)
+            high = jax.tree.map(jnp.maximum, high, signals)
+        return loop, low, high
 
 
 class Surroundings(Means):
@@ -155,17 +178,14 @@ class Surroundings(Means):
     who = "the environment"
 
     def __init__(self, problem: Problem, names: tuple[str, ...]) -> None:
-        domains, space = problem.space.domains, problem.space
+        super().__init__(problem, problem.system)
+        domains, whole = problem.space.domains, problem.space
         check_names("feature", names, domains)
         chosen = names or [name for name, domain in domains.items() if domain.size]
-        self.space = FeatureSpace({name: domains[name] for name in chosen})
-        self.system, self.levels, self.shape = (
-            problem.system,
-            self.space.levels,
-            (1, self.space.dim),
-        )
+        self.space = space = FeatureSpace({name: domains[name] for name in chosen})
+        self.levels, self.shape = space.levels, (1, space.dim)
         # The constraint speaks of all features.
-        self.constraint = space.constraint if self.space.dim == space.dim else None
+        self.constraint = whole.constraint if space.dim == whole.dim else None
 
     def fork(self, fork: Fork, choice: Choice) -> Fork:
         changed = self.space.unflatten(choice.numbers[0].astype(jnp.float32))
@@ -178,20 +198,17 @@ class OtherPolicy(Means):
     who = "the other policy"
 
     def __init__(self, problem: Problem, other: System) -> None:
-        self.system, self.first = other, problem.system
+        super().__init__(problem, other)
         form, key = problem.space.feature_form, jax.random.key(0)
         one, two = (
             str(jax.eval_shape(lambda f, s=system: s.rollout(f, key).start.plant, form))
-            for system in (self.first, other)
+            for system in (problem.system, other)
         )
         if one != two:
             raise ValueError(
                 "by must be a system that differs from the problem's in its policy alone; its "
                 f"state has the form {two}, and the problem's {one}"
             )
-
-    def course(self, features: Mapping[str, Any], key: Any) -> Fork:
-        return self.first.forks(features, key)
 
     def fork(self, fork: Fork, choice: Choice) -> Fork:
         start = self.system.rollout(fork.features, fork.key).start

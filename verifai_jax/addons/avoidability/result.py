@@ -1,20 +1,21 @@
-"""The result of `last_chance`: the bracket, and the escapes."""
+"""The result of `last_chance`: the bracket, the escapes, and their picture."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
-from verifai_jax.core.display.figure import Drawn
+from verifai_jax.core.display.figure import Drawn, Figure
 from verifai_jax.core.display.notebook import InNotebook
 from verifai_jax.core.messages.text import format_seconds
 from verifai_jax.core.values.trace import Trace
 from verifai_jax.evaluation.replay import Replay
 
-AT_AN_END = 0.02
-"""Distance from a bound, as a share of the range, within which an action is at it."""
+PANELS = 4
+"""Signals drawn, at most."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -23,8 +24,8 @@ class Escape:
 
     - `start`, `stop`: the seconds between which it differs; `stop` is None if to the end.
     - `robustness`: the least robustness over the formulas; `trace`: its trace.
-    - `actions`: a row for each decision from `start` to `stop`; `own`: those of the policy then;
-      `bounds`: the lowest and the highest. None for other means.
+    - `did`: what it had to do, in words.
+    - `actions`: a row for each decision from `start` to `stop`; None for other means.
     - `features`: the new and the old value of each changed column; empty for other means.
     """
 
@@ -32,33 +33,14 @@ class Escape:
     stop: float | None
     robustness: float
     trace: Trace = field(repr=False)
+    did: str
     actions: Float[np.ndarray, "decisions entries"] | None = field(default=None, repr=False)
-    own: Float[np.ndarray, "decisions entries"] | None = field(default=None, repr=False)
-    bounds: tuple[np.ndarray, np.ndarray] | None = field(default=None, repr=False)
     features: Mapping[str, tuple[Any, Any]] = field(default_factory=dict)
 
     def __str__(self) -> str:
         until = "to the end" if self.stop is None else f"to {format_seconds(self.stop, 4)}"
-        parts = [f"{name} {new} instead of {old}" for name, (new, old) in self.features.items()]
-        if self.actions is not None and self.own is not None and self.bounds is not None:
-            for i, (low, high) in enumerate(zip(*self.bounds, strict=True)):
-                name = "action" if len(self.bounds[0]) == 1 else f"action[{i}]"
-                did = _course(self.actions[:, i], low, high)
-                parts.append(f"{name} {did} instead of {self.own[:, i].mean():z.3g} on average")
         then = "" if self.stop is None else "; then the policy goes on"
-        said = ", ".join(parts) or "the other policy"
-        return f"{said}, from {format_seconds(self.start, 4)} {until}{then}"
-
-
-def _course(values: Float[np.ndarray, " n"], low: float, high: float) -> str:
-    """Describe the values of one entry of the actions."""
-    said = []
-    for end, word in ((low, "lowest"), (high, "highest")):
-        share = float(np.mean(np.abs(values - end) <= AT_AN_END * (high - low)))
-        if share > 0.99:
-            return f"at its {word}, {end:z.4g},"
-        said += [f"at its {word}, {end:z.4g}, for {share:.0%} of the time"] * (share >= 0.1)
-    return ", ".join([*said, f"{values.mean():z.3g} on average"])
+        return f"{self.did}, from {format_seconds(self.start, 4)} {until}{then}"
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,7 +57,7 @@ class LastChance(Drawn, InNotebook):
     - `replay`: the failing simulation; `notes`: sentences for the user.
     """
 
-    _picture = "verifai_jax.addons.avoidability.picture", "plot_last_chance"
+    _picture = "verifai_jax.addons.avoidability.result", "plot_last_chance"
     row: int | None
     by: str
     failed: float
@@ -96,20 +78,21 @@ class LastChance(Drawn, InNotebook):
     def bracket(self) -> tuple[float, float]:
         return self.avoidable_until or 0.0, self.no_escape_from
 
-    def __str__(self) -> str:
+    @property
+    def headline(self) -> str:
         which = "a failure" if self.row is None else f"the failure of row {self.row}"
         about = f"{which} of {self.replay.problem.name}: "
-        said = f"{about}no escape by {self.by} was found from any instant"
-        if self.avoidable_until is not None:
-            before = format_seconds(max(self.failed - self.avoidable_until, 0.0), 4)
-            until = format_seconds(self.avoidable_until, 4)
-            said = f"{about}{self.by} could avoid it until {until}, {before} before it"
-        lines = [*self.replay.warnings, said, f"  failure      at {format_seconds(self.failed, 4)}"]
+        if self.avoidable_until is None:
+            return f"{about}no escape by {self.by} was found from any instant"
+        before = format_seconds(max(self.failed - self.avoidable_until, 0.0), 4)
+        until = format_seconds(self.avoidable_until, 4)
+        return f"{about}{self.by} could avoid it until {until}, {before} before it"
+
+    def __str__(self) -> str:
+        lines = [f"  failure      at {format_seconds(self.failed, 4)}"]
         if self.escape is not None:
-            lines.append(f"  escape       {self.escape}")
-            lines.append(
-                f"               robustness {self.escape.robustness:z.3g}, simulated alone"
-            )
+            robust = f"robustness {self.escape.robustness:z.3g}, simulated alone"
+            lines += [f"  escape       {self.escape}", f"               {robust}"]
         lines.append(
             f"  no escape    found from {format_seconds(self.no_escape_from, 4)} on, in "
             f"{self.simulations:,} simulations from {len(self.tried)} instants"
@@ -117,6 +100,30 @@ class LastChance(Drawn, InNotebook):
         if self.proved_from is not None:
             when = format_seconds(self.proved_from, 4)
             lines.append(f"  proved       unavoidable from {when} on, whatever the actions")
-        return "\n".join([*lines, *(f"  note         {note}" for note in self.notes)])
+        notes = (f"  note         {note}" for note in self.notes)
+        return "\n".join([*self.replay.warnings, self.headline, *lines, *notes])
 
     __repr__ = __str__
+
+
+def plot_last_chance(result: LastChance, path: str | Path | None = None) -> Figure:
+    """Draw signals of the failing trace and of the escapes (green), and the bracket (amber)."""
+    from verifai_jax.pictures.replay import plot_replay
+    from verifai_jax.pictures.style import FAILING, NOT_CLAIMED, SAFE, show_or_save
+
+    replay = result.replay
+    monitored = dict.fromkeys(s for f in replay.problem.formulas.values() for s in f.signals())
+    shown = list({**monitored, **dict.fromkeys(replay.trace.signals)})[:PANELS]
+    figure = plot_replay(replay, signals=shown)
+    end = float(np.asarray(replay.trace.clock())[-1])
+    for axes, signal in zip(figure.axes, shown, strict=False):
+        for escape in result.escapes[::-1]:
+            trace = escape.trace.trim()
+            on = np.asarray(trace.clock()) >= escape.start - 1e-9
+            line = {"color": SAFE, "linewidth": 2.0 if escape is result.escape else 0.9}
+            axes.plot(np.asarray(trace.clock())[on], np.asarray(trace.signals[signal])[on], **line)
+        axes.axvspan(*result.bracket, color=NOT_CLAIMED, alpha=0.4, linewidth=0)
+        if result.proved_from is not None:
+            axes.axvspan(result.proved_from, end, color=FAILING, alpha=0.08, linewidth=0)
+    figure.supxlabel(result.headline, fontsize=8, color=SAFE, wrap=True)
+    return show_or_save(figure, path)

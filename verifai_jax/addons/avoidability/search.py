@@ -1,12 +1,8 @@
-"""The search for escapes: thousands of forks of one simulation in a batch, from many instants.
+"""The search for escapes by thousands of forks in a batch, and proofs that there are none."""
 
-    search = EscapeSearch(Programs(problem, means), forks, lanes=2048, rounds=12, seed=0)
-    search.explore([10, 20, 30])                        # instants at which an escape was found
-    search.found[20]                                    # the best of them
-
-One program judges forks from all instants, and one differentiates them.
-"""
-
+import itertools
+import math
+import time
 from collections.abc import Sequence
 from functools import partial
 from typing import Any
@@ -14,115 +10,130 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Bool, Float, Int
 
 from verifai_jax.addons.avoidability.means import Choice, Controls, Means
-from verifai_jax.addons.avoidability.proposals import Numbers, Proposals, Stops
+from verifai_jax.addons.verification.enclosure import Enclosure
 from verifai_jax.core.display.progress import count_done
 from verifai_jax.core.messages.text import format_error
 from verifai_jax.core.values.trace import Status, Trace
-from verifai_jax.evaluation.verdicts import boolean_semantics, trace_verdict, violations
-from verifai_jax.mtl import smooth
+from verifai_jax.evaluation.verdicts import violations
+from verifai_jax.features import Array, Box, FeatureSpace
 from verifai_jax.problem.problem import Problem
 from verifai_jax.systems.forks import Fork
 
-CLIMBED = 4
-"""Choices of an instant that are improved by their gradients in a round."""
+INSTANTS, FURTHER = 16, (0, 1, 3, 7)
+"""Instants searched at once; and those after the bracket, from its end, searched once more."""
+ELITES, CLIMBED = 24, 4
+"""Best choices that are kept for an instant, and those of them that gradients improve."""
+PIECES, SPREAD = 6, 0.03
+"""Most pieces of a drawn choice, and the least deviation with which cross-entropy draws."""
 STEPS = (0.5, 0.15, 0.05, 0.015, 0.005)
 """Lengths of a step along a gradient, as shares of the range of an action."""
+MAX_BATCHES = 16
+"""Batches of sequences of whole-number actions that are tried from an instant, at most."""
+Plans = tuple[Float[np.ndarray, "n steps entries"], Int[np.ndarray, " n"]]
+"""Numbers of choices, and where they stop."""
 
 
-class Programs:
-    """The compiled programs of a problem and some means, for all simulations of the problem."""
+class Proposals:
+    """The choices of one instant: the best first, and those that wait to be tried.
 
-    def __init__(self, problem: Problem, means: Means) -> None:
-        self.problem, self.means = problem, means
-        self.course = jax.jit(means.course)
-        self.judge = jax.jit(jax.vmap(self._judged, in_axes=(None, None, 0)))
-        slope = jax.grad(self._objective, argnums=2, allow_int=True)
-        self.climb = jax.jit(jax.vmap(slope, in_axes=(None, None, 0, None)))
-        self.alone = jax.jit(self._alone)
-        self.advance = jax.jit(jax.vmap(self._advanced, in_axes=(None, None, 0, 0)))
+    Best responses are often extreme and change seldom (bang-bang): half of the numbers are ends of
+    their range, and hold for a while.
+    """
 
-    def _trace(self, forks: Fork, first: Int[Array, ""], choice: Choice) -> Trace:
-        fork = self.means.fork(forks.at(choice.start * self.means.period), choice)
-        return self.means.system.go_on(fork, first)
+    def __init__(self, means: Means, start: int, rng: np.random.Generator) -> None:
+        self.means, self.start, self.rng = means, start, rng
+        self.first = min(start, means.shape[0] - 1)
+        self.waiting: list[Plans] = []
+        self.numbers, self.stops = np.zeros((0, *means.shape)), np.zeros(0, int)
+        self.rho = np.zeros(0)
 
-    def _verdict(self, trace: Trace) -> Any:
-        return *trace_verdict(self.problem, trace), boolean_semantics(self.problem, trace)
+    def learn(self, plans: Plans, rho: Float[np.ndarray, " n"]) -> None:
+        """Keep the best of the known and these."""
+        rho = np.concatenate([self.rho, rho])
+        best = np.argsort(-rho, kind="stable")[:ELITES]
+        self.rho, self.stops = rho[best], np.concatenate([self.stops, plans[1]])[best]
+        self.numbers = np.concatenate([self.numbers, plans[0]])[best]
 
-    def _judged(self, forks: Fork, first: Int[Array, ""], choice: Choice) -> Any:
-        return self._verdict(self._trace(forks, first, choice))
+    def next(self, count: int) -> Plans:
+        """Return choices to try: those that wait, new ones, and changes of the best."""
+        parts, self.waiting = self.waiting, []
+        left = max(count - sum(len(stops) for _, stops in parts), 0)
+        changed = 2 * left // 3 if len(self.rho) else 0
+        parts.append(self._few_pieces(left - changed))
+        parts += [self._changed(changed)] if changed else []
+        numbers, stops = (np.concatenate(both)[:count] for both in zip(*parts, strict=True))
+        return numbers, stops
 
-    def _objective(self, forks: Fork, first: Any, choice: Choice, temperature: Any) -> Any:
-        trace = self._trace(forks, first, choice)
-        return jnp.min(trace_verdict(self.problem, trace, smooth(temperature))[0])
+    def _few_pieces(self, count: int) -> Plans:
+        (steps, entries), rng = self.means.shape, self.rng
+        # Changes are more likely soon after the start, where they matter most.
+        changes = self.first + (steps - self.first) * rng.random((count, PIECES - 1)) ** 2
+        few = rng.integers(0, PIECES, (count, 1)) <= np.arange(PIECES - 1)
+        pieces = np.arange(steps)[:, None] >= np.where(few, steps, changes)[:, None]
+        levels = rng.random((count, PIECES, entries))
+        levels = np.where(rng.random(levels.shape) < 0.5, levels.round(), levels)
+        early = self.means.ends & (rng.random(count) < 0.5)
+        stops = np.where(early, rng.integers(self.first + 1, steps + 1, count), steps)
+        return np.take_along_axis(levels, pieces.sum(2)[:, :, None], axis=1), stops
 
-    def _alone(self, forks: Fork, choice: Choice) -> Any:
-        trace = self.means.replayed(forks, choice)
-        return self._verdict(trace), trace
+    def _changed(self, count: int) -> Plans:
+        """Return good choices with a segment that is new, near the best, or of another one.
 
-    def _advanced(self, forks: Fork, decision: Any, state: Any, numbers: Any) -> Any:
-        """Return the state one decision later, and the extremes of all signals so far."""
-        plan = Choice(jnp.int32(0), jnp.broadcast_to(numbers, self.means.shape), decision + 1)
-        fork = self.means.fork(forks, plan)
-        rollout = self.means.system.rollout(fork.features, forks.key)
-        loop, low, high = state
-        for k in range(self.means.period):
-            loop, signals = rollout.sample(loop, decision * self.means.period + k)
-            low = jax.tree.map(jnp.minimum, low, signals)
-            high = jax.tree.map(jnp.maximum, high, signals)
-        return loop, low, high
+        What is near is drawn by cross-entropy: with the deviations of the best choices.
+        """
+        (steps, entries), rng, size = self.means.shape, self.rng, len(self.rho)
+        parents = (size * rng.random(count) ** 2).astype(int)
+        length = np.maximum(1, ((steps - self.first) * rng.random(count) ** 3).astype(int))
+        begin = rng.integers(self.first, np.maximum(steps - length, self.first) + 1)
+        since = np.arange(steps) - begin[:, None]
+        chosen = rng.random((count, entries)) < max(0.5, 1.5 / entries)
+        inside = ((since >= 0) & (since < length[:, None]))[:, :, None] & chosen[:, None]
+        old, (new, stops) = self.numbers[parents], self._few_pieces(count)
+        noise = rng.standard_normal((count, 1, entries)) * (self.numbers.std(0) + SPREAD)
+        lent = self.numbers[rng.integers(0, size, (count, steps)), np.arange(steps)]
+        kinds = rng.integers(0, 3, (count, 1, 1))
+        made = np.choose(kinds, [new, np.clip(old + noise, 0, 1), lent])
+        kept = np.where(rng.random(count) < 0.8, self.stops[parents], stops)
+        return np.where(inside, made, old), kept
 
 
 class EscapeSearch:
-    """The search along one failing simulation; see the module's docstring.
+    """The search along a failing simulation with some decisions, in batches of `lanes` forks."""
 
-    **Arguments:**
-    - `forks`: all forks of the simulation.
-    - `lanes`: forks in a batch; `rounds`: batches for some instants.
-
-    `simulations` counts the forks that went on; `notes` has sentences for the user.
-    """
-
-    def __init__(self, programs: Programs, forks: Fork, lanes: int, rounds: int, seed: int) -> None:
-        self.programs, self.means, self.forks = programs, programs.means, forks
+    def __init__(
+        self, means: Means, forks: Fork, decisions: int, lanes: int, rounds: int, seed: int
+    ) -> None:
+        self.means, self.forks, self.count = means, forks, decisions
         self.lanes, self.rounds, self.rng = lanes, rounds, np.random.default_rng(seed)
+        self.tried: dict[int, Proposals] = {}
         self.found: dict[int, Choice] = {}
-        self.proposals: dict[int, Proposals] = {}
-        self.simulations, self.notes = 0, list[str]()
-        self.climbs = self.means.shape[1] > 0 and not all(self.means.levels)
+        self.alone: dict[int, tuple[Trace, float]] = {}
+        self.simulations, self.notes, self.lost = 0, list[str](), list[int]()
+        self.climbs = means.shape[1] > 0 and not all(means.levels)
 
-    def judge(
-        self, starts: Int[np.ndarray, " n"], numbers: Numbers, stops: Stops
-    ) -> tuple[Float[np.ndarray, " n"], Bool[np.ndarray, " n"]]:
-        """Return the least robustness of each fork, and whether it escapes."""
-        parts = []
-        for begin in range(0, len(starts), self.lanes):
-            some = slice(begin, begin + self.lanes)
-            packed = self._packed(starts[some], numbers[some], stops[some], self.lanes)
-            parts.append(escaping(*map(np.asarray, self.programs.judge(self.forks, *packed))))
-        rho, escaped = (np.concatenate(both)[: len(starts)] for both in zip(*parts, strict=True))
-        self.simulations += len(starts)
-        count_done(len(starts))
-        if self.means.constraint is not None:
-            escaped &= np.asarray(self.means.constraint(np.float32(numbers[:, 0])))
-        return rho, escaped
-
-    def _packed(self, starts: Any, numbers: Any, stops: Any, lanes: int) -> tuple[Any, Choice]:
-        full = [np.resize(each, (lanes, *each.shape[1:])) for each in (starts, numbers, stops)]
-        return np.int32(starts.min() * self.means.period), _choice(*full)
+    def bracket(self) -> tuple[int, int]:
+        """Return the last instant with an escape, -1 without one, and the next one tried."""
+        low, high, entries = -1, self.count, self.means.shape[1]
+        while True:
+            while high - low > 1:
+                spread = min(INSTANTS if entries else self.count, high - low - 1)
+                tried = np.linspace(low + 1, high - 1, spread).round().astype(int)
+                low = max([low, *self.explore(np.unique(tried).tolist())])
+                high = min((i for i in tried.tolist() if i > low), default=high)
+            # No escape at one instant says nothing of later ones: search some again, longer.
+            later = [high + by for by in FURTHER if high + by < self.count]
+            if not entries or not self.explore(later, 2):
+                return low, high
+            low = max(self.alone)
+            high = min((i for i in self.tried if i > low), default=self.count)
 
     def explore(self, instants: Sequence[int], effort: int = 1) -> list[int]:
-        """Search for escapes from some instants, and return those from which one was found.
-
-        **Arguments:**
-        - `effort`: multiplies the number of rounds.
-        """
+        """Return the instants with an escape that a simulation alone confirms."""
         for instant in instants:
-            self._begin(instant)
-            if effort > 1 and all(self.means.levels) and isinstance(self.means, Controls):
-                self.proposals[instant].waiting.append(self._distinct(instant, self.means))
+            self._begin(instant, effort)
         for number in range(self.rounds * effort if self.means.shape[1] else 1):
             # An escape from a later instant is one from all before it.
             latest = max((i for i in instants if i in self.found), default=-1)
@@ -130,32 +141,54 @@ class EscapeSearch:
             if not left:
                 break
             share = max(self.lanes // len(left), 1)
-            drawn = [self.proposals[i].next(share) for i in left]
-            numbers, stops = (np.concatenate(both) for both in zip(*drawn, strict=True))
-            rho, escaped = self.judge(np.repeat(left, share), numbers, stops)
-            for n, instant in enumerate(left):
+            drawn = [self.tried[i].next(share) for i in left]
+            rho, escaped = self.judge(
+                np.repeat(left, share), *map(np.concatenate, zip(*drawn, strict=True))
+            )
+            for n, (instant, plans) in enumerate(zip(left, drawn, strict=True)):
                 mine = slice(n * share, (n + 1) * share)
-                self.proposals[instant].learn(numbers[mine], stops[mine], rho[mine])
+                self.tried[instant].learn(plans, rho[mine])
                 if escaped[mine].any():
-                    i = n * share + int(np.argmax(np.where(escaped[mine], rho[mine], -np.inf)))
-                    self.found[instant] = _choice(instant, numbers[i], stops[i])
+                    i = int(np.argmax(np.where(escaped[mine], rho[mine], -np.inf)))
+                    self.found[instant] = _choice(instant, plans[0][i], plans[1][i])
             if self.climbs and number % 2:
-                self._climb([self.proposals[i] for i in left if i not in self.found])
-        return [i for i in instants if i in self.found]
+                self._climb([self.tried[i] for i in left if i not in self.found])
+        return [i for i in instants if i in self.found and self._confirmed(i)]
 
-    def _begin(self, instant: int) -> None:
+    def judge(
+        self, starts: Int[np.ndarray, " n"], *plans: Any
+    ) -> tuple[Float[np.ndarray, " n"], Bool[np.ndarray, " n"]]:
+        """Return the least robustness of each fork, and whether it escapes."""
+        rho, escaped = np.zeros(len(starts)), np.zeros(len(starts), bool)
+        for begin in range(0, len(starts), self.lanes):
+            some = slice(begin, begin + self.lanes)
+            packed = self._packed(self.lanes, starts[some], *(part[some] for part in plans))
+            judged = escaping(*map(np.asarray, self.means.judge(self.forks, *packed)))
+            rho[some], escaped[some] = (part[: len(starts) - begin] for part in judged)
+        self.simulations += len(starts)
+        count_done(len(starts))
+        if self.means.constraint is not None and len(starts):
+            escaped &= np.asarray(self.means.constraint(np.float32(plans[0][:, 0])))
+        return rho, escaped
+
+    def _packed(self, lanes: int, *parts: np.ndarray) -> tuple[Any, Choice]:
+        full = (np.resize(part, (lanes, *part.shape[1:])) for part in parts)
+        return np.int32(parts[0].min() * self.means.period), _choice(*full)
+
+    def _begin(self, instant: int, effort: int) -> None:
         """Let the best choices of the nearest instants wait, as they are and shifted."""
         order = lambda other: (other.start not in self.found, abs(other.start - instant))  # noqa: E731
-        near, steps = sorted(self.proposals.values(), key=order)[:8], self.means.shape[0]
-        mine = self.proposals.setdefault(instant, Proposals(self.means, instant, self.rng))
+        near, steps = sorted(self.tried.values(), key=order)[:8], self.means.shape[0]
+        mine = self.tried.setdefault(instant, Proposals(self.means, instant, self.rng))
         for other in near:
-            by, numbers, stops = instant - other.start, other.numbers[:8], other.stops[:8]
-            mine.waiting.append((numbers, np.clip(stops, min(instant + 1, steps), steps)))
-            if steps > 1 and by:
-                shifted = numbers[:, np.clip(np.arange(steps) - by, 0, steps - 1)]
-                mine.waiting.append((shifted, np.clip(stops + by, instant + 1, steps)))
+            for by in dict.fromkeys((0, (instant - other.start) * (steps > 1))):
+                moved = other.numbers[:8, np.clip(np.arange(steps) - by, 0, steps - 1)]
+                stops = np.clip(other.stops[:8] + by, min(instant + 1, steps), steps)
+                mine.waiting.append((moved, stops))
+        if effort > 1 and all(self.means.levels) and isinstance(self.means, Controls):
+            mine.waiting.append(self._distinct(instant, self.means))
 
-    def _distinct(self, instant: int, controls: Controls) -> tuple[Numbers, Stops]:
+    def _distinct(self, instant: int, controls: Controls) -> Plans:
         """Return sequences of whole-number actions that lead to distinct states, breadth first."""
         each = np.meshgrid(*[(np.arange(n) + 0.5) / n for n in controls.levels])
         each = np.stack(each, -1).reshape(-1, controls.shape[1])
@@ -169,7 +202,7 @@ class EscapeSearch:
             lanes = np.resize(np.arange(len(plans)), width * len(each))
             before = jax.tree.map(partial(np.take, indices=lanes // len(each), axis=0), states)
             given = np.int32(decision), before, plans[lanes, decision]
-            after = jax.tree.map(np.asarray, self.programs.advance(self.forks, *given))
+            after = jax.tree.map(np.asarray, controls.advance(self.forks, *given))
             # The first link remembers the last action alone.
             seen = jax.tree.leaves((after[0]._replace(links=after[0].links[1:]), *after[1:]))
             rows = np.concatenate([np.reshape(leaf, (len(lanes), -1)) for leaf in seen], axis=1)
@@ -180,28 +213,43 @@ class EscapeSearch:
 
     def _climb(self, proposals: Sequence[Proposals]) -> None:
         """Let steps along gradients wait, from the best choices of each instant."""
-        lanes = 16 * CLIMBED
-        chosen = [(p, k) for p in proposals for k in range(CLIMBED) if k < len(p.rho)]
-        chosen = [(p, k) for p, k in chosen if np.isfinite(p.rho[k])]
-        for begin in range(0, len(chosen), lanes):
-            some = chosen[begin : begin + lanes]
-            starts, stops = np.array([(p.start, p.stops[k]) for p, k in some]).T
-            numbers = np.stack([p.numbers[k] for p, k in some])
-            temperature = max(0.05 * float(np.median([abs(p.rho[k]) for p, k in some])), 1e-6)
-            packed = self._packed(starts, numbers, stops, lanes)
-            try:
-                slopes = self.programs.climb(self.forks, *packed, temperature).numbers
-            except Exception as error:
-                self.climbs = False
-                self.notes.append(f"searched without gradients: {format_error(error)}")
-                return
-            slopes = np.nan_to_num(np.asarray(slopes)[: len(some)])
-            self.simulations += len(some)
-            for (mine, _), here, slope, stop in zip(some, numbers, slopes, stops, strict=True):
-                if (size := np.abs(slope).max()) > 0:
-                    steps = [s * move for move in (slope / size, np.sign(slope)) for s in STEPS]
-                    tried = np.clip(here + np.stack(steps), 0, 1)
-                    mine.waiting.append((tried, np.full(len(tried), stop)))
+        chosen = [(p, k) for p in proposals for k in np.flatnonzero(np.isfinite(p.rho[:CLIMBED]))]
+        if not chosen:
+            return
+        starts, stops, rho = np.array([(p.start, p.stops[k], p.rho[k]) for p, k in chosen]).T
+        numbers = np.stack([p.numbers[k] for p, k in chosen])
+        packed = self._packed(INSTANTS * CLIMBED, starts, numbers, stops)
+        try:
+            temperature = max(0.05 * float(np.median(np.abs(rho))), 1e-6)
+            slopes = self.means.climb(self.forks, *packed, temperature).numbers
+        except Exception as error:
+            self.climbs = False
+            self.notes.append(f"searched without gradients: {format_error(error)}")
+            return
+        self.simulations += len(chosen)
+        for (mine, k), slope in zip(chosen, np.nan_to_num(np.asarray(slopes)), strict=False):
+            if (size := np.abs(slope).max()) > 0:
+                steps = [s * move for move in (slope / size, np.sign(slope)) for s in STEPS]
+                tried = np.clip(mine.numbers[k] + np.stack(steps), 0, 1)
+                mine.waiting.append((tried, np.full(len(tried), mine.stops[k])))
+
+    def _confirmed(self, instant: int) -> bool:
+        """Simulate an escape alone, with the earliest stop after which the policy may go on."""
+        found, tried = self.found.pop(instant), []
+        stops = np.arange(instant + 1, int(found.stop) if self.means.ends else 0)
+        numbers = np.repeat(np.asarray(found.numbers)[None], len(stops), axis=0)
+        escaped = self.judge(np.full(len(stops), instant), numbers, stops)[1]
+        if escaped.any():
+            tried = [found._replace(stop=np.int32(stops[np.argmax(escaped)]))]
+        for choice in (*tried, found):
+            verdict, trace = self.means.alone(self.forks, choice)
+            rho, kept = escaping(*(np.asarray(part)[None] for part in verdict))
+            if kept[0]:
+                self.found[instant] = choice
+                self.alone[instant] = jax.tree.map(np.asarray, trace), float(rho[0])
+                return True
+        self.lost.append(instant)
+        return False
 
 
 def _choice(start: Any, numbers: Any, stop: Any) -> Choice:
@@ -216,3 +264,57 @@ def escaping(
     lowest = np.nan_to_num(rho.min(1), nan=-np.inf)
     kept = (status == Status.OK) & ~violations(rho, status, lambda: holds)
     return lowest, kept & (lowest > -np.inf)
+
+
+def first_proved(
+    search: EscapeSearch, controls: Controls, begin: int, precision: str, seconds: float
+) -> tuple[int | None, str]:
+    """Return the earliest decision from which no action helps, None and why without a proof."""
+    end, proved, high = time.perf_counter() + seconds, None, search.count
+    try:
+        while begin < high and time.perf_counter() < end:
+            # What is certain from an instant is certain from all later ones.
+            middle = (begin + high) // 2
+            prove = _by_trying if controls.levels[0] else _by_sets
+            if prove(search, controls, middle, precision):
+                proved = high = middle
+            else:
+                begin = middle + 1
+    except Exception as error:
+        return proved, f"without a proof: {format_error(error)}" * (proved is None)
+    return proved, "no proof: sets are too wide, or sequences too many" * (proved is None)
+
+
+def _by_sets(search: EscapeSearch, controls: Controls, start: int, precision: str) -> bool:
+    """Return whether all actions from a decision on certainly break a formula."""
+    problem, (steps, entries) = controls.problem, controls.shape
+    index, forks = start * controls.period, search.forks
+
+    def system(features: Any, key: Any = None) -> Trace:
+        later = features["actions"].reshape(steps - start, entries)
+        numbers = jnp.concatenate([jnp.zeros((start, entries), later.dtype), later])
+        choice = Choice(jnp.int32(start), numbers, jnp.int32(steps))
+        fork = controls.fork(forks.at(index), choice)
+        rollout = controls.system.rollout(fork.features, fork.key)
+        rest = lambda state, k: rollout.sample(state, k + index)  # noqa: E731
+        last, samples = rollout.scan(rest, fork.state, rollout.length - index)
+        whole = {n: jnp.concatenate([forks.samples[n][:index], s]) for n, s in samples.items()}
+        return rollout.ended(last, whole)
+
+    unit = Box(0, 1) if entries == 1 else Box([0] * entries, [1] * entries)
+    space = FeatureSpace({"actions": Array(unit, steps - start)})
+    rest = Problem(problem.name, space, system, dict(problem.formulas), end=problem.end)
+    bounds = Enclosure(rest, precision)(np.zeros((1, space.dim)), np.ones((1, space.dim)))
+    return bool(bounds.high[0] < 0)
+
+
+def _by_trying(search: EscapeSearch, controls: Controls, start: int, _: str) -> bool:
+    """Return whether all sequences of whole-number actions fail; False if there are too many."""
+    (steps, entries), left = controls.shape, controls.shape[0] - start
+    if math.prod(controls.levels) ** left > MAX_BATCHES * search.lanes:
+        return False
+    each = [[(k + 0.5) / n for k in range(n)] for n in controls.levels] * left
+    plans = np.array(list(itertools.product(*each))).reshape(-1, left, entries)
+    plans = np.pad(plans, ((0, 0), (start, 0), (0, 0)))
+    count = len(plans)
+    return not search.judge(np.full(count, start), plans, np.full(count, steps))[1].any()

@@ -17,7 +17,7 @@ from verifai_jax.core.compute.cores import available_cores
 
 PACKAGES = ("jax", "jaxlib", "numpy", "optax", "lark", "pandas", "pyarrow", "matplotlib", "rich")
 """Required packages whose versions are reported."""
-EXTRAS = {"mujoco": "mujoco", "mujoco-mjx": "mujoco"} | {
+EXTRAS = {"mujoco": "mujoco", "mujoco-mjx": "mujoco", "mujoco-warp": "warp"} | {
     package: package for package in ("brax", "gymnax", "gymnasium", "diffrax", "playground")
 }
 """Optional packages, and the extra of verifai_jax that installs each."""

@@ -1,7 +1,7 @@
 """`verifai-jax compare specs/old.py:balance specs/new.py:balance --margin 0.002`."""
 
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -10,6 +10,9 @@ from verifai_jax.cli import arguments
 from verifai_jax.cli.gates import Gate, check_gate, fail_on
 from verifai_jax.cli.going_on import kept_until_done
 from verifai_jax.cli.json_output import as_plain, command, give_result, say
+
+if TYPE_CHECKING:
+    from verifai_jax.addons.estimation.comparison.result import Compared
 
 
 @command()
@@ -85,17 +88,7 @@ def compare(
         baseline=result.baseline,
         verdict=result.verdict,
         regression=result.regression,
-        candidates=[
-            {
-                "name": one.name,
-                "verdict": one.verdict,
-                "margin": one.margin,
-                "difference": one.rates.estimate,
-                "both_fail": one.both,
-                **as_plain(one.rates),
-            }
-            for one in result.candidates
-        ],
+        candidates=list(map(stored_candidate, result.candidates)),
         simulations=result.simulations,
         stopped=result.stopped,
         seconds=result.seconds,
@@ -104,3 +97,14 @@ def compare(
         sources=result.sources,
     )
     check_gate(fail_on, {"regression": result.regression})
+
+
+def stored_candidate(one: "Compared") -> dict[str, Any]:
+    """Return a candidate as JSON has it; `report.stored` reads it."""
+    arm = one.undisturbed
+    calm = arm and {"baseline_fails": arm[1], "candidate_fails": arm[2], **as_plain(arm[0])}
+    return {
+        "name": one.name, "verdict": one.verdict, "margin": one.margin,
+        "difference": one.rates.estimate, "both_fail": one.both, **as_plain(one.rates),
+        "undisturbed": calm,
+    }  # fmt: skip

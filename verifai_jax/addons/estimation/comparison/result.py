@@ -73,18 +73,21 @@ class Compared:
                 f"fails in {format_percent(second / known)} of {known:,} pairs, the baseline in "
                 f"{format_percent(first / known)}: {rates}"
             )
+        calm = f"\n    {self.calm}" if self.calm else ""
         return (
             f"{self.name} is {words}{margin}: {shares}\n"
             f"    {rates.only_second:,} pairs fail with it only, {rates.only_first:,} with the "
-            f"baseline only, {self.both:,} with both{without}{self._undisturbed()}"
+            f"baseline only, {self.both:,} with both{without}{calm}"
         )
 
-    def _undisturbed(self) -> str:
+    @property
+    def calm(self) -> str:
+        """A sentence on the pairs without disturbances; empty if the problem has none."""
         if self.undisturbed is None:
             return ""
         rates, first, second = self.undisturbed
         return (
-            f"\n    without disturbances it fails in {format_percent(second / rates.pairs)} of the "
+            f"without disturbances it fails in {format_percent(second / rates.pairs)} of the "
             f"same pairs, the baseline in {format_percent(first / rates.pairs)}: {rates}"
         )
 

@@ -39,6 +39,7 @@ def comparison_page(comparison: Comparison, about: About, problem: Problem | Non
         rows.append((each.name, each.verdict, str(rates), *(f"{count:,}" for count in counts)))
     heads = ["candidate", "verdict", "difference", "pairs", "only it fails"]
     heads += ["only the baseline fails", "both fail", "without both verdicts"]
+    calm = [f"{each.name}: {each.calm}." for each in comparison.candidates if each.calm]
     asked = space_table(first.space, {}, about)
     without = sum(each.rates.undecided for each in comparison.candidates)
     python = (
@@ -62,7 +63,7 @@ def comparison_page(comparison: Comparison, about: About, problem: Problem | Non
             ),
             *([asked] if problem is None else problem_content(problem, about)),
         ],
-        found=[table(heads, rows), *_pairs(comparison)],
+        found=[table(heads, rows), *map(paragraph, calm), *_pairs(comparison)],
         limits=[
             f"In {without:,} pairs a side has no verdict: they widen the intervals in both "
             "directions.",

@@ -44,7 +44,12 @@ def read_comparison(file: Path, data: Mapping[str, Any], space: FeatureSpace | N
     for each in data["candidates"]:
         rates = PairedRates(**values_of(PairedRates, each))
         both, margin, pairs = int(each["both_fail"]), float(each["margin"]), pd.DataFrame()
-        candidates.append(Compared(str(each["name"]), rates, both, margin, pairs, pairs, space))
+        calm = each.get("undisturbed")
+        if calm is not None:
+            calm_rates = PairedRates(**values_of(PairedRates, calm))
+            calm = calm_rates, int(calm["baseline_fails"]), int(calm["candidate_fails"])
+        name = str(each["name"])
+        candidates.append(Compared(name, rates, both, margin, pairs, pairs, space, calm))
     if not candidates:
         raise KeyError("candidates")
     sources = {str(name): sources_of(each) for name, each in data.get("sources", {}).items()}

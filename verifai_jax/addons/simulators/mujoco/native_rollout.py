@@ -20,6 +20,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int, Key
 
 from verifai_jax.addons.simulators.mujoco.loop import Loop, Progress, Sample
+from verifai_jax.addons.simulators.mujoco.part_paths import MjModel
 from verifai_jax.core.compute.compilation import power_of_two
 from verifai_jax.core.messages.errors import require
 from verifai_jax.core.values.trace import Status, Trace
@@ -33,11 +34,15 @@ HALVED = 64
 
 @dataclass(eq=False)
 class Native:
-    """Batches of one loop with the programs that they need; made once for a system."""
+    """Batches of one loop with the programs that they need; made once for a system.
+
+    - `make`: makes a batch of a model and a number of rows; by default MuJoCo's own, in C.
+    """
 
     loop: Loop
     batches: dict[Any, Any] = field(default_factory=dict)
     programs: dict[Any, Any] = field(default_factory=dict)
+    make: Callable[[MjModel, int], Any] | None = None
 
     def simulate(self, features: Features, keys: Key[Array, " n"]) -> Trace:
         """Simulate a batch: all leaves of `features` and `keys` have a leading axis `[n]`."""
@@ -85,16 +90,16 @@ class Native:
         return self.programs[key]
 
     def batch(self, size: int, number: int) -> Any:
-        """Return a `mujoco.batch.Batch` with this many rows, made once."""
+        """Return a `mujoco.batch.Batch` with this many rows, or one like it, made once."""
         if (size, number) not in self.batches:
-            module = require("mujoco.batch", extra="mujoco")
+            make = self.make or require("mujoco.batch", extra="mujoco").Batch
             # Batches of other sizes are not needed again, or not soon.
             self.batches = {key: b for key, b in self.batches.items() if key[0] == size}
             compiled = self.loop.compiled
             if self.loop.finer != 1:
                 compiled = copy.copy(compiled)
                 compiled.opt.timestep /= self.loop.finer
-            self.batches[size, number] = module.Batch(compiled, size)
+            self.batches[size, number] = make(compiled, size)
         return self.batches[size, number]
 
     def _trace(self, results: list["_Results"]) -> Trace:

@@ -1,15 +1,16 @@
-"""A MuJoCo model in a closed loop as a system `(features, key) -> Trace`, on one of two engines.
+"""A MuJoCo model in a closed loop as a system `(features, key) -> Trace`, on one of three engines.
 
 mujoco("envs/mujoco_cartpole.xml", duration=4.0, control_period=0.02,
        bind={"masspole": "body/pole/mass", "x0": "joint/slider/qpos"},
        controller=policy, signals={"x": "joint/slider/qpos"})
 mjx(...)                              # the same in JAX: vmap, gradients, GPU
 native(...)                           # the same in C: all cores, a batch in lock-step
+mujoco(..., backend="warp")           # the same in MuJoCo Warp, without gradients
 """
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any, ClassVar
 
 import jax
@@ -28,6 +29,8 @@ from verifai_jax.addons.simulators.mujoco.mjx_rollout import (
 )
 from verifai_jax.addons.simulators.mujoco.model import ModelSource, load
 from verifai_jax.addons.simulators.mujoco.native_rollout import Native
+from verifai_jax.addons.simulators.mujoco.warp_rollout import WarpBatch
+from verifai_jax.addons.simulators.mujoco.warp_rollout import why_not as why_not_warp
 from verifai_jax.core.compute.fingerprint import used_inputs
 from verifai_jax.core.display.lazy import lazy_import
 from verifai_jax.core.messages.checks import check_count
@@ -42,14 +45,16 @@ from verifai_jax.systems.forks import Rollout
 from verifai_jax.systems.ode.integrators import check_factor
 
 FILM = "verifai_jax.addons.simulators.pictures.mujoco_film"
-BACKENDS = ("native", "mjx")
+BACKENDS = ("native", "mjx", "warp")
+ON_HOST = ("native", "warp")
+"""Backends in which JAX runs the controller alone, between the steps of the physics."""
 
 
 @dataclass(frozen=True, eq=False)
 class MuJoCo(System):
     """A closed loop `(features, key) -> Trace`; made by `mujoco`, which documents its parts.
 
-    - `backend`: `"native"`, `"mjx"`, or `"auto"` until a run chooses.
+    - `backend`: `"native"`, `"mjx"`, `"warp"`, or `"auto"` until a run chooses.
     """
 
     # Measured on the cart-pole in MJX: four forward sweeps take 0.8 of one reverse sweep's time,
@@ -81,8 +86,9 @@ class MuJoCo(System):
 
     @cached_property
     def backends(self) -> tuple[str, ...]:
-        """The engines that can simulate this model."""
-        return BACKENDS if self.why_not("mjx") is None else ("native",)
+        """The engines that can simulate this model; `"warp"` only where it was asked for."""
+        mjx = ("mjx",) if self.why_not("mjx") is None else ()
+        return ("native", *mjx, *(("warp",) if self.backend == "warp" else ()))
 
     @property
     def notes(self) -> tuple[str, ...]:
@@ -147,13 +153,15 @@ class MuJoCo(System):
     def why_not(self, backend: str) -> str | None:
         if backend not in BACKENDS:
             raise unknown_name("backend", backend, (*BACKENDS, "auto"))
-        return None if backend == "native" else why_not(self.loop.bindings)
+        if backend == "native":
+            return None
+        return (why_not_warp if backend == "warp" else why_not)(self.loop.bindings)
 
     def with_backend(self, name: str) -> "MuJoCo":
         if name != "auto" and (reason := self.why_not(name)) is not None:
             raise ValueError(f"backend {name!r} is not possible: {reason}")
         return replace(
-            self, backend=name, loop=replace(self.loop, on_host=name == "native", said={})
+            self, backend=name, loop=replace(self.loop, on_host=name in ON_HOST, said={})
         )
 
     @property
@@ -176,8 +184,8 @@ class MuJoCo(System):
 
     @property
     def black_box(self) -> bool:
-        """True if JAX cannot trace it: on the native backend, or for a model that needs it."""
-        return self.backend == "native" or (self.backend == "auto" and "mjx" not in self.backends)
+        """True if JAX cannot trace it: natively, in Warp, or for a model that needs one of them."""
+        return self.backend in ON_HOST or (self.backend == "auto" and "mjx" not in self.backends)
 
     @cached_property
     def reverse_hint(self) -> str:
@@ -219,7 +227,7 @@ class MuJoCo(System):
         return used_inputs(program(key, features))[0]
 
     def __call__(self, features: Features, key: Seed = None) -> Trace:
-        """Simulate once: traced by JAX unless the backend is native."""
+        """Simulate once: traced by JAX in MJX."""
         if not self.black_box:
             return self.rollout(features, key).trace()
         features = set_durations(features, self.duration)
@@ -231,7 +239,7 @@ class MuJoCo(System):
 
     @property
     def can_fork(self) -> bool:
-        """True for MJX: a native simulation keeps more than its forks would."""
+        """True for MJX: other simulations keep more than their forks would."""
         return not self.black_box
 
     def rollout(self, features: Features, key: Seed = None) -> Rollout:
@@ -240,12 +248,13 @@ class MuJoCo(System):
         return rollout(self.loop, features, key)
 
     def simulate_batch(self, features: Features, keys: Key[Array, " n"]) -> Trace:
-        """Simulate a batch natively; all leaves have a leading axis `[n]`."""
+        """Simulate a batch natively or in Warp; all leaves have a leading axis `[n]`."""
         return self._native.simulate(set_durations(features, self.duration), keys)
 
     @cached_property
     def _native(self) -> Native:
-        return Native(self.loop, programs=self.programs)
+        warp = partial(WarpBatch, bindings=self.loop.bindings) if self.backend == "warp" else None
+        return Native(self.loop, programs=self.programs, make=warp)
 
 
 @suggests_options
@@ -277,8 +286,8 @@ def mujoco(
       `Scaled(path)` for a factor on the model's value, or to a list of these. See docs/mujoco.md
       for all paths.
     - `controller(time, state, features) -> control`: returns `[nu]`, or one number for one
-      actuator; `state` is a `systems.mujoco.loop.State`. JAX traces it. With `backend="native"` a
-      controller that JAX cannot trace, such as one in NumPy or PyTorch, is called with NumPy
+      actuator; `state` is a `systems.mujoco.loop.State`. JAX traces it. With `backend="native"` or
+      `"warp"` one that JAX cannot trace, such as one in NumPy or PyTorch, is called with NumPy
       arrays, once for each decision.
     - `controller_memory`: as in `ode`.
     - `initial(features, key, qpos, qvel) -> (qpos, qvel)`: the state at time 0, after `bind`.
@@ -288,7 +297,7 @@ def mujoco(
       dictionary. By default: joints as `NAME` and `NAME_vel`, and sensors by their names.
     - `terminate(state, features) -> bool`: as in `ode`.
     - `backend`: `"mjx"`, `"native"`, or `"auto"`: a run takes MJX if it needs gradients, otherwise
-      the faster one.
+      the faster one. `"warp"` is MuJoCo Warp, an extra without gradients (docs/mujoco.md).
     - `solver_iterations`, `ls_iterations`: iterations of the constraint solver and of its line
       search, instead of the model's.
     - `keyframe`: name or number of the model's keyframe in which each simulation starts, before
@@ -298,7 +307,7 @@ def mujoco(
       decision takes effect, the control is the keyframe's, or zero.
     **Returns:** a `MuJoCo` system.
     **Raises:** `MissingExtra` without MuJoCo; `FileNotFoundError`; `ValueError` for a model that
-    does not compile, inconsistent times, and paths that are not in the model.
+    does not compile or that the backend lacks, inconsistent times, and paths not in the model.
     """
     if backend not in (*BACKENDS, "auto"):
         raise unknown_name("backend", backend, (*BACKENDS, "auto"))
