@@ -94,7 +94,7 @@ def test_options_of_a_search(call, tmp_path):
     assert "here" in output
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_resume_goes_on_in_the_same_folder(call, tmp_path):
     start = ["falsify", "specs/ramp.py:ramp", "--search", "uniform", "--batch", 16]
     call(*start, "--budget", 48, "--only", "b", "--folder", "one", "--no-pictures")
@@ -110,7 +110,7 @@ def test_resume_goes_on_in_the_same_folder(call, tmp_path):
     assert "--seed is fixed in the run that --resume goes on with" in output
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_ends_and_warm_start(call):
     ramp = ["falsify", "specs/ramp.py:ramp", "--batch", 64, "--no-pictures"]
     output = call(*ramp, "--search", "uniform", "--within", 0.1, "--folder", "prior")
@@ -283,7 +283,7 @@ def test_replay_compares_each_formula_with_its_own_column(call, tmp_path):
         assert float(again) == pytest.approx(float(stored), abs=1e-5)
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_a_system_that_draws_is_replayed_in_the_precision_of_its_run(call, tmp_path):
     (tmp_path / "specs" / "noisy.py").write_text(
         PROBLEM.replace('f["a"] +', 'jax.random.normal(key) + f["a"] +').replace(

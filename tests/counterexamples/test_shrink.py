@@ -102,7 +102,7 @@ def test_the_edge_of_two_half_spaces(edges):
         checked(edges, row, EDGE, EDGE[1], seed=seed, others=False, budget=600)
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_what_it_says(edges):
     found = shrink(edges)
     assert isinstance(found, Shrunk)
@@ -205,7 +205,7 @@ def test_without_a_counterexample():
         shrink(run)
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_choices_integers_and_a_constraint():
     space = vj.FeatureSpace(
         {
@@ -244,7 +244,7 @@ def test_a_black_box_without_gradients():
     assert (few.count, few.distance) == (1, pytest.approx(0.375, rel=0.05))
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_a_system_that_draws_is_simulated_with_the_key_of_the_row():
     def system(features, key):
         lucky = jax.random.uniform(key)
@@ -293,7 +293,7 @@ def test_departures_from_nominal_are_counted():
     assert [name for name, _ in nominal.groups] == ["x", "n", "c"]
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_the_command(edges, tmp_path):
     from verifai_jax.cli.shrink import shrink as command
 

@@ -71,7 +71,7 @@ class TestPaths:
         bends = jax.jit(path.curvature)(jnp.array([5.0, 12.0, 99.0]))
         np.testing.assert_allclose(bends, [0, -0.2, 0])
 
-    @pytest.mark.thorough
+    @pytest.mark.slow
     def test_speed_along_a_path_is_one_everywhere(self, double):
         path = road.Path.start(0.0, 0.0, 0.3).straight(4.0).turn(6.0, 2.0).turn(3.0, -1.0)
         at = jnp.linspace(-3.0, path.length + 3.0, 40)
@@ -341,6 +341,7 @@ def test_nominal_is_safe_and_failures_are_there_but_rare(name):
     assert 1 <= table.violated.sum() <= 0.1 * len(table)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name", ["pedestrian", pytest.param("platoon", marks=pytest.mark.thorough)]
 )

@@ -165,7 +165,7 @@ def test_the_specifications_of_this_project_get_no_false_note():
 
 
 class TestRuns:
-    @pytest.mark.thorough
+    @pytest.mark.slow
     def test_the_nominal_features_fail(self, capsys):
         def run(limit, system=both, **options):
             spec = f"always (x < {limit} & y < 2)"
@@ -250,7 +250,7 @@ class TestRuns:
         (note,) = vj.falsify(vj.Problem("p", SPACE, both, spec), "uniform", 40, batch=40).notes
         assert note.startswith("formula 'far' was never near being violated: its robustness lay")
 
-    @pytest.mark.thorough
+    @pytest.mark.slow
     def test_a_search_that_follows_slopes_where_there_are_none(self):
         def steps(f, key):
             return vj.Trace({"x": jnp.floor(4 * f["a"] + f["b"]) * jnp.ones(3)}, dt=1.0)

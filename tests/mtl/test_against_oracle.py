@@ -68,7 +68,7 @@ def test_smooth_stays_within_its_certificate(formula, recording, tau):
     assert abs(near - exact) <= 0.01 + rounding
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 @given(formulas())
 @settings(max_examples=300, deadline=None)
 def test_the_text_parses_back(formula):

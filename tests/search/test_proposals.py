@@ -40,7 +40,7 @@ def play(proposals, rounds, gradient):
     return np.concatenate(seen)
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name",
     [
@@ -208,7 +208,7 @@ def test_a_search_of_ones_own_that_leaves_the_cube(wrong, message):
         Proposals(Own(wrong), cube, 16, KEY).next(16)
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_a_search_of_ones_own_that_is_right():
     cube = vj.FeatureSpace({"x": vj.Box(0, 1), "y": vj.Box(0, 1)}).cube
     check_search(Own(), cube)

@@ -18,7 +18,7 @@ def judged(**columns):
     return pd.DataFrame(columns).assign(violated=False, status="ok")
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_discrepancy_is_relative_to_uniform_samples():
     ratios = []
     for seed in range(30):
@@ -134,7 +134,7 @@ def test_what_cannot_work_is_refused_with_the_reason():
         coverage(judged(x=[1.0, 2.0]), cells=1)
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_pictures_are_drawn_and_written(tmp_path):
     from PIL import Image
 
@@ -173,7 +173,7 @@ def test_distributions_are_uniform_in_their_own_coordinates():
     assert coverage(table).discrepancy > 20
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_what_a_constraint_forbids_is_no_hole():
     space = vj.FeatureSpace(
         {

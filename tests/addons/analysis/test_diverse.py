@@ -78,7 +78,7 @@ def test_starts_where_told():
         diverse(frame, 0)
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_tells_and_draws(tmp_path):
     found = diverse(mixed(), 5)
     # A feature is called distance too: it keeps its name.

@@ -144,7 +144,7 @@ def test_absent_items_add_nothing():
     assert 0 < drawn["slope"].isna().mean() < 1
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_generated_samples_keep_lengths_and_constraints():
     space = FeatureSpace(
         {"x": Box(0, 1), "y": Box(0, 1), "cars": Array(DiscreteBox(1, 4), length=(1, 3))},

@@ -236,7 +236,7 @@ def test_conditions_in_words():
     assert str(OneOf(column, (0, 1, 4))) == "c is none of c, d"
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_what_precision_means_depends_on_the_search():
     def system(features, key):
         return vj.Trace({"y": features["a"][None] - 0.25}, dt=1.0)
@@ -268,7 +268,7 @@ def test_what_cannot_work_is_refused_with_the_reason():
         rules(table.iloc[:0])
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_pictures_are_drawn_and_written(tmp_path):
     from PIL import Image
 
@@ -315,7 +315,7 @@ def test_conditions_that_rows_kept_aside_do_not_support_are_dropped(seed):
     assert rule.precision.low < 0.53 < rule.precision.high
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_a_random_key_is_never_in_a_rule():
     """Whole numbers of so many values need far more support than chance ever gives."""
     for seed in range(20):

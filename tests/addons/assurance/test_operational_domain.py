@@ -170,7 +170,7 @@ def wide():
     return vj.Problem("p", space, system, "always z < 9")
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_the_mass_is_that_of_the_prior():
     odd = vj.odd_of(vj.FeatureSpace({"x": vj.Box(-1.0, 1.0), "y": vj.Box(0.0, 1.0)}), "part")
     assert odd.is_box

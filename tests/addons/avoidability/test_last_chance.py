@@ -31,7 +31,9 @@ def check(name: str, seed: int, forks: int) -> None:
 
 
 @pytest.mark.thorough
-@pytest.mark.parametrize("name", SYSTEMS)
+@pytest.mark.parametrize(
+    "name", [pytest.param(n, marks=() if n == "wall" else pytest.mark.slow) for n in SYSTEMS]
+)
 def test_the_bracket_holds_the_known_instant(name):
     check(name, 3, 1024 if name == "grid" else 512)
 
@@ -49,7 +51,7 @@ def braked():
     return known, vj.last_chance(WALL, known.features, actions=known.actions, **SMALL)
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_what_is_proved_begins_after_the_known_instant_and_before_the_failure(braked):
     known, found = braked
     assert known.instant <= found.proved_from < found.failed
@@ -90,7 +92,7 @@ def test_actions_are_replayed_by_a_controller_that_takes_them(braked):
     assert x.max() <= 10
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_the_environment_avoids_it_by_a_feature_from_an_instant_on():
     """A fan that pushes back with a force: it must stop what the car has left to stop."""
 

@@ -21,7 +21,7 @@ wall = vj.Problem("wall", {"v0": vj.Box(5, 8)}, car, "always x <= 10")
 """
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_the_command_prints_the_bracket_and_draws_it(tmp_path):
     (tmp_path / "model.py").write_text(MODEL)
     folder = tmp_path / "run"

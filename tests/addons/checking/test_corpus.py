@@ -70,7 +70,7 @@ def test_files_say_what_fails_and_how_it_was_found(run, corpus):
     assert {p.name for p in again} == {p.name for p in corpus.iterdir()}
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_failing_fixed_and_without_a_verdict(corpus):
     result = vj.replay_counterexamples(problem(), corpus)
     assert states(result) == ["failing"] * 3
@@ -139,7 +139,7 @@ def test_third(): pass
 """
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_problems_that_share_a_name(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     for folder, limits in (("a", (0.1, 2, 3)), ("b", (0.2, 2, 3))):

@@ -76,7 +76,7 @@ def check_run(run, problem, tmp_path, count):
     assert not wrong, "\n".join(wrong)
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_mutated_runs(run, problem, tmp_path):
     check_run(run, problem, tmp_path, FEW)
 

@@ -84,6 +84,7 @@ def equal(one, other):
     assert one.notes == other.notes
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("problem", "options"),
     [
@@ -104,7 +105,7 @@ def test_the_table_is_the_one_of_one_machine_whatever_the_order(problem, options
     )
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_a_run_that_was_stopped_goes_on_with_workers_and_without(tmp_path):
     whole = vj.falsify(LINE, "uniform", 4000, batch=512)
     begun = vj.falsify(
@@ -137,7 +138,7 @@ def test_a_constraint_is_kept_and_its_acceptance_is_that_of_the_rows_taken():
     assert one.acceptance == other.acceptance
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_a_pool_that_loses_a_process_leaves_what_is_finished(tmp_path, monkeypatch):
     monkeypatch.setattr("verifai_jax.addons.clusters.executors.SECONDS", 0.0)
     options = {"search": "uniform", "budget": 70, "batch": 20, "confirm": False}
@@ -154,7 +155,7 @@ def test_a_pool_that_loses_a_process_leaves_what_is_finished(tmp_path, monkeypat
     pd.testing.assert_frame_equal(again.table.all, whole.table.all, check_exact=True)
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_finished_rows_of_a_slow_black_box_are_not_simulated_again(tmp_path, monkeypatch):
     monkeypatch.setattr("verifai_jax.addons.clusters.executors.SECONDS", 0.0)
     monkeypatch.setattr("verifai_jax.addons.clusters.executor_engine.WORTH_KEEPING", 0.0)
@@ -188,7 +189,7 @@ def test_an_interruption_cancels_what_is_queued():
     assert all(future.cancelled() for future, _, _ in executor.queue)
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_estimates_and_comparisons_are_those_of_one_machine():
     one, other = (
         vj.estimate(LINE, "monte_carlo", 2000, run_on=vj.RunOn(executor=e))
@@ -284,7 +285,7 @@ def test_arrays_and_pools_of_black_boxes_can_be_sent():
 
 
 @pytest.mark.addons
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_every_problem_of_the_project_can_be_sent():
     cloudpickle = pytest.importorskip("cloudpickle")
     pytest.importorskip("mujoco")

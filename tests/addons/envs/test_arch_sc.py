@@ -44,14 +44,14 @@ def derivative(t, y, steam):
     return [filling, heating, (pressure - sensor) / 0.5, wanted - flow, *moves]
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_values_of_the_sheet(simulate):
     pressure = np.asarray(simulate([4.0, 4.0])["P"][0])
     for time, expected in REFERENCE.items():
         assert pressure[time * 100] == pytest.approx(expected, abs=2e-4)
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_a_program_with_an_adaptive_solver():
     knots, dt = np.random.default_rng(3).choice([3.99, 4.01], 6), 6.0 / 6
     with in_precision("float64"):

@@ -16,7 +16,7 @@ def rows(problem, n, seed=3):
     return jax.vmap(problem.space.unflatten)(u), jax.random.split(jax.random.key(0), n)
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 @pytest.mark.parametrize("problem", [specs.over, specs.halt], ids=lambda p: p.name)
 def test_problems_have_good_days_and_bad_ones(problem):
     problem = problem.on_backend("native")

@@ -247,7 +247,7 @@ def test_force_is_that_of_the_policy_small_or_large_normalised_or_not(width):
         assert float(push) == (10 if int(policy.act(state)) == 1 else -10)
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_one_program_judges_any_policy_of_a_form():
     @jax.jit
     def worst(policy, u):
@@ -294,7 +294,7 @@ def test_wind_is_a_force_on_the_cart():
     assert abs(one.signals["theta"][-1] - blown({"theta0": 0.02}, KEY).signals["theta"][-1]) > 1e-4
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_either_controller():
     both = cp.cartpole(cp.either(cp.linear(), cp.neural()), duration=0.2)
     for place, alone in enumerate((cp.linear(), cp.neural())):

@@ -140,7 +140,7 @@ def test_gains_are_the_riccati_equations():
     np.testing.assert_allclose(np.stack(jacobian, axis=1), slope, rtol=1e-5, atol=1e-6)
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_gradients_are_finite_differences(double):
     # A network of the shipped one's kind that is quick to compile.
     layers = new_layers(KEY, (5, 4, 1), gain=1.0)
@@ -176,7 +176,7 @@ def test_shipped_network_drives_and_doing_nothing_does_not():
     assert evaluate(task, lazy, seed=5, episodes=200).mean() < 100
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_the_task_steps_like_the_system():
     policy = load_policy(lk.POLICY_FILE)
     task = lk.LaneKeepingTask()
@@ -237,7 +237,7 @@ def test_nominal_is_safe_and_failures_are_there_but_rare(name):
     assert 1 <= table.violated.sum() <= 0.1 * len(table)
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_a_frame_shows_the_car_in_red_where_it_is_over_a_marking():
     features = {"curvature": Waveform(jnp.array([0.0, 0.005]), duration=100.0), "bias": 0.03}
     trace = lk.lane_keeping(hands_off, duration=2.0)(features, KEY)

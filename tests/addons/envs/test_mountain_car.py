@@ -70,7 +70,7 @@ def ours(continuous, start, actions, dtype):
     return np.concatenate([np.asarray(start)[None], states]), np.asarray(rewards), np.asarray(over)
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 @pytest.mark.parametrize("continuous", [False, True])
 def test_equal_to_gymnasium_step_for_step(continuous, monkeypatch):
     # Gymnasium computes the discrete car in float64; it rounds the continuous one's state to

@@ -130,7 +130,7 @@ def test_failures_belong_to_the_region_that_they_are_in_whatever_is_nearest():
     assert min(purity) > 0.95
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_a_region_a_hundred_times_less_probable_has_samples():
     cells, rng = Cells(12, 2, 2), np.random.default_rng(1)
     for row, mass in enumerate((1e-4, 1e-6)):

@@ -30,7 +30,7 @@ def rare():
     return estimate(half_space(1e-6, "rare"), budget=20_000, p0=1e-4)
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_one_in_a_million(rare):
     assert rare.method == "importance"
     assert rare.low < 1e-6 < rare.high
@@ -150,7 +150,7 @@ def test_without_any_verdict_no_robustness_is_claimed():
     assert "inf" not in said
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_chance_that_does_not_come_from_the_key_is_noticed():
     rng = np.random.default_rng(7)
 

@@ -108,14 +108,14 @@ def test_what_cannot_fail_gets_a_bound_and_no_estimate():
     assert answer.high == pytest.approx(1 - 0.05 ** (1 / answer.prior.simulations), rel=1e-6)
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_boolean_robustness_has_no_slope_and_is_counted():
     answer, _ = answered(lambda u: np.where(u[:, 0] < 3e-4, -1.0, 1.0), 1, 30_000, seed=1)
     assert answer.probability is None or answer.low < 3e-4 < answer.high
     assert answer.high > 3e-4
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_discrete_coordinates_are_cells_of_the_cube():
     # One of 10 cells, and in it a tail: p = 1e-5.
     def robustness(u):
@@ -125,7 +125,7 @@ def test_discrete_coordinates_are_cells_of_the_cube():
     assert answer.probability == pytest.approx(1e-5, rel=0.1)
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_a_constraint_makes_the_prior_conditional():
     # Given that the first coordinate lies in its upper quarter, failing is four times as probable.
     answer, limit_state = answered(
@@ -152,7 +152,7 @@ def test_simulations_without_verdict_widen_the_upper_end():
     assert answer.high > 0.15 * 0.98 + 0.02
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_the_same_seed_gives_the_same():
     one, other = (answered(half_space(4, 1e-4), 4, 10_000, seed=3)[0] for _ in range(2))
     assert one.probability == other.probability
@@ -241,7 +241,7 @@ def test_an_interval_holds_what_splitting_gave_where_they_cannot_both_be_right(
     assert not widened or answer.low <= splitting <= answer.high
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_many_simulations_need_little_memory():
     """All starts, and all ends, are compared with one another: so there is a limit to them."""
     limit_state = Cells(6, 3, 2).limit_state(2_000_000)

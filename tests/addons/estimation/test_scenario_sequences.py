@@ -49,7 +49,7 @@ def truth():
     return run.failure_rate.estimate
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_the_interval_holds_the_probability_of_the_whole(truth):
     found = vj.sequence([FIRST, SECOND], {"x0": "x"}, samples=2000, progress=False)
     assert found.low < truth < found.high
@@ -118,7 +118,7 @@ def test_what_begins_outside_of_a_space_has_no_verdict():
     assert len(found.counterexamples) == 0
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_what_is_wrong_is_said():
     with pytest.raises(ValueError, match="a sequence has two parts or more"):
         vj.sequence([FIRST], {"x0": "x"})

@@ -140,7 +140,7 @@ WRITTEN = [
 ]
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_as_a_person_writes_it():
     features = SPACE.coerce({"traffic": WRITTEN, "v": 0.5})
     events = features["traffic"]

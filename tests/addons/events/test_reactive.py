@@ -72,7 +72,7 @@ def test_plain_data_and_names():
     assert repr(AFFINE.coerce([0, 0, 0])) == "Reaction(x, y; affine, from -1 to 1)"
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_reacting_breaks_what_no_plan_of_the_same_size_can():
     assert sway.reactive.space.dim == sway.open_loop.space.dim == 9
     corners = np.array(list(itertools.product([-1.0, 1.0], repeat=9)), np.float32)

@@ -67,7 +67,7 @@ def on_host(system):
     return lambda features, key: system(jax.tree.map(np.asarray, features), key)
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_gymnasium_observations_and_choices():
     def policy(observation):
         return int(observation[2] + 0.3 * observation[3] > 0)
@@ -91,7 +91,7 @@ def test_gymnasium_observations_and_choices():
         problem.with_faults(faults.Bias("observation[4]", offset=1.0))
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_gymnasium_continuous_actions():
     system = vj.gymnasium(
         "Pendulum-v1", lambda o: -2.0 * o[1:2] - 0.5 * o[2:], steps=30, features={"m": "m"}
@@ -106,7 +106,7 @@ def test_gymnasium_continuous_actions():
     assert len(run.table.all) == 8
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_gymnax():
     pytest.importorskip("gymnax")
     system = vj.gymnax(
@@ -117,7 +117,7 @@ def test_gymnax():
     assert check(problem, made[:-1], jax.jit, m=1.0) == []
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_brax():
     pytest.importorskip("brax")
     system = vj.brax(

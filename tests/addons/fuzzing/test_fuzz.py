@@ -47,7 +47,7 @@ def run():
     return vj.fuzz(LEVEL, 256, batch=64, cells=CELLS, seed=3, confirm=False, progress=False)
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_what_is_covered_is_what_an_independent_count_says(run):
     labels = {(each.source, each.name): each.label for each in TRAFFIC.transitions}
     states, transitions, pairs, cells = Counter(), Counter(), Counter(), Counter()
@@ -134,7 +134,7 @@ def troubled(features):
     return vj.Trace({"y": y}, dt=0.1)
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_without_a_formula_each_trouble_is_a_counterexample():
     system = vj.blackbox(troubled)
     run = vj.fuzz(

@@ -89,7 +89,7 @@ def test_no_trace_contradicts_a_proof():
     assert proofs_hold(range(100), ["x"]) > 2
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_no_trace_contradicts_many_proofs():
     assert proofs_hold(range(60, 2000)) > 60
 

@@ -134,7 +134,7 @@ def test_a_later_sample_decides_whatever_a_gap_hid(compiled, monkeypatch):
     assert seen == [(1, 1), (-np.inf, 1), (-np.inf, -2), (-2, -2), (4, 4)]
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 @given(formulas(2), broken(4))
 @settings(QUICK, max_examples=15)
 def test_the_monitor_in_jax_has_the_same_interval(formula, both):
@@ -161,7 +161,7 @@ def test_a_monitor_in_jax_decides_after_a_gap():
         assert monitor.memory < mtl.online("always x > 0", 1.0).memory
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 @given(st.lists(formulas(3, counted=True), min_size=9, max_size=12), st.lists(broken(), min_size=9))
 @settings(QUICK, max_examples=2)
 def test_the_exported_header_has_the_same_interval(tmp_path_factory, some, recordings):

@@ -38,6 +38,7 @@ def test_a_simulation_that_tells_two_readings_apart(problem):
     assert rare.holds == (False, True)
 
 
+@pytest.mark.slow
 def test_mutants_and_findings_of_simulations(problem):
     found = mtl.lint("always (x > 9 -> eventually t > 3)", problem)
     assert {finding.kind for finding in found} == {"vacuous", "never holds"}

@@ -154,7 +154,7 @@ def test_examples_satisfy_barely_satisfy_and_break(shown):
     assert np.asarray(shown.satisfying["x"])[:11].max() > 1
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_pictures_have_a_row_for_each_signal_and_truth(shown, tmp_path):
     figure = shown.plot(tmp_path / "examples.png")
     assert len(figure.axes) == 9

@@ -205,7 +205,7 @@ int main(void) {
 """
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 @pytest.mark.skipif(shutil.which("gcc") is None, reason="needs gcc")
 def test_exported_c_gives_the_bounds_of_watch_bit_for_bit(tmp_path, monkeypatch):
     monkeypatch.setenv("VERIFAI_JAX_CACHE", str(tmp_path / "cache"))

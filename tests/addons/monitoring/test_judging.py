@@ -55,7 +55,7 @@ def logs(tmp_path):
     return folder
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_a_fleet_has_the_verdicts_of_its_recordings_alone(logs, tmp_path):
     requirements = read_requirements(tmp_path / "requirements.toml")
     found = judge(requirements, logs)

@@ -18,7 +18,7 @@ def trace(dt=0.1, **signals):
     return Trace({name: np.array(values, float) for name, values in signals.items()}, dt=dt)
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 @given(formulas(counted=True), recordings(), st.sampled_from(["hold", "truncate"]))
 @settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 def test_values_in_numpy_are_those_of_the_definitions(formula, recording, end):

@@ -122,7 +122,7 @@ def test_what_cannot_be_monitored_is_said_at_once():
         monitor.step(monitor.init(), {"sped": 1.0})
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_a_part_that_stands_in_several_places_is_followed_once():
     text = "x > 0"
     for i in range(16):

@@ -173,7 +173,7 @@ def test_mining_finds_bounds_and_windows_of_functions():
         mtl.mine("always[0, ?T) x > 0", [trace])
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_a_count_has_no_gradient_which_is_said():
     problem = vj.Problem(
         "p", {"a": vj.Box(-1, 1)},

@@ -127,7 +127,7 @@ def test_a_message_of_ulog_that_declares_a_million_numbers(tmp_path):
         read(path)
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_channels_and_frames_of_mdf(tmp_path):
     path = tmp_path / "car.mf4"
     write_mdf(path)
@@ -151,7 +151,7 @@ def test_channels_and_frames_of_mdf(tmp_path):
         read(path, dbc=tmp_path / "car.dbc")
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 @pytest.mark.parametrize("formula", ["().__class__.__bases__[0]", "9**9**9**9*X1", "exit(X1)"])
 def test_a_formula_of_mdf_is_not_evaluated(tmp_path, formula):
     path = tmp_path / "car.mf4"

@@ -93,7 +93,7 @@ def test_every_instant_has_its_offline_value(formula, recording, boolean):
     check_every_instant({"f": formula}, recording, boolean)
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 @given(
     st.lists(formulas(3, counted=True), min_size=9, max_size=12),
     recordings(sizes=(9,)),
@@ -195,7 +195,7 @@ def test_a_name_that_c_or_the_code_uses_is_refused(name):
         mtl.export_c("x > 0", 0.1, name)
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 @pytest.mark.skipif(shutil.which("gcc") is None, reason="needs gcc")
 def test_headers_of_free_names_and_of_odd_signals_compile_without_a_warning(tmp_path):
     formula = "always[0, 0.3] (exp(x) > 0 & max(y, 1) < 3)"
@@ -232,7 +232,7 @@ int main(void) {
 """
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 @given(st.lists(formulas(3, counted=True), min_size=9, max_size=12), st.integers(0, 2**31))
 @settings(QUICK, max_examples=2)
 def test_the_exported_header_is_sound_c_and_has_the_same_values(tmp_path_factory, some, seed):

@@ -364,6 +364,7 @@ def test_the_table_has_every_primitive():
     assert not excluded & set(TABLE)
 
 
+@pytest.mark.slow
 def test_programs_of_all_primitives_equal_those_of_xla_or_are_refused_by_name():
     translated, refused, wrong = {}, {}, []
     for name, function in TABLE.items():

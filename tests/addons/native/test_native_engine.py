@@ -63,6 +63,7 @@ def points(problem, n=BATCH):
     return np.random.default_rng(0).random((n, problem.space.dim), np.float32)
 
 
+@pytest.mark.slow
 def test_verdicts_are_those_of_xla(ending):
     ours, theirs, _ = evaluated(ending, points(ending))
     assert 0.01 < theirs.violated.mean() < 0.9
@@ -80,6 +81,7 @@ def test_rows_before_the_first_native_one_are_those_of_xla(ending):
     assert np.array_equal(np.concatenate([part.rho for part in parts]), ours.rho)
 
 
+@pytest.mark.slow
 def test_gradients_are_those_of_xla(ending):
     ours, theirs, _ = evaluated(ending, points(ending), gradient=True)
     size = np.abs(theirs.gradient).max(1, keepdims=True) + 1e-3
@@ -102,6 +104,7 @@ def test_nan_and_infinities_are_those_of_xla():
     assert np.array_equal(np.isnan(ours.rho), np.isnan(theirs.rho))
 
 
+@pytest.mark.slow
 def test_a_system_that_draws_draws_the_same():
     def simulate(features, key):
         noise = jax.random.normal(key, (20,)) * 0.1
@@ -128,6 +131,7 @@ def test_what_is_near_to_zero_is_decided_by_xla():
     assert np.array_equal(ours.rho, theirs.rho)
 
 
+@pytest.mark.slow
 def test_the_same_table_resumed_or_not(ending):
     options = {"run_on": vj.RunOn(engine="native"), "batch": 700, "progress": False}
     whole = vj.falsify(ending, "uniform", 2100, **options)
@@ -173,6 +177,7 @@ def test_by_default_it_is_native_unless_few_simulations_may_do(ending, monkeypat
     assert vj.falsify(ending, "cross_entropy", 700, **options).engine == "xla"
 
 
+@pytest.mark.slow
 def test_given_features_are_simulated_natively(ending):
     rows = vj.falsify(ending, "uniform", 800, confirm=False, progress=False).table.all
     run = vj.simulate(ending, rows, run_on=vj.RunOn(engine="native"), progress=False)
@@ -235,6 +240,7 @@ def test_with_a_broken_compiler(ending, monkeypatch, tmp_path, script, words):
     assert words in fallback_note(ending)
 
 
+@pytest.mark.slow
 def test_with_a_cache_that_cannot_be_written(ending, monkeypatch, tmp_path):
     (tmp_path / "cache").mkdir()
     (tmp_path / "cache" / "native").write_text("a file")
@@ -254,6 +260,7 @@ def test_a_folder_that_others_can_write_to_is_refused(ending, monkeypatch, tmp_p
     assert "others can write to" in fallback_note(ending)
 
 
+@pytest.mark.slow
 def test_a_damaged_library_is_made_anew(ending, monkeypatch, tmp_path):
     monkeypatch.setenv("VERIFAI_JAX_CACHE", str(tmp_path))
     ending.programs.clear()

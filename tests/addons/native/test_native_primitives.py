@@ -262,6 +262,7 @@ def test_elements_by_number():
     check(function, 4, "elements", 64, np.nan_to_num(rows_of(4), posinf=3, neginf=-3))
 
 
+@pytest.mark.slow
 def test_loops_and_branches():
     def function(row, words, number, temperature, numbers):
         def step(carry, x):
@@ -308,6 +309,7 @@ def test_loops_and_branches():
     assert np.allclose(a, b, rtol=1e-4, atol=1e-4)
 
 
+@pytest.mark.slow
 def test_a_branch_keeps_what_is_used_after_it():
     """A branch changes the memory of its loop as it lies, where nothing else needs the old one."""
 
@@ -347,6 +349,7 @@ def test_a_branch_keeps_what_is_used_after_it():
     assert np.array_equal(ours.view(np.float32), theirs.view(np.float32))
 
 
+@pytest.mark.slow
 def test_random_numbers_are_those_of_jax():
     def function(row, words, number, *_):
         key = jax.random.fold_in(jax.random.wrap_key_data(words, impl="threefry2x32"), number)

@@ -29,7 +29,7 @@ def model():
     return model, data
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_depth_is_that_of_mujoco_s_rays(model):
     model, data = model
     camera = mujoco_camera(model, data, "eye", 20, 30)

@@ -94,7 +94,7 @@ def report(folder, tmp_path_factory):
     return vj.load(folder, PROBLEM).report(path, **OPTIONS)
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_the_questions_of_an_auditor_are_answered(report, folder):
     run, text = vj.load(folder, PROBLEM), read(report).text
     counts = run.table.counts

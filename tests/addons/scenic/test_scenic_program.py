@@ -27,6 +27,7 @@ def test_without_scenic_one_line_names_the_extra(monkeypatch):
 @pytest.mark.filterwarnings("ignore")
 @pytest.mark.usefixtures("installed")
 class TestWithScenic:
+    @pytest.mark.slow
     def test_names_are_those_of_the_program(self):
         program = vj.scenic(GALLERY / "cones.scenic")
         assert program.compiled

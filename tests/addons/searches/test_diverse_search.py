@@ -56,7 +56,7 @@ class Descent(Search):
         return jnp.float32(0.1)
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_contract_with_gradients():
     check_search(Diverse(Descent(), capacity=8), Cube((0, 0)))
 

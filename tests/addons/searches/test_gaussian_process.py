@@ -90,7 +90,7 @@ def test_evidence_is_the_density_of_the_targets():
         np.testing.assert_allclose(CODES.evidence(hyper(jnp.float64), given), expected, rtol=1e-9)
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 @pytest.mark.parametrize("process", [PLAIN, CODES], ids=["plain", "codes"])
 def test_sampled_functions_have_the_moments_of_the_posterior(process):
     rng = np.random.default_rng(3)

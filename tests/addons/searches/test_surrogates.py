@@ -129,7 +129,7 @@ def test_a_system_that_jax_traces_is_learned_as_a_black_box_is():
     assert "s to search, " in str(run)
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_where_no_traces_come_it_is_turbo():
     space = {"force": vj.Array(vj.Box(-1, 1), length=DIM)}
     spec = {"low": "always x < 2.1", "high": "always x > -2.1"}
@@ -161,7 +161,7 @@ def test_one_of_six_proposals_is_the_guess_of_the_model_whatever_the_batch(monke
 
 
 class TestDefault:
-    @pytest.mark.thorough
+    @pytest.mark.slow
     def test_quick_black_boxes_have_the_portfolio(self):
         calls = []
 

@@ -170,7 +170,7 @@ def test_a_run_ends_where_it_was_terminated():
     assert motion.caption == "ball, row 0: ok"
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_pictures_of_a_replay(seen, gl, tmp_path, monkeypatch):
     monkeypatch.setattr(scene, "SIZE", SIZE)
     names = [path.name for path in write_replay_pictures(seen, tmp_path, "worst")]

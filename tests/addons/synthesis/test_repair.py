@@ -67,7 +67,7 @@ def test_rounds_and_what_it_says(mended):
     assert len(mended.plot().axes) == 1
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_rare_failures_are_compared_by_estimates():
     space = {"k": vj.Box(0.0, 4.0), "x": vj.Normal(0.0, 1.0)}
     system = lambda f, key: vj.Trace({"x": jnp.full(2, f["x"] - f["k"])}, dt=1.0)  # noqa: E731

@@ -68,7 +68,7 @@ def test_each_trouble_is_a_row_and_stops_no_other():
     np.testing.assert_array_equal(found[8].trace["x"], host_systems.decay({"a": 9.5})["x"])
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_at_the_end_of_all_time_what_runs_is_ended_and_nothing_begins(troublesome):
     outcomes(troublesome, [{"a": 0}] * 2)
     features, began = [{"a": a} for a in (0, 4, 4, 4, 0)], time.monotonic()
@@ -89,7 +89,7 @@ def test_one_simulation_raises_what_went_wrong(troublesome):
         single_trace(iter([(0, late)]))
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_workers_are_used_again_and_end_with_the_pool(troublesome):
     found = outcomes(troublesome, [{"a": 9}] * 20) + outcomes(troublesome, [{"a": 9}] * 20)
     pids = {int(outcome.trace["x"][0]) for outcome in found}
@@ -140,7 +140,7 @@ def test_a_caller_that_stops_ends_what_runs(troublesome):
     assert outcomes(troublesome, [{"a": 0}])[0].status == Status.OK
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_what_a_simulator_has_started_ends_with_the_pool():
     with_children = blackbox(host_systems.troublesome, workers=1)
     (outcome,) = outcomes(with_children, [{"a": 12}])
@@ -150,7 +150,7 @@ def test_what_a_simulator_has_started_ends_with_the_pool():
     until(lambda: not alive(child), 5)
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_what_has_ended_when_interrupted_is_handed_over(monkeypatch, tmp_path):
     """Outcomes of several workers lie in the queue when Ctrl-C comes."""
     system = blackbox(host_systems.troublesome, workers=2)
@@ -290,7 +290,7 @@ def test_a_session_without_a_file_is_told_so():
     assert "%%writefile simulator.py" in done.stderr
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_a_module_that_only_its_file_finds(tmp_path, monkeypatch):
     # As `verifai-jax falsify folder/script.py` loads its target.
     monkeypatch.setattr(sys, "path", list(sys.path))

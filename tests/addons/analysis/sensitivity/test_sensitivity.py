@@ -222,7 +222,7 @@ def test_what_cannot_work_is_refused_with_the_reason(mixed, ishigami):
             analysis(tied)
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_pictures_are_drawn_and_written(ishigami, mixed, tmp_path):
     from PIL import Image
 

@@ -45,7 +45,7 @@ def falsified(problem, folder=None, budget=64, **options):
     return vj.falsify(problem, "uniform", budget, progress=False, folder=folder, **options)
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_outcomes_of_runs():
     run = falsified(PROBLEM)
     broken = np.count_nonzero(run.table.all["a"] > 0.9)
@@ -145,7 +145,7 @@ def test_tests_that_were_edited(tmp_path):
     assert "tests always (x < 3), and the problem has always (x < 0.9)" in str(found)
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_evidence_that_was_edited(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     Path("odd.yaml").write_text(

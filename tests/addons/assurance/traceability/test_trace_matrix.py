@@ -79,7 +79,7 @@ def project(tmp_path, monkeypatch):
     return tmp_path
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_a_whole_chain_and_every_change_of_it(project):
     whole = traced()
     assert whole.complete, str(whole)

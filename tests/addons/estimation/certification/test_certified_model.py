@@ -69,7 +69,7 @@ def names(result):
     return {name for name, *_ in result.sources["files"]}
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_blocks_of_another_model_are_no_part_of_a_certificate(project):
     memo = {}
     first, computed = certified(memo)
@@ -92,7 +92,7 @@ def test_a_synthesis_records_its_model():
     assert found.sources["versions"]["verifai_jax"] == vj.__version__
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_a_repair_from_a_run_of_another_model_says_so(project):
     options = {"budget": 64, "aim": vj.Aim(held_out=8), "batch": 8, "progress": False}
     run = vj.falsify(tuning(), "uniform", 16, progress=False, confirm=False)

@@ -43,7 +43,7 @@ def test_a_pair_of_systems_that_draw_fails_again_under_its_key():
     assert fails == [not row["worse"], bool(row["worse"])]
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_a_regression_is_found_and_lies_where_it_does():
     result = vj.compare(BASE, make(0.8))
     one = result.candidates[0]
@@ -90,7 +90,7 @@ def test_simulations_without_a_verdict_widen_the_interval():
     assert f"{rates.undecided:,} without a verdict" in str(result)
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_pairs_depend_on_the_seed_alone():
     where = vj.FeatureSpace(SPACE, where=lambda f: f["a"] < f["b"])
     rows = []
@@ -160,7 +160,7 @@ def test_eight_discordant_pairs_of_eight_decide_however_many_others():
         paired_rates(3, 3, 5)
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_the_command_compares_two_targets(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "spec.py").write_text(

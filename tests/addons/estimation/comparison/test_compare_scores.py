@@ -250,7 +250,7 @@ def test_the_command_compares_files(tmp_path):
 DISTURBED = {"a": vj.Box(0.0, 0.8)}
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_a_matched_arm_without_disturbances_says_what_makes_the_difference():
     def loop(gain, name):
         system = vj.ode(

@@ -113,7 +113,7 @@ def test_what_cannot_be_loaded(project, tmp_path_factory, monkeypatch):
         load("ramp.py:ramp@main")
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_command_compares_revisions(project):
     arguments = ["compare", "specs/ramp.py:ramp@HEAD~1", "specs/ramp.py:ramp@HEAD"]
     result = CliRunner().invoke(main, [*arguments, "specs/ramp.py:ramp", "--fail-on", "regression"])

@@ -73,7 +73,7 @@ def test_a_planted_difference_is_found(tmp_path):
     assert "pairs with different verdicts:" in page
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_no_difference_where_terms_are_only_written_otherwise():
     found = compared(plant(), plant(order=2))
     assert not found.differs
@@ -126,7 +126,7 @@ def pendulums():
     return compared
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("change", "said"),
     [

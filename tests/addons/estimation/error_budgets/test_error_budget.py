@@ -95,7 +95,7 @@ def decaying(dt, method="euler", limit=0.3):
     return vj.Problem("decay", SPACE, system, f"eventually x < {limit}")
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_the_parts_of_an_estimate(tmp_path):
     problem = decaying(0.25)
     result = vj.estimate(problem, "monte_carlo", 2000, p0=0.9, progress=False)
@@ -147,7 +147,7 @@ def test_a_system_with_chance_and_without_a_step():
     assert "is not shown under this prior" in str(found.prior)
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_a_comparison():
     first, second = decaying(0.25), decaying(0.25, limit=0.31)
     compared = vj.compare(first, second, budget=2000, progress=False)

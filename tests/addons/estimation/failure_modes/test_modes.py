@@ -168,7 +168,7 @@ def test_a_mode_is_replayed_explained_and_shrunk(found, tmp_path):
     assert "unexplained" in text
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_a_run_and_the_command(tmp_path):
     (tmp_path / "easy.py").write_text(
         "import verifai_jax as vj\n"

@@ -46,6 +46,7 @@ def found(trials):
 
 @pytest.mark.thorough
 class TestRealTrials:
+    @pytest.mark.slow
     def test_the_rate_is_that_of_reality(self, found):
         rng = np.random.default_rng(0)
         drawn = pd.DataFrame(
@@ -164,6 +165,7 @@ class TestPolicies:
 
 @pytest.mark.thorough
 class TestCalibration:
+    @pytest.mark.slow
     def test_the_wear_of_the_brakes_is_found(self, trials):
         def worn(features, key):
             return brake({**features, "brake": features["wear"] * features["brake"]}, key)

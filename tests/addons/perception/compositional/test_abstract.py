@@ -125,7 +125,7 @@ def test_what_is_confirmed_fails_because_the_network_errs():
     pd.testing.assert_frame_equal(again.candidates, result.candidates)
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_a_perception_that_never_errs_uses_up_its_budget():
     def true(features, sample):
         return dict(sample, reading=sample["gap"])
@@ -141,7 +141,7 @@ def test_a_perception_that_never_errs_uses_up_its_budget():
     assert "simulations  none" in str(result)
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_a_finite_search_ends_with_all_of_its_candidates_simulated():
     points = [[0.9, v / 7, hue] for v in range(8) for hue in (0.39, 0.4, 0.9)]
     result = vj.perception.abstract(
@@ -153,7 +153,7 @@ def test_a_finite_search_ends_with_all_of_its_candidates_simulated():
     assert len(result.candidates) == len(result.confirmed) == len(result.simulations) == 16
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_nothing_is_rendered_where_nothing_is_uncertain():
     for spec, kind in (("always gap > -99", "safe"), ("always gap > 99", "fails anyway")):
         result = vj.perception.abstract(

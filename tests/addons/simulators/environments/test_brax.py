@@ -366,7 +366,7 @@ def test_an_error_within_brax_names_the_versions():
         brax("swimmer", push, steps=3, backend="mjx")
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_names_in_the_environments_of_brax():
     with pytest.raises(UnknownNameError, match="environment of brax 'hoper'; did you mean 'hopper"):
         brax("hoper", push, steps=3)

@@ -59,7 +59,7 @@ def whole():
         )
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_one_row_a_policy(whole):
     columns = whole.record.columns
     assert list(columns) == [*BEFORE, "rate", *AFTER]
