@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 import verifai_jax as vj
-from verifai_jax.core.compute.purity import difference, programs_read
+from verifai_jax.core.compute.jaxprs import programs_read
+from verifai_jax.core.compute.purity import difference
 from verifai_jax.core.user_code.targets import definitions
 from verifai_jax.problem.problem import ProblemError
 from verifai_jax.problem.silent_mistakes import silent_mistakes

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, PyTree
 
 from verifai_jax.core.compute.devices import Device, spread_over_devices
-from verifai_jax.core.compute.fingerprint import programs_in
+from verifai_jax.core.compute.jaxprs import programs_in
 from verifai_jax.core.compute.keys import simulation_key
 from verifai_jax.problem.problem import Problem
 

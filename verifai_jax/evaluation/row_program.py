@@ -17,6 +17,7 @@ from jaxtyping import Array, Bool, Float, Key, PyTree
 
 from verifai_jax.core.compute.compilation import tracing
 from verifai_jax.core.compute.fingerprint import as_traced, fingerprint, identity
+from verifai_jax.core.compute.jaxprs import work_of
 from verifai_jax.core.compute.keys import IMPLEMENTATION
 from verifai_jax.core.compute.lifting import CAPACITY, LiftedNumbers
 from verifai_jax.core.compute.precision import in_precision
@@ -164,8 +165,6 @@ class RowProgram:
     @cached_property
     def work(self) -> int:
         """Approximate number of scalar operations in a simulation with its derivative."""
-        from verifai_jax.evaluation.work import work_of
-
         with tracing(self.inputs.purpose), in_precision(self.precision):
             if not self.gradient:
                 return work_of(self.trace("evaluate").jaxpr.jaxpr)

@@ -10,7 +10,7 @@ robustness, or with one of exactly zero where the Boolean semantics say so (`x >
 """
 
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -95,13 +95,11 @@ class Verdicts(NamedTuple):
         """Return some of the rows, by their indices."""
         arrays = self._replace(messages=None, traces=None)
         some: Verdicts = jax.tree.map(lambda leaf: leaf[chosen], arrays)
-
-        def listed(each: list[Any] | None) -> list[Any] | None:
-            if each is None:
-                return None
-            return [each[i] for i in np.arange(len(each))[chosen].tolist()]
-
-        return some._replace(messages=listed(self.messages), traces=listed(self.traces))
+        if self.messages is None and self.traces is None:
+            return some
+        numbers = np.arange(len(self.status))[chosen].tolist()
+        lists = [each and [each[i] for i in numbers] for each in (self.messages, self.traces)]
+        return some._replace(messages=lists[0], traces=lists[1])
 
 
 class RowVerdict(NamedTuple):

@@ -89,7 +89,9 @@ def _nominal_note(problem: Problem, evaluate: Evaluator) -> tuple[str, ...]:
         # One of its own: the journal of the run keeps rows of its table only.
         monitor = engine.monitor if isinstance(engine, HostEngine) else None
         engine = HostEngine(problem, engine.precision, monitor=monitor)
-    elif not is_quick(problem) or _samples(problem, cast(Engine, engine).padded) > MAX_SAMPLES:
+    elif not is_quick(problem) or (
+        cast(Trace, problem.form()).length * cast(Engine, engine).padded > MAX_SAMPLES
+    ):
         return ()
     space = problem.space
     nominal = space.completed(problem.nominal or {})
@@ -107,15 +109,9 @@ def _nominal_note(problem: Problem, evaluate: Evaluator) -> tuple[str, ...]:
     )
 
 
-def _samples(problem: Problem, rows: int) -> int:
-    form = problem.form()
-    return rows * (1 if form is None else form.length)
-
-
 def notes_after(
-    table: ErrorTable, tally: Tally, formulas: Mapping[str, str], search: Search,
-    warm: bool = False,
-) -> tuple[str, ...]:  # fmt: skip
+    table: ErrorTable, tally: Tally, formulas: Mapping[str, str], search: Search, warm: bool = False
+) -> tuple[str, ...]:
     """Return likely mistakes that all simulations of a run show together.
 
     **Arguments:**

@@ -28,7 +28,7 @@ from jaxtyping import Array
 
 from verifai_jax.core.compute import fingerprint
 from verifai_jax.core.compute.compilation import Slot
-from verifai_jax.core.compute.jaxprs import CALLS, called
+from verifai_jax.core.compute.jaxprs import CALLS, called, programs_in
 from verifai_jax.core.compute.precision import truncate_silently
 from verifai_jax.problem.problem import Problem
 from verifai_jax.problem.tracing import judged_results
@@ -136,7 +136,7 @@ class _Sweep:
         if name == "cond":
             branches = [self(_program(each), moved[1:]) for each in options["branches"]]
             return [any(each) for each in zip(*branches, strict=True)]
-        if name.startswith("scatter") or (_is_of_jax(step) and not fingerprint.programs_in(step)):
+        if name.startswith("scatter") or (_is_of_jax(step) and not programs_in(step)):
             return [name not in _FLAT] * len(step.outvars)
         return self.differentiated(program, step, moved)
 

@@ -20,7 +20,7 @@ from jaxtyping import Array, Float, Key
 from verifai_jax.core.compute.compilation import ProgramCache, Slot
 from verifai_jax.core.compute.fingerprint import fingerprint
 from verifai_jax.core.compute.precision import reproducible_settings, truncate_silently
-from verifai_jax.core.compute.purity import TRACED_ONCE, watch
+from verifai_jax.core.compute.purity import TRACED_ONCE, Watched, watch
 from verifai_jax.core.display.extensions import verb
 from verifai_jax.core.display.lazy import lazy_import
 from verifai_jax.core.display.notebook import InNotebook, text_html
@@ -323,10 +323,6 @@ class Problem(InNotebook):
         if trace is None:
             self._check_known()
             return
-        self.programs.get(JUDGED, _settings(), lambda: self._check_judges(trace, features))
-
-    def _check_judges(self, trace: Trace, features: Mapping[str, Any]) -> None:
-        """Trace what judges the simulations, which must give the same program each time."""
 
         def judged(trace: Trace, features: Any) -> Any:
             values = [robustness(f, trace, end=self.end) for f in self.formulas.values()]
@@ -335,12 +331,11 @@ class Problem(InNotebook):
             return values, steered, None if where is None else where(features)
 
         judges = (tuple(self.formulas.values()), self.guide, self.space.where)
-        watched = watch(
-            judges, lambda: jax.make_jaxpr(lambda *a: judged(*a))(trace, features), twice=False
-        )
-        if watched.why_impure:
+        program = lambda: jax.make_jaxpr(lambda *a: judged(*a))(trace, features)  # noqa: E731
+        watched = lambda: watch(judges, program, twice=False).why_impure  # noqa: E731
+        if why_impure := self.programs.get(JUDGED, _settings(), watched):
             raise ProblemError(
-                f"what judges the simulations of problem {self.name!r} {watched.why_impure}. "
+                f"what judges the simulations of problem {self.name!r} {why_impure}. "
                 f"{TRACED_ONCE}: a formula, a guide and a constraint are functions of their "
                 "arguments alone"
             )
@@ -400,8 +395,7 @@ class Problem(InNotebook):
         if watched is None:
             return trace
         self.programs.get(TRACED, _settings(), lambda: watched.result)
-        self.programs.get(KEPT, None, lambda: watched.kept)
-        self.programs.get(QUICK, None, lambda: watched.quick)
+        self.programs.get(WATCHED, None, lambda: watched)
         if (alone := why_not_batched(watched.result[0].jaxpr)) is not None:
             raise ProblemError(
                 f"the system of problem {self.name!r} cannot be simulated in batches: {alone}"
@@ -429,14 +423,12 @@ class Problem(InNotebook):
         return "\n".join(lines)
 
 
-JUDGED: Slot[tuple[str, ...], None] = Slot("judged")
-"""That the formulas, the guide and the constraint were checked, by JAX's settings."""
-KEPT: Slot[None, tuple[str, ...]] = Slot("kept")
-"""What each call of a problem's system changes, in words."""
+JUDGED: Slot[tuple[str, ...], str | None] = Slot("judged")
+"""Why formulas, guide and constraint are impure, by JAX's settings; None if they are not."""
 FORM: Slot[None, Trace | None] = Slot("form")
 """The form of the traces of a problem's system."""
-QUICK: Slot[None, bool] = Slot("quick")
-"""Whether a problem's system is quick to trace."""
+WATCHED: Slot[None, Watched] = Slot("watched")
+"""What was seen when a problem's system was traced first."""
 TRACED: Slot[tuple[str, ...], tuple[Any, Trace]] = Slot("traced")
 """The program of the system and the form of its traces, by JAX's precision and generator."""
 FINGERPRINT: Slot[None, str] = Slot("fingerprint")

@@ -17,7 +17,7 @@ from verifai_jax.core.values.trace import Trace
 from verifai_jax.features import Domain
 from verifai_jax.mtl.fitting import assumptions
 from verifai_jax.mtl.shortfalls import shortfalls
-from verifai_jax.problem.problem import KEPT, QUICK, Problem
+from verifai_jax.problem.problem import WATCHED, Problem
 from verifai_jax.problem.tracing import judged_results, traced_by_default
 
 COMPARED = ". A Categorical of texts has the place of the choice as its value, which no text equals"
@@ -61,7 +61,7 @@ def mistakes_of_the_system(problem: Problem) -> Iterator[str]:
     if problem.black_box or not traced_by_default(problem.system):
         return
     yield from _unread(problem)
-    if kept := problem.programs.peek(KEPT, None):
+    if (watched := problem.programs.peek(WATCHED, None)) and (kept := watched.kept):
         yield (
             f"each call of the system changes {' and '.join(kept[:4])}, and JAX calls it while "
             "tracing, once for all steps of all simulations: what it decides by that, it decides "
@@ -71,7 +71,8 @@ def mistakes_of_the_system(problem: Problem) -> Iterator[str]:
 
 def is_quick(problem: Problem) -> bool:
     """Return whether a system was quick to trace, and so is likely quick to simulate."""
-    return bool(problem.programs.peek(QUICK, None))
+    watched = problem.programs.peek(WATCHED, None)
+    return watched is not None and watched.quick
 
 
 def _unread(problem: Problem) -> Iterator[str]:

@@ -20,7 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
-from verifai_jax.core.compute.compilation import Compilation
+from verifai_jax.core.compute.compilation import Compilation, pad_rows
 from verifai_jax.core.values.clauses import ABSENT, CLAUSES
 from verifai_jax.core.values.cube import Cube
 from verifai_jax.search.base import Observations, Plan, Search
@@ -279,9 +279,7 @@ class Proposals:
     ) -> Bool[np.ndarray, " n"]:
         if self._accepts is None:
             return np.ones(len(points), bool)
-        missing = self.batch - len(points)
-        padded = np.pad(points, ((0, missing), (0, 0)), mode="edge") if missing else points
-        return np.asarray(self._accepts(padded))[: len(points)]
+        return np.asarray(self._accepts(pad_rows(points, self.batch)))[: len(points)]
 
     def _next_of_sequence(self, max_points: int) -> Float[Array, "m d"] | Float[np.ndarray, "m d"]:
         """Return the next accepted points of a search that does not learn."""
@@ -338,8 +336,7 @@ class Proposals:
         self._barren = 0 if accepted.any() else self._barren + 1
         if self._barren >= MAX_REFUSED:
             self._give_up()
-        missing = self.batch - len(learned)
-        self._points = np.pad(learned, ((0, missing), (0, 0)), mode="edge") if missing else learned
+        self._points = pad_rows(learned, self.batch) if len(learned) < self.batch else learned
         self._rows = np.flatnonzero(accepted)[:max_points]
         self.cut = int(accepted.sum()) > max_points
         simulated = points if len(self._rows) == len(points) else np.asarray(points)[self._rows]

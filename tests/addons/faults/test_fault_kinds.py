@@ -9,7 +9,7 @@ import pytest
 
 import verifai_jax as vj
 from verifai_jax.addons import faults
-from verifai_jax.core.compute.fingerprint import programs_in
+from verifai_jax.core.compute.jaxprs import programs_in
 from verifai_jax.core.values.trace import Status
 
 DT, STEPS = 0.1, 30

@@ -17,8 +17,7 @@ from verifai_jax.addons.native.native_code import elementary, translation
 from verifai_jax.addons.native.native_code.library import library_name, load
 from verifai_jax.addons.native.native_code.source import translate
 from verifai_jax.addons.native.native_code.values import Untranslatable
-from verifai_jax.core.compute.fingerprint import programs_in
-from verifai_jax.core.compute.jaxprs import CALLS, CUSTOM_CALLS
+from verifai_jax.core.compute.jaxprs import CALLS, CUSTOM_CALLS, programs_in
 
 pytestmark = pytest.mark.thorough
 

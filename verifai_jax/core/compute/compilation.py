@@ -186,7 +186,9 @@ class Compilation:
                 _pool.cache_clear()
                 raise
             finally:
-                _count_waiting(time.perf_counter() - began)
+                global _waited
+                with _lock:
+                    _waited += time.perf_counter() - began
             self._lowered = None
         return self._program
 
@@ -198,12 +200,6 @@ class Compilation:
 def seconds_waited() -> float:
     """Return how many seconds all threads of this process have waited for programs."""
     return _waited
-
-
-def _count_waiting(seconds: float) -> None:
-    global _waited
-    with _lock:
-        _waited += seconds
 
 
 def compile_soon(

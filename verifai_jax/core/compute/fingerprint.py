@@ -29,7 +29,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.interpreters import batching, partial_eval
 
-from verifai_jax.core.compute.jaxprs import CALLS, CUSTOM_CALLS
+from verifai_jax.core.compute.jaxprs import CALLS, CUSTOM_CALLS, PROGRAM, programs_in
 from verifai_jax.core.user_code.user_errors import source_line
 
 _CUSTOM = ("custom_jvp_call", "custom_vjp_call")
@@ -225,10 +225,6 @@ def _module_path(kind: type) -> str:
     return f"{kind.__module__}.{kind.__qualname__}"
 
 
-PROGRAM: Any = getattr(jax.extend.core, "ClosedJaxpr", jax.extend.core.Jaxpr)
-"""The class of a program with its constants; newer versions of JAX have one class of programs."""
-
-
 def as_traced(traced: jax.stages.Traced) -> Callable[..., Any]:
     """Return a traced program as a function of pytrees, which runs no user code again.
 
@@ -308,15 +304,6 @@ def describe_step(step: Any) -> str:
     named = f" of {name}" if name and not name.startswith("<") else ""
     line = source_line(getattr(step.source_info, "traceback", None))
     return f"{step.primitive.name}{named}{'' if line is None else f' ({line})'}"
-
-
-def programs_in(step: Any) -> list[Any]:
-    """Return the programs among the parameters of an equation, such as the body of a loop."""
-    kinds = (jax.extend.core.Jaxpr, PROGRAM)
-    leaves = jax.tree.leaves(
-        list(step.params.values()), is_leaf=lambda each: isinstance(each, kinds)
-    )
-    return [getattr(each, "jaxpr", each) for each in leaves if isinstance(each, kinds)]
 
 
 def alone_only(program: Any) -> Iterator[tuple[Any, Exception]]:

@@ -1,11 +1,14 @@
-"""Running a program that JAX traced, on values of any kind instead of arrays."""
+"""Programs that JAX traced: what is within them, their work, and how other values run through."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, TypeVar
 
-from jax.extend.core import Literal
+import numpy as np
+from jax.extend import core
 
 V = TypeVar("V")
+PROGRAM: Any = getattr(core, "ClosedJaxpr", core.Jaxpr)
+"""The class of a program with its constants; newer versions of JAX have one class of programs."""
 CALLS = frozenset({
     "checkpoint", "closed_call", "core_call", "custom_vmap_call", "jit", "pjit", "remat", "remat2",
 })  # fmt: skip
@@ -23,6 +26,36 @@ def called(step: Any) -> Any | None:
     return next(step.params[name] for name in _PARAMETERS if name in step.params)
 
 
+def programs_read(parameters: Mapping[str, Any]) -> Iterator[Any]:
+    """Yield the programs nested in an operation, such as the body of a loop."""
+    for value in parameters.values():
+        for part in value if isinstance(value, tuple | list) else (value,):
+            if isinstance(part, (core.Jaxpr, PROGRAM)):
+                yield part
+
+
+def programs_in(step: Any) -> list[Any]:
+    """Return the programs among the parameters of an equation, without their constants."""
+    return [getattr(each, "jaxpr", each) for each in programs_read(step.params)]
+
+
+def work_of(program: core.Jaxpr) -> int:
+    """Count the scalar operations of a `Jaxpr`; those in loops count as often as they run.
+
+    For a loop with a condition one iteration counts, for a conditional all branches. The count
+    decides whether native compilation pays.
+    """
+    count = 0
+    for step in program.eqns:
+        inside = sum(map(work_of, programs_in(step)))
+        if inside:
+            count += inside * int(step.params.get("length", 1))
+        else:
+            shapes: list[Any] = [each.aval for each in step.outvars]
+            count += sum(int(np.prod(each.shape)) for each in shapes)
+    return count
+
+
 def run_through(
     program: Any, constants: Sequence[V], inputs: Sequence[V], literal: Callable[[Any], V],
     step: Callable[[Any, list[V]], Sequence[V]],
@@ -38,7 +71,7 @@ def run_through(
     values.update(zip(program.invars, inputs, strict=True))
 
     def read(each: object) -> V:
-        return literal(each) if isinstance(each, Literal) else values[each]
+        return literal(each) if isinstance(each, core.Literal) else values[each]
 
     for each in program.eqns:
         results = step(each, [read(operand) for operand in each.invars])

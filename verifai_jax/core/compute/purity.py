@@ -16,9 +16,9 @@ from typing import Any, TypeAlias
 import jax
 import jax.core
 import numpy as np
-from jax.extend.core import Jaxpr, JaxprEqn, Literal
+from jax.extend.core import JaxprEqn, Literal
 
-from verifai_jax.core.compute.fingerprint import PROGRAM
+from verifai_jax.core.compute.jaxprs import programs_read
 from verifai_jax.core.user_code.kept_state import CHANCE, changed, holds_tracer, state_of
 from verifai_jax.core.user_code.user_errors import source_line
 
@@ -139,14 +139,6 @@ def _value(value: object) -> object:
         return None if value is None else (array.dtype.str, array.shape, array.tobytes())
     except TypeError:  # Random keys and the like.
         return type(value).__name__
-
-
-def programs_read(parameters: dict[str, Any]) -> Iterator[Program]:
-    """Yield the programs nested in an operation, such as the body of a loop."""
-    for value in parameters.values():
-        for part in value if isinstance(value, tuple | list) else (value,):
-            if isinstance(part, (Jaxpr, PROGRAM)):
-                yield part
 
 
 def _is_plain(value: object) -> bool:

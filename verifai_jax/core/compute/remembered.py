@@ -34,7 +34,6 @@ MAX_BYTES = 64 * 2**20
 """Size of a program that is kept at most."""
 SEAL = 32
 """Bytes of the checksum in front of a program."""
-ANY_PLATFORM = (jax.export.DisabledSafetyCheck.platform(),)
 _SETTINGS = (
     "jax_enable_x64", "jax_default_matmul_precision", "jax_numpy_dtype_promotion",
     "jax_threefry_partitionable", "jax_debug_nans", "jax_debug_infs", "jax_disable_jit",
@@ -97,7 +96,8 @@ def lower_or_recall(
         exported = jax.export.deserialize(bytearray(data))
     if b"lapack" not in exported.mlir_module_serialized:
         # For one of a processor JAX imports scipy.linalg, as it may need LAPACK.
-        exported = replace(exported, platforms=("any",), disabled_safety_checks=ANY_PLATFORM)
+        anywhere = (jax.export.DisabledSafetyCheck.platform(),)
+        exported = replace(exported, platforms=("any",), disabled_safety_checks=anywhere)
 
     def recalled(*arguments: Any) -> Any:
         results = exported.call(*jax.tree.leaves(arguments))

@@ -90,8 +90,16 @@ def missing_glyphs() -> Iterator[None]:
 def _figure_class() -> Any:
     # Made on demand: importing matplotlib takes longer than importing everything else here.
     from matplotlib.figure import Figure
+    from matplotlib.layout_engine import ConstrainedLayoutEngine
 
     class NotebookFigure(Figure):
+        def draw(self, renderer: Any) -> None:
+            layout = self.get_layout_engine()
+            if isinstance(layout, ConstrainedLayoutEngine) and self.canvas.is_saving():
+                # For a layout matplotlib draws twice; the second time alone is seen.
+                return layout.execute(self)
+            return super().draw(renderer)
+
         def savefig(self, *arguments: Any, **options: Any) -> None:
             with missing_glyphs():
                 super().savefig(*arguments, **options)

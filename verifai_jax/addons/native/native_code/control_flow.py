@@ -28,7 +28,8 @@ from verifai_jax.addons.native.native_code.values import (
     kind_of,
     names_in,
 )
-from verifai_jax.core.compute.fingerprint import operands_of_scan, programs_in
+from verifai_jax.core.compute.fingerprint import operands_of_scan
+from verifai_jax.core.compute.jaxprs import programs_in
 
 Forms: TypeAlias = list[Form]
 """Shapes and types of the values of a loop."""
