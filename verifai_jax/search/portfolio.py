@@ -61,14 +61,12 @@ LESS_PATIENT = 1
 """The same once a kind of failure is described: of eight wells in four and six dimensions it found
 7.8 and 6.7 in the mean, with four rounds 7.4 and 6.2 (`benchmarks/RESULTS.md`)."""
 FILLED = 8
-"""Batch from which on cross-entropy has nine tenths of what it and mutations have, whatever gains
-say: those of mutations are small ones, near what is known, and there are none where the best points
-are equally good. By gains five problems of choices, numbers and plateaus took 1.07 to 1.23 times
-as many simulations, without gradients and in batches of 16, and with a fifth up to 1.5 times as
-many. Signals are left to the gains, as mutations know their shape: with nine tenths NN of the ARCH
-competition took 1.2 times as many. So are descents among numbers alone: the landscape of ripples
-took 1.07 times as many. In rounds of one simulation cross-entropy draws from the prior alone, and
-has a fifth until there is evidence."""
+"""Batch from which on cross-entropy has nine tenths of what mutations and it have; in rounds of one
+simulation, in which it draws from the prior alone, it has a fifth. Shares by gains drifted to
+mutations, whose gains are small: five problems took up to 1.5 times as many simulations."""
+MODELLED = 0.8
+"""Share of the models of what descents leave in small rounds. By gains, of which the first few are
+luck, the menu of `mixed_spaces` took TODO times as many simulations."""
 IN_VAIN = 3
 """Power of the share of coordinates that descents can move with which they count, and their gains.
 Without a factor on the gains they got on as long as the numbers alone can: five problems of choices
@@ -86,7 +84,6 @@ MANY = 32
 thousands in the seconds that gradients take to compile."""
 AMONG = 4
 """Number of best points among which a new one is a gain: those that mutations have as parents."""
-MODELLED = 0.8
 OPENING_ROWS = 20
 TAKEN = 32
 """Points remembered as starts and ends of descents; as many as mutations keep to start from."""
@@ -266,7 +263,7 @@ class Portfolio(Search[PortfolioState]):
 
         def propose() -> Float[Array, "batch d"]:
             others, _ = Mutation().ask(state.mutation._replace(key=key), cube, CHOICES * 2 // 3)
-            return model.propose(key, cube, batch, others)
+            return model.propose(key, cube, batch, others, state.mutation.stale)
 
         nothing = jnp.full((batch, cube.dim), 0.5, jnp.float32)
         return jax.lax.cond(rows > 0, propose, lambda: nothing)
@@ -427,10 +424,8 @@ class Portfolio(Search[PortfolioState]):
         # Descents move the continuous coordinates alone, and are in vain where a choice is wrong.
         moved = len(cube.continuous) / max(cube.dim, 1)
         rate = rate.astype(jnp.float32).at[GRADIENT].multiply(moved**IN_VAIN)
-        descends = state.gradient is not None and not len(cube.discrete)
-        if batch >= FILLED and (state.model is not None or not (descends or cube.signals)):
-            others = prior[MUTATION:]
-            rate = rate.at[MUTATION:].set(others / np.sum(others) * jnp.sum(rate[MUTATION:]))
+        others = prior[MUTATION:]
+        rate = rate.at[MUTATION:].set(others / np.sum(others) * jnp.sum(rate[MUTATION:]))
         if state.gradient is None:
             dead, smallest = jnp.array(True), 0.0
         else:
