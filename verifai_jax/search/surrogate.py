@@ -78,6 +78,8 @@ class Surrogate(NamedTuple):
         - `stale`: the number of simulations since the last progress.
         """
         x, d = _features(self.u, cube), cube.dim
+        if d == 0:  # One point is all that there is.
+            return jnp.zeros((batch, 0), jnp.float32)
         each = d * -(-CHOICES // (3 * batch))
         random = draw_columns(key, batch, 2, d, x.shape[1], CAPACITY, each)
         coins, prior, weights, noises, shared = random
