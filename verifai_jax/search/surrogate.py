@@ -118,7 +118,7 @@ class Surrogate(NamedTuple):
         inside = -line / (2 * jnp.maximum(bend, 1e-9))
         lowest = jnp.where(2 * bend > jnp.abs(line), inside, -jnp.sign(line))
         u, first = u.at[:, others].set((lowest + 1) / 2), 2 * len(others)
-        cells = cube.cells(u)
+        cells = jnp.asarray(cube.cells(u))
         for i in codes:
             cell = jnp.argmin(weights[:, first : first + cube.levels[i]], axis=1)
             cells = cells.at[:, cube.discrete.tolist().index(i)].set(cell)
