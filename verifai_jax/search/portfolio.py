@@ -1,11 +1,11 @@
 """A portfolio of searches that share their observations, with a budget that follows success.
 
 The members are complementary: gradients of clauses lead to corners and to points where clauses are
-equal, mutations need few simulations and no gradients, and cross-entropy fills the region of
-failures in large batches. A bandit divides the simulations: a member's share follows the discounted
-rate at which its points are among the best so far, with a small minimum; a member whose gradients
-are zero or not finite drops to that minimum at once. In large rounds the bandit only decides
-between descents and the other two. All members learn from every point, and descents start equally
+equal, models of the robustness (`surrogate`) say in small rounds which point is worth a simulation,
+mutations work on rough landscapes, and cross-entropy fills the region of failures in large batches.
+A bandit divides the simulations between descents and the others: the share of descents follows the
+discounted rate at which points are among the best so far, with a small minimum; where gradients are
+zero or not finite it drops at once. All members learn from every point, and descents start equally
 often from the best points and from new ones.
 
 Once a region of failures is described, all members look for failures elsewhere (`kinds`).
@@ -61,22 +61,22 @@ LESS_PATIENT = 1
 """The same once a kind of failure is described: of eight wells in four and six dimensions it found
 7.8 and 6.7 in the mean, with four rounds 7.4 and 6.2 (`benchmarks/RESULTS.md`)."""
 FILLED = 8
-"""Batch from which on cross-entropy has nine tenths of what it and mutations have, whatever gains
-say: those of mutations are small ones, near what is known, and there are none where the best points
-are equally good. By gains five problems of choices, numbers and plateaus took 1.07 to 1.23 times
-as many simulations, without gradients and in batches of 16, and with a fifth up to 1.5 times as
-many. Signals are left to the gains, as mutations know their shape: with nine tenths NN of the ARCH
-competition took 1.2 times as many. So are descents among numbers alone: the landscape of ripples
-took 1.07 times as many. In rounds of one simulation cross-entropy draws from the prior alone, and
-has a fifth until there is evidence."""
-IN_VAIN = 3
-"""Power of the share of coordinates that descents can move with which they count, and their gains.
-Without a factor on the gains they got on as long as the numbers alone can: five problems of choices
-and numbers took 1.03 to 1.4 times as many simulations."""
+"""Batch from which on cross-entropy has nine tenths of what mutations and it have; in rounds of one
+simulation, in which it draws from the prior alone, it has a fifth. Shares by gains drifted to
+mutations, whose gains are small: five problems took up to 1.5 times as many simulations."""
+MODELLED = 0.8
+"""Share of the models of what descents leave in small rounds, chosen by hand. By gains, of which
+the first few are luck, the other two get half of it after one round."""
+IN_VAIN = 6
+"""Power of the share of coordinates that descents can move with which their gains count: the models
+know what choices do. With 3 the medians of `menu`, `recipe`, `mixed` and `cruise` were 1.2 to 1.4
+times as high (`benchmarks/RESULTS.md`)."""
 OPENING = 6
-"""Descents before the budget is shared by evidence. With two instead, SB3 to SB5 together took 0.99
-times as many simulations; with twelve, and one of four with the whole cube, the
-landscape of ripples cost half as much again (`benchmarks/RESULTS.md`)."""
+"""Descents before the budget is shared by evidence, and before one starts from the best points."""
+OPENING_ROWS = 20
+"""Simulations after which the budget is shared by evidence at the latest: in rounds of 16 a slope
+of four descents each, and their first jumps. Without a limit, and with the models, the landscape of
+ripples took 370 simulations instead of 80, with that of four descents 215."""
 MOSTLY = 0.75
 """Share of coordinates that descents can move from which on some descents go first. Where a fifth
 of the coordinates or fewer are choices three problems took 0.36, 0.41 and 0.88 times as many
@@ -86,8 +86,6 @@ MANY = 32
 thousands in the seconds that gradients take to compile."""
 AMONG = 4
 """Number of best points among which a new one is a gain: those that mutations have as parents."""
-MODELLED = 0.8
-OPENING_ROWS = 20
 TAKEN = 32
 """Points remembered as starts and ends of descents; as many as mutations keep to start from."""
 
@@ -112,7 +110,7 @@ class PortfolioState(NamedTuple):
 
 @dataclass(frozen=True)
 class Portfolio(Search[PortfolioState]):
-    """Gradient, mutations and cross-entropy together, sharing the budget by success; no tuning.
+    """Gradients, models, mutations and cross-entropy, sharing the budget by success; no tuning.
 
     **Arguments:**
     - `gradients`: whether to use gradients of the robustness. They are left out automatically if
@@ -266,7 +264,7 @@ class Portfolio(Search[PortfolioState]):
 
         def propose() -> Float[Array, "batch d"]:
             others, _ = Mutation().ask(state.mutation._replace(key=key), cube, CHOICES * 2 // 3)
-            return model.propose(key, cube, batch, others)
+            return model.propose(key, cube, batch, others, state.mutation.stale)
 
         nothing = jnp.full((batch, cube.dim), 0.5, jnp.float32)
         return jax.lax.cond(rows > 0, propose, lambda: nothing)
@@ -427,10 +425,8 @@ class Portfolio(Search[PortfolioState]):
         # Descents move the continuous coordinates alone, and are in vain where a choice is wrong.
         moved = len(cube.continuous) / max(cube.dim, 1)
         rate = rate.astype(jnp.float32).at[GRADIENT].multiply(moved**IN_VAIN)
-        descends = state.gradient is not None and not len(cube.discrete)
-        if batch >= FILLED and (state.model is not None or not (descends or cube.signals)):
-            others = prior[MUTATION:]
-            rate = rate.at[MUTATION:].set(others / np.sum(others) * jnp.sum(rate[MUTATION:]))
+        others = prior[MUTATION:]
+        rate = rate.at[MUTATION:].set(others / np.sum(others) * jnp.sum(rate[MUTATION:]))
         if state.gradient is None:
             dead, smallest = jnp.array(True), 0.0
         else:

@@ -19,7 +19,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.scipy.linalg import cho_solve, solve_triangular
-from jaxtyping import Array, Bool, Float, Key
+from jaxtyping import Array, Bool, Float, Int, Key
 
 from verifai_jax.core.values.cube import Cube
 from verifai_jax.search.best_points import newest_first
@@ -38,7 +38,10 @@ LENGTHS = (0.2, 0.6, 1.8)
 NUGGETS = (1e-3, 3e-2)
 """Variances of the noise of the process, in units of its own."""
 EVENLY = 0.1
-"""Share of the proposals that are drawn from the prior."""
+"""Share of the proposals that are drawn from the prior, at least."""
+PATIENCE = 80
+"""Simulations without progress after which half of the proposals are drawn from the prior: slopes
+may lead away from the failures."""
 CHOICES = 384
 """Points among which the process chooses, of which a third are drawn from the prior."""
 MAX_DIM = 256
@@ -65,17 +68,22 @@ class Surrogate(NamedTuple):
         return Surrogate(u[kept], score[kept])
 
     def propose(
-        self, key: Key[Array, ""], cube: Cube, batch: int, others: Float[Array, "m d"]
-    ) -> Float[Array, "batch d"]:
+        self, key: Key[Array, ""], cube: Cube, batch: int, others: Float[Array, "m d"],
+        stale: Int[Array, ""],
+    ) -> Float[Array, "batch d"]:  # fmt: skip
         """Propose points; those of the prior as long as there is nothing to tell points apart.
 
         **Arguments:**
         - `others`: proposals of other searches, among which the process chooses too.
+        - `stale`: the number of simulations since the last progress.
         """
         x, d = _features(self.u, cube), cube.dim
+        if d == 0:  # One point is all that there is.
+            return jnp.zeros((batch, 0), jnp.float32)
         each = d * -(-CHOICES // (3 * batch))
         random = draw_columns(key, batch, 2, d, x.shape[1], CAPACITY, each)
         coins, prior, weights, noises, shared = random
+        evenly = jnp.maximum(EVENLY, stale / (stale + PATIENCE))
         there = jnp.isfinite(self.score)
         spread = jnp.max(self.score, where=there, initial=0.0) > jnp.min(self.score)
 
@@ -85,11 +93,11 @@ class Surrogate(NamedTuple):
             drawn = self._minima(cube, y, there, *normal)
             choices = jnp.concatenate([shared.reshape(-1, d), others])
             lowest = self._lowest(cube, y, there, choices, -jnp.log1p(-coins[:, 1:]))
-            return jnp.where(coins[:, :1] < (1 + EVENLY) / 2, drawn, lowest)
+            return jnp.where(coins[:, :1] < (1 + evenly) / 2, drawn, lowest)
 
         informed = spread & (jnp.sum(there) >= ENOUGH)
         u = jax.lax.cond(informed, modelled, lambda: prior)
-        u = jnp.where(coins[:, :1] < EVENLY, prior, u)
+        u = jnp.where(coins[:, :1] < evenly, prior, u)
         return u.at[:, cube.discrete].set(cube.centres(cube.cells(u)))
 
     def _minima(
@@ -110,7 +118,7 @@ class Surrogate(NamedTuple):
         inside = -line / (2 * jnp.maximum(bend, 1e-9))
         lowest = jnp.where(2 * bend > jnp.abs(line), inside, -jnp.sign(line))
         u, first = u.at[:, others].set((lowest + 1) / 2), 2 * len(others)
-        cells = cube.cells(u)
+        cells = jnp.asarray(cube.cells(u))
         for i in codes:
             cell = jnp.argmin(weights[:, first : first + cube.levels[i]], axis=1)
             cells = cells.at[:, cube.discrete.tolist().index(i)].set(cell)
