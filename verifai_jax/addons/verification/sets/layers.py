@@ -17,8 +17,6 @@ SLACK = 2.0**-45
 """Share of a number by which a result is widened for the rounding of its own bounds."""
 LARGEST, DEEPEST = 2**21, 16
 """Numbers of a matrix at most, and layers one after another, that are remembered."""
-FEW, FINE_BOXES = 8, 64
-"""Results that go back at most if there are more boxes than these, which are small ones."""
 TOGETHER = 32
 """Boxes that go back at once: their rows then fit the cache."""
 
@@ -93,7 +91,7 @@ def refined(radius: np.ndarray, common: Common) -> np.ndarray:
     """Return a radius of which what layers have in common counts once."""
     flat, own = (each.reshape(len(each), -1) for each in (radius, common.own))
     boxes, count = flat.shape
-    if common.depth == 1 or (boxes > FINE_BOXES and count > FEW):
+    if common.depth == 1:
         return radius
     rows = np.eye(count)[None]
     blocks = [slice(i, i + TOGETHER) for i in range(0, boxes, TOGETHER)]
