@@ -81,7 +81,7 @@ def picked(common: Common, own: np.ndarray, numbers: np.ndarray, count: int) -> 
 
     def back(rows: np.ndarray, block: slice) -> np.ndarray:
         whole = np.zeros((*rows.shape[:2], count))
-        np.add.at(whole, (slice(None), slice(None), numbers), rows)
+        np.add.at(whole.transpose(2, 0, 1), numbers, rows.transpose(2, 0, 1))
         return common.back(whole, block)
 
     return common._replace(own=own, back=back)
