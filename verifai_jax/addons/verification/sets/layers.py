@@ -1,4 +1,4 @@
-"""What units of layers have in common, so that sums of them do not add up what cancels.
+"""The common variation of the units of layers, so that sums of them do not add up what cancels.
 
 What a linear function of units misses is a symbol of each unit: where a later layer adds units up,
 symbols may cancel. They are not kept as arrays of symbols. Each form knows the way back through its
