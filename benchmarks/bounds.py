@@ -1,12 +1,13 @@
 """Bounds of networks and of small examples, beside those of immrax.
 
     python -m venv peer && peer/bin/pip install immrax pandas click     # immrax 0.3.8, jax 0.10.2
-    PYTHONPATH=. peer/bin/python benchmarks/bounds.py
+    OPENBLAS_NUM_THREADS=1 PYTHONPATH=. peer/bin/python benchmarks/bounds.py
 
 Networks with random weights, and examples of immrax's documentation: how wide bounds are, as the
 mean over boxes of the ratio of ours to theirs (of CROWN's for networks, of the tightest of natural,
-Jacobian-based and mixed inclusion functions otherwise), and the ratio of the processor's seconds
-for a batch, compiled before. Bounds contain the values at sampled points.
+Jacobian-based and mixed inclusion functions otherwise), and the processor's seconds for a batch,
+compiled before: medians of both, which take turns, and of the ratios of their turns. Bounds contain
+the values at sampled points.
 """
 
 import argparse
@@ -31,6 +32,7 @@ NETWORKS = {
 ACTIVE = {"tanh": lambda x: 2 * jax.nn.sigmoid(2 * x) - 1, "relu": jax.nn.relu,
           "sigmoid": jax.nn.sigmoid}  # fmt: skip
 """immrax takes tanh as this, against NaN in its own."""
+TURNS = 15
 
 
 def network(sizes: tuple[int, ...], kind: str) -> Callable:
@@ -108,23 +110,23 @@ def compare(name: str, function: Callable, dim: int, theirs: Callable, boxes: in
     for width in (0.02, 0.2, 1.0):
         middle = random.uniform(-1, 1, (boxes, dim))
         low, high = np.float32(middle - width / 2), np.float32(middle + width / 2)
-        results, seconds = [], []
-        for bounds in (lambda low, high: mine(low.astype(float), high.astype(float)), theirs):
-            jax.block_until_ready(bounds(low, high))
-            times = []
-            for _ in range(5):
-                begun = time.process_time()
-                found = jax.block_until_ready(bounds(low, high))
-                times.append(time.process_time() - begun)
-            results.append([np.asarray(end, float) for end in found])
-            seconds.append(min(times))
+        both = (lambda low, high: mine(low.astype(float), high.astype(float))), theirs
+        results = [jax.block_until_ready(bounds(low, high)) for bounds in both]
+        results = [[np.asarray(end, float) for end in found] for found in results]
+        seconds = np.zeros((TURNS, 2))
+        for turn, i in itertools.product(range(TURNS), range(2)):
+            begun = time.process_time()
+            jax.block_until_ready(both[i](low, high))
+            seconds[turn, i] = time.process_time() - begun
+        medians = 1e3 * np.median(seconds, 0)
         points = low + random.random((200, *low.shape)).astype(np.float32) * (high - low)
         values = np.asarray(jax.vmap(jax.vmap(function))(points), float)
         (first, last), (begin, end) = results
         assert np.all((first <= values) & (values <= last)), "a value is outside of our bounds"
         ratio = (last - first) / (end - begin)
         print(f"| {name} | {width} | {np.mean(ratio):z.3f} | {np.max(ratio):z.3f} | "
-              f"{1e3 * seconds[0]:z.3g} | {1e3 * seconds[1]:z.3g} |", flush=True)  # fmt: skip
+              f"{medians[0]:z.3g} | {medians[1]:z.3g} | "
+              f"{np.median(seconds[:, 0] / seconds[:, 1]):z.2g} |", flush=True)  # fmt: skip
 
 
 def main() -> None:
@@ -135,7 +137,7 @@ def main() -> None:
     options = parser.parse_args()
     boxes = options.boxes
     print(f"immrax {immrax.__version__ if hasattr(immrax, '__version__') else ''}, {boxes} boxes")
-    print("| function | width | ours / theirs, mean | worst | ours, ms | theirs, ms |")
+    print("| function | width | ours / theirs, mean | worst | ours, ms | theirs, ms | ratio |")
     for name in options.names:
         if name in NETWORKS:
             sizes, kind = NETWORKS[name]

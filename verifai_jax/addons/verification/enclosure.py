@@ -86,12 +86,9 @@ class Enclosure:
     def __call__(self, low: Corners, high: Corners) -> Bounds:
         """Return bounds over boxes `[n, dim]` between these points, or raise `MissingRule`."""
         blocks = [slice(i, i + TOGETHER) for i in range(0, len(low), TOGETHER)]
-        first, last = self.ranges.ends(low, high)
-        between = self.ranges(low, high)
 
         def bounds(block: slice) -> Bounds:
-            own = [(begin[block], end[block], symbols) for begin, end, symbols in between]
-            return self._bounds(self._leaves(first[block], last[block], own), len(low[block]))
+            return self._bounds(self._leaves(low[block], high[block]), len(low[block]))
 
         if len(blocks) == 1 or available_cores() == 1:
             parts = [bounds(block) for block in blocks]
@@ -127,15 +124,17 @@ class Enclosure:
         with in_precision(self.precision):
             return interpreter(program, leaves)
 
-    def _leaves(self, first: Corners, last: Corners, between: Sequence[Any]) -> list[Value]:
+    def _leaves(self, low: Corners, high: Corners) -> list[Value]:
         """Return the features of boxes as sets, in the order of the leaves of their tree."""
+        first, last = self.ranges.ends(low, high)
+        between = self.ranges(low, high)
         sets: list[Value] = []
         for name, forms in self._forms.items():
             span, part = self._fields[name]
             if part is not None:
                 symbols = np.eye(self.dim)[:, span]
                 unit = Form.leaf(first[:, span], last[:, span], symbols, np.dtype(self.precision))
-                sets += self._evaluated(part, [unit], len(first))
+                sets += self._evaluated(part, [unit], len(low))
                 continue
             for form in forms:
                 begin, end, symbols = between[len(sets)]

@@ -146,17 +146,6 @@ def test_the_way_back_gives_what_all_symbols_give():
         np.testing.assert_allclose(least[i], bottom, atol=2e-3 * (top - bottom).max())
 
 
-def test_many_boxes_go_back_from_few_results_alone():
-    """What is not known of the layers between costs less than a tenth in small boxes."""
-    layers, random = weights(1), np.random.default_rng(1)
-    low = random.uniform(-1, 0.8, (90, 3))
-    function = lambda x: network(layers, x)[:2]  # noqa: E731
-    many = bounds(function, low, low + 0.02)
-    few = [bounds(function, low[i : i + 30], low[i : i + 30] + 0.02) for i in (0, 30, 60)]
-    few = np.concatenate([least for least, _ in few]), np.concatenate([most for _, most in few])
-    assert np.mean((many[1] - many[0]) / (few[1] - few[0])) < 1.1
-
-
 def winding(random):
     """Return a network whose units are scaled, divided, cut, turned around, and skip layers."""
     matrices = [jnp.asarray(random.normal(size=s) / np.sqrt(s[0]), jnp.float32)

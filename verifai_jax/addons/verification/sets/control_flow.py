@@ -57,8 +57,8 @@ def _cond(t: Interpreter, step: Equation, inputs: list[Value]) -> list[Value]:
     branches, (which, *operands) = step.params["branches"], inputs
     index = as_whole(which)
     if index.dtype != bool:
-        ends = (np.clip(end, 0, len(branches) - 1) for end in (index.low, index.high))
-        index = Whole(*ends, index.dtype)
+        low, high = (np.clip(end, 0, len(branches) - 1) for end in (index.low, index.high))
+        index = Whole(low, high, index.dtype)
     first, last = int(index.low.min()), int(index.high.max())
     results = [t.closed(branches[number], operands) for number in range(first, last + 1)]
     if len(results) == 1:

@@ -1,6 +1,7 @@
 """Operations on single numbers, on sets of them."""
 
 from collections.abc import Callable
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -19,7 +20,7 @@ from verifai_jax.addons.verification.sets.interpreter import (
 from verifai_jax.addons.verification.sets.whole import Whole
 
 
-def levelled(values: list[Value]) -> list[Value]:
+def levelled(values: list[Any]) -> list[Any]:
     """Return operands of one shape: numbers that stand for arrays are repeated.
 
     All parts of a set need it, since a later sum counts the slopes as often as they stand there.

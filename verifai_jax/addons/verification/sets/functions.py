@@ -7,7 +7,7 @@ causes only a quadratic error, which the widening of results covers.
 """
 
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy import special
@@ -232,7 +232,7 @@ FUNCTIONS: dict[str, Callable[[Form], Form]] = {
 """Functions of one number, by the name of JAX's primitive."""
 
 
-def _above(knot: Reals | float) -> Function:
+def _above(knot: Any) -> Function:
     """Return the maximum with a number."""
     return Function(lambda x: np.maximum(x, knot), lambda *_: [knot], units=0.0, rises=True)
 

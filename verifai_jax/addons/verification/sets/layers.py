@@ -1,4 +1,4 @@
-"""What units of layers have in common, so that sums of them do not add up what cancels.
+"""The common variation of the units of layers, so that sums of them do not add up what cancels.
 
 What a linear function of units misses is a symbol of each unit: where a later layer adds units up,
 symbols may cancel. They are not kept as arrays of symbols. Each form knows the way back through its
@@ -17,8 +17,6 @@ SLACK = 2.0**-45
 """Share of a number by which a result is widened for the rounding of its own bounds."""
 LARGEST, DEEPEST = 2**21, 16
 """Numbers of a matrix at most, and layers one after another, that are remembered."""
-FEW, FINE_BOXES = 8, 64
-"""Results that go back at most if there are more boxes than these, which are small ones."""
 TOGETHER = 32
 """Boxes that go back at once: their rows then fit the cache."""
 
@@ -83,7 +81,7 @@ def picked(common: Common, own: np.ndarray, numbers: np.ndarray, count: int) -> 
 
     def back(rows: np.ndarray, block: slice) -> np.ndarray:
         whole = np.zeros((*rows.shape[:2], count))
-        np.add.at(whole, (slice(None), slice(None), numbers), rows)
+        np.add.at(whole.transpose(2, 0, 1), numbers, rows.transpose(2, 0, 1))
         return common.back(whole, block)
 
     return common._replace(own=own, back=back)
@@ -93,7 +91,7 @@ def refined(radius: np.ndarray, common: Common) -> np.ndarray:
     """Return a radius of which what layers have in common counts once."""
     flat, own = (each.reshape(len(each), -1) for each in (radius, common.own))
     boxes, count = flat.shape
-    if common.depth == 1 or (boxes > FINE_BOXES and count > FEW):
+    if common.depth == 1:
         return radius
     rows = np.eye(count)[None]
     blocks = [slice(i, i + TOGETHER) for i in range(0, boxes, TOGETHER)]

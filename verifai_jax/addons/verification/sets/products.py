@@ -44,8 +44,9 @@ def _contracted(
              for c, n in zip(name, v.shape, strict=True)}  # fmt: skip
     terms = math.prod(sizes[c] for c in joint[1])
     for form, other, (own, its) in ((a, b, names), (b, a, names[::-1])):
-        real = isinstance(form, Form) and isinstance(other, Form)
-        if real and is_point(other) and np.isfinite(other.centre).all():
+        if isinstance(form, Whole) or isinstance(other, Whole):
+            continue
+        if is_point(other) and np.isfinite(other.centre).all():
             return _times(form, other.centre[0], f"...{own},{its}->...{result}", dtype, terms)
     axes = result + "".join(joint[1])
 

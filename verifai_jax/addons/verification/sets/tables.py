@@ -88,7 +88,7 @@ def _search(t: Interpreter, program: Program, inputs: list[Value]) -> list[Value
     return [Whole(np.where(lost, 0, first), np.where(lost, len(edges), last), dtype)]
 
 
-_SEARCHES = {side: partial(jnp.searchsorted, side=side) for side in ("left", "right")}
+_SEARCHES: Any = {side: partial(jnp.searchsorted, side=side) for side in ("left", "right")}
 
 
 def _sin_cos(t: Interpreter, program: Program, inputs: list[Value]) -> list[Value] | None:
