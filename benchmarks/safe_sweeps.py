@@ -151,7 +151,10 @@ def our_side(case: Case, configurations: int, seed: int, *, search: Any, halving
     study = case.study(0 if halving is None else 7)
     spent.clear()
     before = time.process_time()
-    result = vj.sweep(study, search, configurations=configurations, seed=seed, halving=halving)
+    result = vj.sweep(
+        study, search, configurations=configurations, seed=seed, halving=halving,
+        batch=None if search == "halton" else max(1, configurations // 2),
+    )  # fmt: skip
     total = time.process_time() - before
     seconds = {**spent, "other": total - sum(spent.values())}
     table = result.table

@@ -66,10 +66,9 @@ def border_between(
     """
     if inside(np.array([outside]))[0]:
         return outside
-    for _ in range(12):
-        between = np.linspace(within, outside, 33)[1:-1]
-        count = int(np.argmin([*inside(between), False]))
-        rates = [within, *between, outside]
+    for _ in range(7):  # To 2^-35, on the outer side.
+        rates = np.linspace(within, outside, 33)
+        count = int(np.argmin([*inside(rates[1:-1]), False]))
         within, outside = float(rates[count]), float(rates[count + 1])
     return outside
 
