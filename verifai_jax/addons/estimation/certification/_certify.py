@@ -56,19 +56,12 @@ ProgressReport = Callable[[int, int, str], None]
 @suggests_options
 @shows_progress("certifying")
 def certify(
-    problem_of: Callable[[Any], Problem],
-    policies: Sequence[Any],
-    *,
-    p: float = 0.01,
-    certification: Certification | None = None,
-    seed: int = 0,
-    only_safe: bool = False,
-    tie: float | None = None,
-    remember: Remember | None = None,
-    progress: ProgressReport | bool | None = None,
-    devices: Sequence[Any] | None = None,
+    problem_of: Callable[[Any], Problem], policies: Sequence[Any], *, p: float = 0.01,
+    certification: Certification | None = None, seed: int = 0, only_safe: bool = False,
+    tie: float | None = None, remember: Remember | None = None,
+    progress: ProgressReport | bool | None = None, devices: Sequence[Any] | None = None,
     run_on: RunOn | None = None,
-) -> Certificates:
+) -> Certificates:  # fmt: skip
     """Attack all policies, then bound the failure probability of each from fresh samples.
 
     **Arguments:**
@@ -158,17 +151,9 @@ def certify(
     known = all(row.simulations for row in rows)
     now = find_leader(*_counts(sampled), tie, margins) if known else None
     return Certificates(
-        rows=rows,
-        problem=blocks.problem.name,
-        p=p,
-        confidence=confidence,
-        safest=None if now is None else now.number,
-        chance=None if now is None else now.chance,
-        tie=tie,
-        seed=seed,
-        samples=samples,
-        budget=budget,
-        stopped=stopped,
+        rows=rows, problem=blocks.problem.name, p=p, confidence=confidence,
+        safest=None if now is None else now.number, chance=None if now is None else now.chance,
+        tie=tie, seed=seed, samples=samples, budget=budget, stopped=stopped,
         seconds=time.perf_counter() - started,
         notes=(
             *formula_notes(blocks.problem),
@@ -177,7 +162,7 @@ def certify(
             *_chance(blocks.problem, rows),
         ),
         sources=blocks.sources.to_json(),
-    )
+    )  # fmt: skip
 
 
 def _chance(problem: Problem, rows: Sequence[Certificate]) -> list[str]:
@@ -232,18 +217,11 @@ def _certificate(
         rate = simultaneous_interval(failing, sampled.simulations, allocation.confidence, among)
     worst, features, counterexamples = _worst_rows(blocks.space, (sampled, attacked))
     return Certificate(
-        number=number,
-        failures=sampled.failures,
-        simulations=sampled.simulations,
-        not_finite=sampled.not_finite,
-        rate=rate,
-        verdict=verdict(rate, allocation.p),
-        attacks=attacked.simulations,
-        attack_failures=attacked.failures,
-        worst_robustness=worst,
-        worst_features=features,
-        counterexamples=counterexamples,
-    )
+        number=number, failures=sampled.failures, simulations=sampled.simulations,
+        not_finite=sampled.not_finite, rate=rate, verdict=verdict(rate, allocation.p),
+        attacks=attacked.simulations, attack_failures=attacked.failures, worst_robustness=worst,
+        worst_features=features, counterexamples=counterexamples,
+    )  # fmt: skip
 
 
 def _worst_rows(
