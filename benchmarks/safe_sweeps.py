@@ -119,7 +119,7 @@ class Outcome:
     nominal: float = math.nan
 
     def with_return(self, case: Case) -> "Outcome":
-        """Return it with the mean nominal return of its safe policies, whose time is not counted."""
+        """Return it with the mean nominal return of its safe policies, in uncounted time."""
         found = [p for p, good in zip(self.policies, self.safe, strict=True) if good]
         returns = [float(evaluate(case.nominal, policy, episodes=20).mean()) for policy in found]
         return dataclasses.replace(self, nominal=float(np.mean(returns)) if returns else math.nan)
@@ -153,9 +153,10 @@ def count_time(stage: str) -> None:
     setattr(owner, name, timed)
 
 
-def our_side(case: Case, configurations: int, seed: int, *, search: Any, halving: Any) -> Outcome:
+def our_side(
+    study: vj.Study, configurations: int, seed: int, *, search: Any, halving: Any
+) -> Outcome:
     """Sweep with this package."""
-    study = case.study(0 if halving is None else 7)
     spent.clear()
     before = time.process_time()
     result = vj.sweep(
@@ -181,7 +182,7 @@ def environment_of(case: Case) -> Any:
     from gymnax.environments import spaces  # pyright: ignore[reportMissingImports]
 
     class Environment:
-        default_params = case.task
+        default_params = parameters_of(case.task)
 
         def action_space(self, task: Any) -> Any:
             kind = case.task.action
@@ -195,21 +196,28 @@ def environment_of(case: Case) -> Any:
             )
             return spaces.Box(-jnp.inf, jnp.inf, size.shape)
 
-        def reset(self, key: Any, task: Any) -> Any:
+        def reset(self, key: Any, parameters: Any) -> Any:
+            task = parameters or case.task
             state = task.reset(key)
             return task.observe(state), (state, jnp.int32(0))
 
-        def step(self, key: Any, state: Any, action: Any, task: Any) -> Any:
+        def step(self, key: Any, state: Any, action: Any, parameters: Any) -> Any:
             before, age = state
+            task = parameters or case.task
             step_key, reset_key = jax.random.split(key)
             after, reward, over = task.step(step_key, before, action)
             over = over | (age + 1 >= task.time_limit)
-            fresh = self.reset(reset_key, task)
+            fresh = self.reset(reset_key, parameters)
             both = (task.observe(after), (after, age + 1))
             chosen = jax.tree.map(lambda new, old: jnp.where(over, new, old), fresh, both)
             return *chosen, jnp.asarray(reward, jnp.float32), over, {}
 
     return Environment()
+
+
+def parameters_of(task: Any) -> Any:
+    """Return a task whose fields are numbers, which are arguments of a program; else nothing."""
+    return () if jax.tree.leaves(task) == [task] else task
 
 
 class RejaxSide:
@@ -224,7 +232,7 @@ class RejaxSide:
         ours = PPO(**case.settings)
         self.algorithm = rejax.PPO.create(
             env=environment_of(case),
-            env_params=case.task,
+            env_params=parameters_of(case.task),
             num_envs=ours.environments,
             num_steps=ours.horizon,
             num_epochs=ours.epochs,
@@ -278,7 +286,7 @@ class RejaxSide:
                 self.case.task, **{n: jnp.float32(values[n]) for n in self.case.ranges}
             )
             named = {THEIR_NAMES.get(n, n): jnp.float32(values[n]) for n in OPTIMISER}
-            algorithm = self.algorithm.replace(env_params=task, **named)
+            algorithm = self.algorithm.replace(env_params=parameters_of(task), **named)
             policy = self.policy(*self.train(algorithm, jax.random.key(1000 * seed + number)))
             study.tell(trial, float(evaluate(self.case.nominal, policy, episodes=20).mean()))
             policies.append(policy)
@@ -334,7 +342,8 @@ def main() -> None:
                     continue
             else:
                 search, halving = own[side]
-                run = functools.partial(our_side, case, search=search, halving=halving)
+                study = case.study(0 if halving is None else 7)
+                run = functools.partial(our_side, study, search=search, halving=halving)
             before = time.process_time()
             run(4, 999)
             compiling = time.process_time() - before
@@ -356,10 +365,11 @@ def show(name: str, outcomes: list[Outcome]) -> None:
     total = sum(seconds.values())
     parts = ", ".join(f"{took:.1f} s {stage}" for stage, took in seconds.items())
     first = float(np.mean([one.first for one in outcomes]))
+    known = [one.nominal for one in outcomes if one.safe and not math.isnan(one.nominal)]
+    nominal = float(np.mean(known)) if known else math.nan
     print(
         f"    {name:9} {safe} safe in {total:.1f} CPU s ({parts}): {3600 * safe / total:,.0f} an "
-        f"hour; first after {first:.1f} s; nominal return of the safe ones "
-        f"{np.nanmean([one.nominal for one in outcomes]):.1f}",
+        f"hour; first after {first:.1f} s; nominal return of the safe ones {nominal:.1f}",
         flush=True,
     )
 

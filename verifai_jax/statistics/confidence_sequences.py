@@ -19,6 +19,7 @@ nonasymptotic confidence sequences, Annals of Statistics 49, 2021).
 
 import math
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Real
@@ -57,9 +58,7 @@ def anytime_interval(
     return Rate(failures, n, low, high, confidence, at_any_time=True, undecided=undecided)
 
 
-def border_between(
-    within: float, outside: float, inside: Callable[[np.ndarray], np.ndarray]
-) -> float:
+def border_between(within: float, outside: float, inside: Callable[[np.ndarray], Any]) -> float:
     """Find where an interval ends, between the estimate, which is inside, and an end of [0, 1].
 
     `inside` says of several rates at once whether they belong to the interval.

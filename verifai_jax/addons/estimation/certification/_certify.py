@@ -74,9 +74,8 @@ def certify(
     - `seed`: the seed of samples and search. All policies get the same samples, which differ from
       those of a training with this seed.
     - `only_safe`: whether to simulate only what shows policies to be safe: one that is shown to be
-      unsafe by fewer than `samples` gets no more, one whose rate is near `p` stays undecided if its
-      part of the budget is too small, the attack on a policy ends with the block in which it finds
-      a failure, and no samples are drawn to name the safest.
+      unsafe by fewer than `samples` gets no more, one whose part of the budget is too small stays
+      undecided, an attack ends with the block that finds a failure, and the safest is not sought.
     - `tie`: failure rates that differ by less than this count as equally safe. The default is `p /
       10` or less, such that resolving it takes about as many samples as the minimum for all
       policies together.
