@@ -116,6 +116,13 @@ class Outcome:
     seconds: dict[str, float]
     policies: list[Any]
     first: float
+    nominal: float = math.nan
+
+    def with_return(self, case: Case) -> "Outcome":
+        """Return it with the mean nominal return of its safe policies, in uncounted time."""
+        found = [p for p, good in zip(self.policies, self.safe, strict=True) if good]
+        returns = [float(evaluate(case.nominal, policy, episodes=20).mean()) for policy in found]
+        return dataclasses.replace(self, nominal=float(np.mean(returns)) if returns else math.nan)
 
 
 NARROW = CrossEntropy(min_elite=4, widening=1.0)
@@ -123,7 +130,7 @@ EARLY = vj.Halving(reduction=1, until_safe=True)
 STAGES = {
     "training": (TrainingRuns, "train"),
     "returns": (RunningSweep, "_measure_returns"),
-    "tests": (RunningSweep, "_without_passed"),
+    "tests": (RunningSweep, "_going_on"),
     "search": (RunningSweep, "_screen"),
     "certifying": (RunningSweep, "_certify"),
 }
@@ -146,12 +153,16 @@ def count_time(stage: str) -> None:
     setattr(owner, name, timed)
 
 
-def our_side(case: Case, configurations: int, seed: int, *, search: Any, halving: Any) -> Outcome:
+def our_side(
+    study: vj.Study, configurations: int, seed: int, *, search: Any, halving: Any
+) -> Outcome:
     """Sweep with this package."""
-    study = case.study(0 if halving is None else 7)
     spent.clear()
     before = time.process_time()
-    result = vj.sweep(study, search, configurations=configurations, seed=seed, halving=halving)
+    result = vj.sweep(
+        study, search, configurations=configurations, seed=seed, halving=halving,
+        batch=None if search == "halton" else max(1, configurations // 2),
+    )  # fmt: skip
     total = time.process_time() - before
     seconds = {**spent, "other": total - sum(spent.values())}
     table = result.table
@@ -171,7 +182,7 @@ def environment_of(case: Case) -> Any:
     from gymnax.environments import spaces  # pyright: ignore[reportMissingImports]
 
     class Environment:
-        default_params = case.task
+        default_params = parameters_of(case.task)
 
         def action_space(self, task: Any) -> Any:
             kind = case.task.action
@@ -185,21 +196,28 @@ def environment_of(case: Case) -> Any:
             )
             return spaces.Box(-jnp.inf, jnp.inf, size.shape)
 
-        def reset(self, key: Any, task: Any) -> Any:
+        def reset(self, key: Any, parameters: Any) -> Any:
+            task = parameters or case.task
             state = task.reset(key)
             return task.observe(state), (state, jnp.int32(0))
 
-        def step(self, key: Any, state: Any, action: Any, task: Any) -> Any:
+        def step(self, key: Any, state: Any, action: Any, parameters: Any) -> Any:
             before, age = state
+            task = parameters or case.task
             step_key, reset_key = jax.random.split(key)
             after, reward, over = task.step(step_key, before, action)
             over = over | (age + 1 >= task.time_limit)
-            fresh = self.reset(reset_key, task)
+            fresh = self.reset(reset_key, parameters)
             both = (task.observe(after), (after, age + 1))
             chosen = jax.tree.map(lambda new, old: jnp.where(over, new, old), fresh, both)
             return *chosen, jnp.asarray(reward, jnp.float32), over, {}
 
     return Environment()
+
+
+def parameters_of(task: Any) -> Any:
+    """Return a task whose fields are numbers, which are arguments of a program; else nothing."""
+    return () if jax.tree.leaves(task) == [task] else task
 
 
 class RejaxSide:
@@ -214,7 +232,7 @@ class RejaxSide:
         ours = PPO(**case.settings)
         self.algorithm = rejax.PPO.create(
             env=environment_of(case),
-            env_params=case.task,
+            env_params=parameters_of(case.task),
             num_envs=ours.environments,
             num_steps=ours.horizon,
             num_epochs=ours.epochs,
@@ -268,7 +286,7 @@ class RejaxSide:
                 self.case.task, **{n: jnp.float32(values[n]) for n in self.case.ranges}
             )
             named = {THEIR_NAMES.get(n, n): jnp.float32(values[n]) for n in OPTIMISER}
-            algorithm = self.algorithm.replace(env_params=task, **named)
+            algorithm = self.algorithm.replace(env_params=parameters_of(task), **named)
             policy = self.policy(*self.train(algorithm, jax.random.key(1000 * seed + number)))
             study.tell(trial, float(evaluate(self.case.nominal, policy, episodes=20).mean()))
             policies.append(policy)
@@ -324,14 +342,15 @@ def main() -> None:
                     continue
             else:
                 search, halving = own[side]
-                run = functools.partial(our_side, case, search=search, halving=halving)
+                study = case.study(0 if halving is None else 7)
+                run = functools.partial(our_side, study, search=search, halving=halving)
             before = time.process_time()
             run(4, 999)
             compiling = time.process_time() - before
             print(f"  {side}: {compiling:.0f} s before, compiling")
             every = []
             for seed in chosen.seeds:
-                every.append(run(chosen.configurations, seed))
+                every.append(run(chosen.configurations, seed).with_return(case))
                 show(f"seed {seed}", every[-1:])
                 if chosen.check:
                     count_again(case, every[-1], chosen.check)
@@ -346,9 +365,11 @@ def show(name: str, outcomes: list[Outcome]) -> None:
     total = sum(seconds.values())
     parts = ", ".join(f"{took:.1f} s {stage}" for stage, took in seconds.items())
     first = float(np.mean([one.first for one in outcomes]))
+    known = [one.nominal for one in outcomes if one.safe and not math.isnan(one.nominal)]
+    nominal = float(np.mean(known)) if known else math.nan
     print(
         f"    {name:9} {safe} safe in {total:.1f} CPU s ({parts}): {3600 * safe / total:,.0f} an "
-        f"hour; first after {first:.1f} s",
+        f"hour; first after {first:.1f} s; nominal return of the safe ones {nominal:.1f}",
         flush=True,
     )
 

@@ -19,6 +19,7 @@ nonasymptotic confidence sequences, Annals of Statistics 49, 2021).
 
 import math
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Real
@@ -57,19 +58,16 @@ def anytime_interval(
     return Rate(failures, n, low, high, confidence, at_any_time=True, undecided=undecided)
 
 
-def border_between(
-    within: float, outside: float, inside: Callable[[np.ndarray], np.ndarray]
-) -> float:
+def border_between(within: float, outside: float, inside: Callable[[np.ndarray], Any]) -> float:
     """Find where an interval ends, between the estimate, which is inside, and an end of [0, 1].
 
     `inside` says of several rates at once whether they belong to the interval.
     """
     if inside(np.array([outside]))[0]:
         return outside
-    for _ in range(12):
-        between = np.linspace(within, outside, 33)[1:-1]
-        count = int(np.argmin([*inside(between), False]))
-        rates = [within, *between, outside]
+    for _ in range(7):  # To 2^-35, on the outer side.
+        rates = np.linspace(within, outside, 33)
+        count = int(np.argmin([*inside(rates[1:-1]), False]))
         within, outside = float(rates[count]), float(rates[count + 1])
     return outside
 

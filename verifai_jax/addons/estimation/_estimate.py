@@ -150,21 +150,14 @@ def estimate(
     simulated.compile()
     with SimulationProgress(problem.name, budget, progress) as bar, one_thread():
         limit_state = LimitState(
-            simulated,
-            problem.space.dim,
-            int(budget),
-            batch,
-            constraint=_constraint(problem, rest),
-            deadline=None if max_seconds is None else started + max_seconds,
-            report=bar.update,
+            simulated, problem.space.dim, int(budget), batch, constraint=_constraint(problem, rest),
+            deadline=None if max_seconds is None else started + max_seconds, report=bar.update,
             together=1 if executor is None else AT_ONCE,
             gradient=simulated.gradient if _differentiates(choice.problem) else None,
-            uniform=simulated.uniform,
-            draws=depends_on_key(choice.problem),
+            uniform=simulated.uniform, draws=depends_on_key(choice.problem),
             one_by_one=choice.problem.black_box and executor is None,
-            workers=choice.problem.system.workers,
-            rest=rest,
-        )
+            workers=choice.problem.system.workers, rest=rest,
+        )  # fmt: skip
         slow = simulations_are == "slow" or cheap is not None
         plan = answers.Plan(confidence, chains, simulated.clamped, within)
         if cheap is not None:
@@ -242,33 +235,17 @@ def _result(
             if not made:
                 notes.insert(0, UNSEARCHED)
     return Estimate(
-        name=problem.name,
-        probability=answer.probability,
-        low=answer.low,
-        high=high if answer.probability is not None else bound,
-        confidence=plan.confidence,
-        method=answer.method,
-        simulations=limit_state.simulations,
-        budget=limit_state.budget,
-        failures=limit_state.failures,
-        no_verdict=limit_state.no_verdict,
-        upper_bound=bound,
-        prior_simulations=answer.prior.simulations,
-        prior_failures=answer.prior.failures,
-        prior_no_verdict=answer.prior.no_verdict,
-        effective=answer.effective,
-        relative_error=answer.relative_error,
-        diagnostics=answer.diagnostics,
-        notes=tuple(dict.fromkeys(notes)),
-        p0=p0,
-        seed=seed,
-        version=__version__,
-        precision=precision,
-        backend=backend,
-        seconds=seconds,
-        stopped=limit_state.ended,
+        name=problem.name, probability=answer.probability, low=answer.low,
+        high=high if answer.probability is not None else bound, confidence=plan.confidence,
+        method=answer.method, simulations=limit_state.simulations, budget=limit_state.budget,
+        failures=limit_state.failures, no_verdict=limit_state.no_verdict, upper_bound=bound,
+        prior_simulations=answer.prior.simulations, prior_failures=answer.prior.failures,
+        prior_no_verdict=answer.prior.no_verdict, effective=answer.effective,
+        relative_error=answer.relative_error, diagnostics=answer.diagnostics,
+        notes=tuple(dict.fromkeys(notes)), p0=p0, seed=seed, version=__version__,
+        precision=precision, backend=backend, seconds=seconds, stopped=limit_state.ended,
         drawn=answer.drawn,
-    )
+    )  # fmt: skip
 
 
 def _robustness_of(cheap: Problem, precision: str, seed: int) -> answers.Cheap:
@@ -321,15 +298,11 @@ def _with_decided(found: Estimate, rest: "Rest", limit_state: LimitState, seed: 
     probability = None if found.probability is None else whole(found.probability, 0)
     estimated = 1 - whole(0.0, 0) / probability if probability else 1.0
     return replace(
-        found,
-        probability=probability,
-        relative_error=estimated * found.relative_error,
-        low=min(ends(found.low)),
-        high=max(ends(found.high)),
-        upper_bound=max(ends(found.upper_bound)),
-        certain=whole(0.0, 0),
+        found, probability=probability, relative_error=estimated * found.relative_error,
+        low=min(ends(found.low)), high=max(ends(found.high)),
+        upper_bound=max(ends(found.upper_bound)), certain=whole(0.0, 0),
         rest=left / (left + rest.decided),
-    )
+    )  # fmt: skip
 
 
 def one_thread() -> AbstractContextManager[object]:

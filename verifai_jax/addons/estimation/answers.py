@@ -121,21 +121,14 @@ def importance_answer(
     high = min(1.0, high / (1 - agreement.unseen))
     answer = Answer(counts, min(mean.mean, 1.0), low, high, "importance", mean.effective, mean.cv)
     answer.diagnostics = {
-        "tail_index": mean.tail,
-        "largest_share": mean.largest,
-        "failing_share": float(samples.failing.mean()),
-        "components": len(samples.proposal.shares),
-        "defensive_share": float(samples.proposal.shares[0]),
-        "failures_by_prior": failing,
-        "samples_by_prior": drawn,
-        "splitting": run.estimate,
-        "unresolved": samples.unresolved,
-        "acceptance": samples.acceptance[0],
-        "levels": list(run.levels),
-        "fractions": list(run.fractions),
-        "reached": [float(share) for share in agreement.reached],
+        "tail_index": mean.tail, "largest_share": mean.largest,
+        "failing_share": float(samples.failing.mean()), "components": len(samples.proposal.shares),
+        "defensive_share": float(samples.proposal.shares[0]), "failures_by_prior": failing,
+        "samples_by_prior": drawn, "splitting": run.estimate, "unresolved": samples.unresolved,
+        "acceptance": samples.acceptance[0], "levels": list(run.levels),
+        "fractions": list(run.fractions), "reached": [float(share) for share in agreement.reached],
         "unseen": agreement.unseen,
-    }
+    }  # fmt: skip
     answer.drawn = {"weights": np.sort(samples.x[samples.failing])[::-1] / samples.x.sum()}
     if run.stopped is None:
         check_by_splitting(answer, run, float(agreement.reached[0]), (low, high), plan)

@@ -219,17 +219,16 @@ class BatchedTraining:
             updates = np.array([self.configurations[n].updates for n in filled], np.int32)
             states, curves = _start(*arguments, seeds, updates)
         program = _advance_updates(*arguments[:3])
-        lowered = program.lower(*arguments[3:], states, curves, np.int32(0), np.int32(0))
-        on_cpu = self.devices[0].platform == "cpu"
-        compiled = lowered.compile(compiler_options=_sequential() if on_cpu else None)
         seconds = 0.0
         while done < until:
             # Short at first, until it is known how long an update takes.
             rate = self._rates.get(structure)
+            if rate is None:  # No update compiles the program, which is not timed.
+                program(tasks, algorithms, states, curves, np.int32(0), np.int32(0))
             updates = 1 if rate is None else max(1, int(SLICE_SECONDS / rate))
             updates = min(updates, until - done)
             began = time.perf_counter()
-            states, curves = compiled(
+            states, curves = program(
                 tasks, algorithms, states, curves, np.int32(done), np.int32(done + updates)
             )
             jax.block_until_ready(curves)
@@ -384,7 +383,7 @@ def _start(
 def _advance_updates(
     layout: _Layout, static_task: StaticTask, structure: PyTreeDef
 ) -> jax.stages.Wrapped:
-    """Return the program of further updates: of `jit_each`, to be compiled before it is timed."""
+    """Return the program of further updates."""
 
     def one(
         task_numbers: list[Array], numbers: list[Array], state: AlgorithmState,
@@ -402,7 +401,10 @@ def _advance_updates(
 
         return jax.lax.fori_loop(done, until, update, (state, curve))
 
-    return jax.jit(_over_lanes(layout, one, shared=2))
+    further = _over_lanes(layout, one, shared=2)
+    further.__name__ = "_advance_updates"
+    on_cpu = layout.devices[0].platform == "cpu"
+    return jax.jit(further, compiler_options=_sequential() if on_cpu else None)
 
 
 @jax.jit

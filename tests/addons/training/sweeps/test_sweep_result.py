@@ -12,7 +12,7 @@ from planted_sweep import SPACE, ToyStudy, ToyTrainer, curve_to, planted_rows, r
 
 import verifai_jax as vj
 from verifai_jax.addons.rl import load_policy
-from verifai_jax.addons.training.sweeps.pareto import fronts
+from verifai_jax.addons.training.sweeps.ranking import on_pareto_front
 from verifai_jax.addons.training.sweeps.record import AFTER, BEFORE
 from verifai_jax.addons.training.sweeps.result import Sweep, load_sweep
 from verifai_jax.addons.training.sweeps.storage import SweepFileError
@@ -198,8 +198,32 @@ def test_the_pareto_front_is_that_of_the_definition(large):
     table = large.table
     points = np.stack([-table["nominal_return"], table["failure_high"], table["steps"]], axis=1)
     front = large.pareto()
-    assert sorted(front.index) == np.flatnonzero(fronts(points) == 0).tolist()
+    assert sorted(front.index) == undominated(points)
     assert front["failure_high"].is_monotonic_increasing
+
+
+def undominated(points):
+    """By the definition: rows of numbers that no other row is at most, and less in one."""
+
+    def dominates(one, other):
+        pairs = list(zip(one, other, strict=True))
+        return all(a <= b for a, b in pairs) and any(a < b for a, b in pairs)
+
+    known = [p for p in points.tolist() if not any(np.isnan(p))]
+    rows = enumerate(points.tolist())
+    return [i for i, p in rows if p in known and not any(dominates(q, p) for q in known)]
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_the_front_of_rows_that_are_equal_infinite_or_unknown(seed):
+    rng = np.random.default_rng(seed)
+    points = rng.integers(0, 6, (60, 3)).astype(float)
+    points[rng.random(points.shape) < 0.03] = np.nan
+    points[rng.random(points.shape) < 0.03] = np.inf
+    names = ("nominal_return", "failure_high", "steps")
+    table = pd.DataFrame(points * [-1, 1, 1], columns=names)
+    assert np.flatnonzero(on_pareto_front(table)).tolist() == undominated(points)
+    assert on_pareto_front(table[:0]).tolist() == []
 
 
 def test_a_policy_acts_as_its_row_says(small):

@@ -18,7 +18,11 @@ from numpy_training import seed_of, study, sweep, train, train_anew, train_repor
 
 import verifai_jax as vj
 from verifai_jax.addons.training.sweeps import StudyError
-from verifai_jax.addons.training.sweeps.function_runs import FunctionRuns, _reported, train_once
+from verifai_jax.addons.training.sweeps.function_runs import (
+    FunctionRuns,
+    reported_steps,
+    train_once,
+)
 
 HERE = Path(__file__).parent
 
@@ -113,8 +117,8 @@ def test_a_training_reports_its_checkpoints_and_how_far_it_is(tmp_path):
     for prefix, expected in (("", weights), ("4/", again)):
         held = [a for n, a in found.items() if n.startswith(f"{prefix}array/")]
         assert any(np.array_equal(np.ravel(a), np.float32(expected)) for a in held), prefix
-    assert _reported(tmp_path / "8.part") == 8
-    assert _reported(tmp_path / "other.part") == 0
+    assert reported_steps(tmp_path / "8.part") == 8
+    assert reported_steps(tmp_path / "other.part") == 0
     with (
         unchecked(),
         pytest.raises(ValueError, match="checkpoint was not called at 4 steps or after them"),

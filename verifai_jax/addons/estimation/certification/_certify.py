@@ -56,19 +56,12 @@ ProgressReport = Callable[[int, int, str], None]
 @suggests_options
 @shows_progress("certifying")
 def certify(
-    problem_of: Callable[[Any], Problem],
-    policies: Sequence[Any],
-    *,
-    p: float = 0.01,
-    certification: Certification | None = None,
-    seed: int = 0,
-    only_safe: bool = False,
-    tie: float | None = None,
-    remember: Remember | None = None,
-    progress: ProgressReport | bool | None = None,
-    devices: Sequence[Any] | None = None,
+    problem_of: Callable[[Any], Problem], policies: Sequence[Any], *, p: float = 0.01,
+    certification: Certification | None = None, seed: int = 0, only_safe: bool = False,
+    tie: float | None = None, remember: Remember | None = None,
+    progress: ProgressReport | bool | None = None, devices: Sequence[Any] | None = None,
     run_on: RunOn | None = None,
-) -> Certificates:
+) -> Certificates:  # fmt: skip
     """Attack all policies, then bound the failure probability of each from fresh samples.
 
     **Arguments:**
@@ -81,9 +74,8 @@ def certify(
     - `seed`: the seed of samples and search. All policies get the same samples, which differ from
       those of a training with this seed.
     - `only_safe`: whether to simulate only what shows policies to be safe: one that is shown to be
-      unsafe by fewer than `samples` gets no more, one whose rate is near `p` stays undecided if its
-      part of the budget is too small, the attack on a policy ends with the block in which it finds
-      a failure, and no samples are drawn to name the safest.
+      unsafe by fewer than `samples` gets no more, one whose part of the budget is too small stays
+      undecided, an attack ends with the block that finds a failure, and the safest is not sought.
     - `tie`: failure rates that differ by less than this count as equally safe. The default is `p /
       10` or less, such that resolving it takes about as many samples as the minimum for all
       policies together.
@@ -158,17 +150,9 @@ def certify(
     known = all(row.simulations for row in rows)
     now = find_leader(*_counts(sampled), tie, margins) if known else None
     return Certificates(
-        rows=rows,
-        problem=blocks.problem.name,
-        p=p,
-        confidence=confidence,
-        safest=None if now is None else now.number,
-        chance=None if now is None else now.chance,
-        tie=tie,
-        seed=seed,
-        samples=samples,
-        budget=budget,
-        stopped=stopped,
+        rows=rows, problem=blocks.problem.name, p=p, confidence=confidence,
+        safest=None if now is None else now.number, chance=None if now is None else now.chance,
+        tie=tie, seed=seed, samples=samples, budget=budget, stopped=stopped,
         seconds=time.perf_counter() - started,
         notes=(
             *formula_notes(blocks.problem),
@@ -177,7 +161,7 @@ def certify(
             *_chance(blocks.problem, rows),
         ),
         sources=blocks.sources.to_json(),
-    )
+    )  # fmt: skip
 
 
 def _chance(problem: Problem, rows: Sequence[Certificate]) -> list[str]:
@@ -232,18 +216,11 @@ def _certificate(
         rate = simultaneous_interval(failing, sampled.simulations, allocation.confidence, among)
     worst, features, counterexamples = _worst_rows(blocks.space, (sampled, attacked))
     return Certificate(
-        number=number,
-        failures=sampled.failures,
-        simulations=sampled.simulations,
-        not_finite=sampled.not_finite,
-        rate=rate,
-        verdict=verdict(rate, allocation.p),
-        attacks=attacked.simulations,
-        attack_failures=attacked.failures,
-        worst_robustness=worst,
-        worst_features=features,
-        counterexamples=counterexamples,
-    )
+        number=number, failures=sampled.failures, simulations=sampled.simulations,
+        not_finite=sampled.not_finite, rate=rate, verdict=verdict(rate, allocation.p),
+        attacks=attacked.simulations, attack_failures=attacked.failures, worst_robustness=worst,
+        worst_features=features, counterexamples=counterexamples,
+    )  # fmt: skip
 
 
 def _worst_rows(

@@ -13,11 +13,12 @@ from verifai_jax.search import Search
 class Certification:
     """The attack on each policy and the samples of its certificate.
 
-    - `samples`: minimum number of samples of each policy, rounded up to whole blocks of 64 (smaller
-      blocks for fewer than 64 samples). 32 are enough if only the safest policy is wanted.
+    - `samples`: minimum number of samples of each policy, in a sweep of those that fewer do not
+      show to be unsafe; in whole blocks of 64, or smaller ones for fewer. 32 name the safest.
     - `confidence`: the probability that all intervals hold at once.
     - `budget`: samples of all policies together; four times the minimum when left out. Samples
-      beyond the minimum go to policies whose verdict is open, and to those that may be the safest.
+      beyond the minimum go to policies whose verdict is open, and to those that may be the safest;
+      in a sweep to those that may be safe, to each its part at most.
     - `attack`: the search that looks for failures first; its failures are not part of any rate.
     - `attack_simulations`: simulations of each attack, rounded up to whole blocks, 0 for none.
 

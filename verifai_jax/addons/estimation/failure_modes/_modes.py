@@ -125,17 +125,11 @@ def modes(
     rng = np.random.default_rng(seed)
     with SimulationProgress(problem.name, budget, progress) as bar, one_thread():
         limit_state = LimitState(
-            simulated,
-            problem.space.dim,
-            estimated,
-            batch,
-            constraint=_constraint(problem.space),
-            deadline=None if max_seconds is None else started + max_seconds,
-            report=bar.update,
+            simulated, problem.space.dim, estimated, batch, constraint=_constraint(problem.space),
+            deadline=None if max_seconds is None else started + max_seconds, report=bar.update,
             gradient=simulated.gradient if _has_slopes(chosen.problem) else None,
-            uniform=simulated.uniform,
-            draws=draws,
-        )
+            uniform=simulated.uniform, draws=draws,
+        )  # fmt: skip
         plan = Plan(confidence, chains, simulated.clamped)
         if chosen.problem.black_box:
             notice_own_chance(limit_state, np.random.default_rng((seed, 1)))
@@ -173,24 +167,13 @@ def modes(
         )
     known = answer.probability is not None
     return Modes(
-        name=problem.name,
-        modes=listed,
-        probability=answer.probability,
-        low=answer.low if known else 0.0,
-        high=answer.high if known else bound,
-        confidence=confidence,
-        unexplained=unexplained,
-        rest=rest,
-        simulations=limit_state.simulations,
-        budget=int(budget),
-        upper_bound=bound,
-        notes=tuple(dict.fromkeys(notes)),
-        run=run,
-        seconds=time.perf_counter() - started,
-        sources=sources.to_json(),
-        changed=changed,
-        stopped=limit_state.ended,
-    )
+        name=problem.name, modes=listed, probability=answer.probability,
+        low=answer.low if known else 0.0, high=answer.high if known else bound,
+        confidence=confidence, unexplained=unexplained, rest=rest,
+        simulations=limit_state.simulations, budget=int(budget), upper_bound=bound,
+        notes=tuple(dict.fromkeys(notes)), run=run, seconds=time.perf_counter() - started,
+        sources=sources.to_json(), changed=changed, stopped=limit_state.ended,
+    )  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -244,15 +227,10 @@ def _under_keys(simulated: DoublePrecisionEvaluator, limit_state: LimitState) ->
         if limit_state.gradient is not None:
             slopes = lambda u: simulated.gradient_held(u, numbers(u))  # noqa: E731
         under = LimitState(
-            lambda u: simulated.held(u, numbers(u)),
-            limit_state.dim,
-            budget,
-            limit_state.batch,
-            constraint=limit_state.constraint,
-            deadline=limit_state.deadline,
-            gradient=slopes,
+            lambda u: simulated.held(u, numbers(u)), limit_state.dim, budget, limit_state.batch,
+            constraint=limit_state.constraint, deadline=limit_state.deadline, gradient=slopes,
             uniform=limit_state.uniform,
-        )
+        )  # fmt: skip
         under.strict = True
         return under
 
@@ -342,26 +320,13 @@ def _list_modes(
             )
         listed.append(
             Mode(
-                number=number,
-                name=name_mode(failures, prior),
-                probability=whole * float(masses[k]),
-                low=low,
-                high=high,
-                share=float(masses[k]),
-                features=features,
-                distance=float(np.linalg.norm(design[number])),
-                rho=rho,
-                cause=cause,
-                failures=failures,
-                row=row,
-                problem=problem,
-                run=run,
-                key=key,
-                precision=numbers.precision,
-                key_number=int(keys[number]),
-                chance=chance,
+                number=number, name=name_mode(failures, prior),
+                probability=whole * float(masses[k]), low=low, high=high, share=float(masses[k]),
+                features=features, distance=float(np.linalg.norm(design[number])), rho=rho,
+                cause=cause, failures=failures, row=row, problem=problem, run=run, key=key,
+                precision=numbers.precision, key_number=int(keys[number]), chance=chance,
             )
-        )
+        )  # fmt: skip
     return tuple(listed), rest, found[0][0]
 
 

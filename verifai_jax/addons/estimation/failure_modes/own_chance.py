@@ -76,15 +76,10 @@ def divide_by_chance(
     ]
     return Divided(
         Regions(np.concatenate([z, tried]), np.append(region[group], of_tried)),
-        np.zeros(len(z) + len(tried), int),
-        joined=0,
-        tried=0,
-        under=1.0,
-        held=0,
+        np.zeros(len(z) + len(tried), int), joined=0, tried=0, under=1.0, held=0,
         design=tuple(len(z) + row for row in likeliest),
-        failing=tuple(int(failing[row]) for row in likeliest),
-        times=times,
-    )
+        failing=tuple(int(failing[row]) for row in likeliest), times=times,
+    )  # fmt: skip
 
 
 def _groups(z: Float[np.ndarray, "n d"], max_groups: int) -> Int[np.ndarray, " n"]:

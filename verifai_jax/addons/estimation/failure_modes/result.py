@@ -204,19 +204,14 @@ class Modes(Drawn, InNotebook):
         return pd.DataFrame(
             [
                 {
-                    "mode": mode.number,
-                    "name": mode.name,
-                    "probability": mode.probability,
-                    "low": mode.low,
-                    "high": mode.high,
-                    "share": mode.share,
-                    "distance": mode.distance,
-                    "cause": mode.cause,
+                    "mode": mode.number, "name": mode.name, "probability": mode.probability,
+                    "low": mode.low, "high": mode.high, "share": mode.share,
+                    "distance": mode.distance, "cause": mode.cause,
                     **mode.features,
                 }
                 for mode in self.modes
             ]
-        )
+        )  # fmt: skip
 
     def _notebook_parts(self) -> Iterator[str]:
         if self.modes:

@@ -27,27 +27,21 @@ def fingerprint(study: Study, options: Mapping[str, Any]) -> dict[str, Any]:
     """
     problem = study.untrained_problem()
     return {
-        "study": study.name,
-        "space": _features(study.space),
-        "constrained": study.space.where is not None,
-        "task": describe(study.trainer.task),
+        "study": study.name, "space": _features(study.space),
+        "constrained": study.space.where is not None, "task": describe(study.trainer.task),
         "nominal": describe(study.trainer.evaluation_task),
         "algorithms": {
             name: describe(algorithm) for name, algorithm in study.trainer.by_name.items()
         },
-        "steps": study.trainer.steps,
-        "snapshots": list(study.checkpoints),
-        "seeds": list(study.training_seeds),
-        "p": study.p,
+        "steps": study.trainer.steps, "snapshots": list(study.checkpoints),
+        "seeds": list(study.training_seeds), "p": study.p,
         "curve": None if study.curve_formula is None else str(study.curve_formula),
         "problem": {
-            "name": problem.name,
-            "features": _features(problem.space),
+            "name": problem.name, "features": _features(problem.space),
             "formulas": {name: str(formula) for name, formula in problem.formulas.items()},
         },
-        "options": dict(options),
-        "version": __version__,
-    }
+        "options": dict(options), "version": __version__,
+    }  # fmt: skip
 
 
 def digest(value: Mapping[str, Any]) -> str:

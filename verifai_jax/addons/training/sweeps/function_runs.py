@@ -158,7 +158,7 @@ class FunctionRuns(TrainingRuns):
     def _show(self, calls: Sequence[Mapping[str, Any]], over: threading.Event) -> None:
         """Show how far the trainings are that report it; runs in a thread."""
         while not over.wait(1.0):
-            steps = [_reported(Path(call["folder"])) for call in calls]
+            steps = [reported_steps(Path(call["folder"])) for call in calls]
             if running := [(n, call["steps"]) for n, call in zip(steps, calls, strict=True) if n]:
                 done, total = (sum(each) for each in zip(*running, strict=True))
                 self.clock.advance(0, f"in training: {done:,} of {total:,} steps")
@@ -318,7 +318,7 @@ class _Reports:
         self._folder.with_suffix(".steps").write_text(str(self.last))
 
 
-def _reported(folder: Path) -> int:
+def reported_steps(folder: Path) -> int:
     """Return the steps that a training with this folder has reported; 0 before the first."""
     try:
         return int(folder.with_suffix(".steps").read_text() or 0)

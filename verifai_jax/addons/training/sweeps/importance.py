@@ -392,11 +392,9 @@ def trends(
 
 def _rank(values: Float[np.ndarray, "n k"]) -> Float[np.ndarray, "n k"]:
     """Return ranks of columns with mean 0 and deviation 1 (or all 0); equal values share one."""
-    ranks = np.empty(values.shape)
-    for j, column in enumerate(values.T):
-        _, index, counts = np.unique(column, return_inverse=True, return_counts=True)
-        last = np.cumsum(counts)
-        ranks[:, j] = (last - (counts - 1) / 2)[index]
+    from scipy.stats import rankdata
+
+    ranks = np.asarray(rankdata(values, axis=0))
     ranks -= ranks.mean(axis=0)
     deviation = ranks.std(axis=0)
     return ranks / np.where(deviation > 0, deviation, 1.0)

@@ -23,18 +23,9 @@ METRICS = ("upper end of the failure probability", "nominal return")
 DIRECTIONS = ("minimize", "maximize")
 """Optuna's directions of a trial's values."""
 _ATTRIBUTES = (
-    "verdict",
-    "seeds",
-    "seeds_safe",
-    "steps",
-    "failure_rate",
-    "failure_rate_worst",
-    "training_seconds",
-    "status",
-    "best_row",
-    "best_steps",
-    "best_verdict",
-)
+    "verdict", "seeds", "seeds_safe", "steps", "failure_rate", "failure_rate_worst",
+    "training_seconds", "status", "best_row", "best_steps", "best_verdict",
+)  # fmt: skip
 """Columns that become user attributes of a trial."""
 
 

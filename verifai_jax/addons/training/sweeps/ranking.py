@@ -4,10 +4,9 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from jaxtyping import Bool, Int
+from jaxtyping import Bool, Float, Int
 
 from verifai_jax.addons.estimation.simultaneous_interval import verdict_kind
-from verifai_jax.addons.training.sweeps.pareto import fronts
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -40,14 +39,21 @@ def preference_order(table: "pd.DataFrame") -> Int[np.ndarray, " certified"]:
     return order[np.isfinite(high)[order]]
 
 
-def pareto_fronts(table: "pd.DataFrame") -> Int[np.ndarray, " rows"]:
-    """Return the number of each row's Pareto front, 0 for the first.
+def on_pareto_front(table: "pd.DataFrame") -> Bool[np.ndarray, " rows"]:
+    """Return True for rows with a return and a certificate that no other such row dominates.
 
     Rows are compared by nominal return, the upper end of the failure probability, and environment
-    steps. A row without a return or a certificate gets -1.
+    steps.
     """
     columns = (-table["nominal_return"], table["failure_high"], table["steps"])
-    return fronts(np.stack([np.asarray(column, np.float64) for column in columns], axis=1))
+    points = np.stack([np.asarray(column, np.float64) for column in columns], axis=1)
+    known = points[~np.isnan(points).any(axis=1)]
+
+    def stays(point: Float[np.ndarray, " 3"]) -> bool:
+        dominating = (known <= point).all(axis=1) & (known < point).any(axis=1)
+        return not np.isnan(point).any() and not dominating.any()
+
+    return np.array([stays(point) for point in points], bool)
 
 
 def full_return_threshold(table: "pd.DataFrame") -> float:

@@ -21,19 +21,10 @@ A configuration that cannot train has `error: ...` instead."""
 BEFORE = ("configuration", "seed", "steps")
 """Columns of the table before those of the hyper-parameters."""
 AFTER = (
-    "status",
-    "training_return",
-    "nominal_return",
-    "failures",
-    "simulations",
-    "failure_rate",
-    "failure_low",
-    "failure_high",
-    "worst_robustness",
-    "verdict",
-    "curve_robustness",
+    "status", "training_return", "nominal_return", "failures", "simulations", "failure_rate",
+    "failure_low", "failure_high", "worst_robustness", "verdict", "curve_robustness",
     "training_seconds",
-)
+)  # fmt: skip
 """Columns of the table after those of the hyper-parameters."""
 
 

@@ -28,7 +28,7 @@ from verifai_jax.addons.training.sweeps.optuna_export import export_to_optuna
 from verifai_jax.addons.training.sweeps.ranking import (
     group_by_configuration,
     is_safe,
-    pareto_fronts,
+    on_pareto_front,
     preference_order,
 )
 from verifai_jax.addons.training.sweeps.record import SweepRecord, TrainedPolicy, algorithm_uses
@@ -243,7 +243,7 @@ class Sweep(Reported):
         Rows are compared by nominal return, the upper end of the failure probability, and
         environment steps.
         """
-        front = self.table.loc[pareto_fronts(self.table) == 0]
+        front = self.table.loc[on_pareto_front(self.table)]
         return front.sort_values(
             ["failure_high", "nominal_return", "steps"], ascending=[True, False, True]
         )

@@ -11,7 +11,7 @@ from verifai_jax._version import __version__
 from verifai_jax.addons.estimation.certification._certify import certify
 from verifai_jax.addons.estimation.certification.certification import Certification
 from verifai_jax.addons.estimation.certification.result import Certificate, Certificates
-from verifai_jax.addons.estimation.simultaneous_interval import verdict_kind
+from verifai_jax.addons.estimation.simultaneous_interval import UNSAFE, verdict_kind
 from verifai_jax.addons.rl._evaluate import batched_mean_returns
 from verifai_jax.addons.training.sweeps import record
 from verifai_jax.addons.training.sweeps.clock import CERTIFYING, TRAINING, Clock, OutOfTime
@@ -151,12 +151,9 @@ class RunningSweep:
             if compares:
                 self._measure_returns(self._runs_of(numbers))
             if rung < last:
-                left = self._without_unsafe(numbers, rung, self.halving.p, last)
-                if self.halving.until_safe:
-                    left = self._without_passed(left, rung)
-                selected = left
+                selected = self._going_on(numbers, rung, last, self.halving)
                 if compares:
-                    values = self._halving_objectives(self.halving.by, left, rung)
+                    values = self._halving_objectives(self.halving.by, selected, rung)
                     selected = self.halving.select(values)
                 for number in set(numbers) - set(selected):
                     self.configurations[number].stopped = rung
@@ -164,32 +161,27 @@ class RunningSweep:
                 numbers = selected
         self._measure_returns(runs)
 
-    def _without_unsafe(
-        self, numbers: Sequence[int], rung: int, p: float | None, rungs: int
+    def _going_on(
+        self, numbers: Sequence[int], rung: int, rungs: int, halving: Halving
     ) -> list[int]:
-        """Return the configurations that are not shown to fail more often than `p` at a rung."""
-        groups = {number: self._entries_of(number, rung) for number in numbers}
-        entries = [entry for group in groups.values() for entry in group if self._is_finite(entry)]
-        if p is None or not entries:
-            return list(numbers)
-        # All rungs together have the confidence of the sweep; each has samples of its own.
-        confidence = 1 - (1 - self.certified.confidence) / rungs
-        found = self._quick_certificates(entries, [2, rung], p, confidence)
-        unsafe = {entry for entry, one in found.items() if verdict_kind(one.verdict) == "unsafe"}
-        never = {entry for group in groups.values() for entry in group if entry not in found}
-        return [number for number in numbers if not {*groups[number]} <= unsafe | never]
-
-    def _without_passed(self, numbers: Sequence[int], rung: int) -> list[int]:
-        """Return the configurations with a policy at a rung that does not pass the test."""
-        groups = {number: self._entries_of(number, rung) for number in numbers}
-        entries = [entry for group in groups.values() for entry in group if self._is_finite(entry)]
-        p, confidence = self.study.p, self.certified.confidence
-        for samples in (SCREENING, TEST):  # Most that do not pass show it by the first ones.
-            found = self._quick_certificates(entries, [3, rung], p, confidence, samples, 0)
+        """Return the configurations that do not pass the test, and are not shown to be unsafe."""
+        groups = {number: {*self._entries_of(number, rung)} for number in numbers}
+        finite = [entry for group in groups.values() for entry in group if self._is_finite(entry)]
+        passing, p, confidence = finite, self.study.p, self.certified.confidence
+        for samples in (SCREENING, TEST) if halving.until_safe else ():
+            # Most that do not pass show it by the first samples.
+            found = self._quick_certificates(passing, [3, rung], p, confidence, samples, 0)
             fails = {entry: columns_of(one)["failures"] for entry, one in found.items()}
-            entries = [entry for entry in entries if fails[entry] <= TEST * p / 2]
+            passing = [entry for entry in passing if fails[entry] <= TEST * p / 2]
         for number, group in groups.items():
-            self.configurations[number].passed = {*group} <= {*entries}
+            self.configurations[number].passed = halving.until_safe and group <= {*passing}
+        if halving.p is not None and finite:
+            # All rungs together have the confidence of the sweep; each has samples of its own.
+            confidence = 1 - (1 - confidence) / rungs
+            found = self._quick_certificates(finite, [2, rung], halving.p, confidence)
+            unsafe = {entry for entry, one in found.items() if verdict_kind(one.verdict) == UNSAFE}
+            ended = {n for n, group in groups.items() if not group & {*finite} - unsafe}
+            numbers = [number for number in numbers if number not in ended]
         return [number for number in numbers if not self.configurations[number].passed]
 
     def _quick_certificates(

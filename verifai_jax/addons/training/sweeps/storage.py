@@ -112,18 +112,14 @@ def _write_files(stored: StoredSweep, table: "pd.DataFrame", folder: Path) -> No
     np.savez_compressed(folder / CURVES, **arrays)  # pyright: ignore[reportArgumentType]
     data = {name: getattr(record, name) for name in _PLAIN}
     data |= {
-        "complete": record.complete,
-        "rows": record.rows,
-        "sources": list(record.sources),
-        "used": stored.used,
-        "mixed": mixed,
-        "worst": record.worst,
+        "complete": record.complete, "rows": record.rows, "sources": list(record.sources),
+        "used": stored.used, "mixed": mixed, "worst": record.worst,
         "space": _space_to_json(stored.space),
         "checksums": {
             file.relative_to(folder).as_posix(): checksum(read_bytes(file))
             for file in _files(folder, record.rows)
         },
-    }
+    }  # fmt: skip
     files.write_record(folder / RECORD, plain(data))
 
 
