@@ -168,5 +168,7 @@ def _course(values: np.ndarray, low: float, high: float) -> str:
         if share > 0.99:
             return f"at its {word}, {end:z.4g},"
         left -= share
-        said += [f"at its {word}, {end:z.4g}, for {100 * share:z.0f} % of the time"] * (share >= 0.1)
+        said += [f"at its {word}, {end:z.4g}, for {100 * share:z.0f} % of the time"] * (
+            share >= 0.1
+        )
     return ", ".join([*said, f"{values.mean():z.3g} on average"][: None if left > 0.01 else -1])
