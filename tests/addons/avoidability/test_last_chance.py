@@ -121,6 +121,43 @@ def test_the_environment_avoids_it_by_a_feature_from_an_instant_on():
     assert "the other policy could avoid it" in str(other)
 
 
+@pytest.mark.thorough
+def test_what_never_comes_fails_where_its_window_ends():
+    system = vj.ode(
+        lambda t, s, u, f: jnp.stack([s[1], u]), initial=lambda f, key: jnp.zeros(2) * f["g"],
+        controller=lambda t, s, f: f["g"], signals=lambda t, s, u, f: {"x": s[0]}, dt=0.02,
+        duration=2.0,
+    )  # fmt: skip
+    late = "eventually[0, 1.8] always[0, 0.2] abs(x - 1) <= 0.15"
+    problem = vj.Problem("reach", {"g": vj.Box(0.1, 0.4)}, system, late)
+    found = vj.last_chance(problem, {"g": 0.2}, actions=(-4, 4), proof_seconds=0, **SMALL)
+    assert found.failed == pytest.approx(1.8)
+    # From x and v at t, full force must reach 0.85 by 1.8 s: x + v r + 2 r^2 with r = 1.8 - t.
+    last = brentq(lambda t: 0.1 * t**2 + 0.2 * t * (1.8 - t) + 2 * (1.8 - t) ** 2 - 0.85, 0, 1.8)
+    assert found.avoidable_until <= last + 0.02
+    assert found.no_escape_from >= last - 0.06  # It has to stay for 0.2 s, too.
+    assert "could avoid it until" in str(found)
+    assert " 0 s before" not in str(found)
+
+
+@pytest.mark.slow
+def test_a_cart_pole_of_gymnax_is_saved_by_a_beam_over_its_states():
+    pytest.importorskip("gymnax")
+
+    def leaning(observation):
+        return jnp.where(observation[2] > 0, 1, 0)
+
+    system = vj.gymnax("CartPole-v1", leaning, steps=120, initial={"theta0": "theta"})
+    problem = vj.Problem("upright", {"theta0": vj.Box(-0.1, 0.1)}, system, "always abs(theta) < .2")
+    options = {"forks": 1024, "rounds": 4, "progress": False}
+    for start in (-0.03, 0.05):  # Their failing traces differ in length.
+        found = vj.last_chance(problem, {"theta0": start}, **options)
+        escape = found.escape.trace.trim()
+        assert np.abs(escape.signals["theta"]).max() < 0.2
+        assert escape.length == 121
+        assert found.failed - 0.25 < found.avoidable_until < found.failed
+
+
 def test_a_row_that_does_not_fail_is_refused():
     with pytest.raises(ValueError, match=r"the simulation of 'wall' does not fail when simulated"):
         vj.last_chance(

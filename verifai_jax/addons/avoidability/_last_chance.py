@@ -21,6 +21,7 @@ from verifai_jax.counterexamples.selection import Row, problem_of, select_row
 from verifai_jax.evaluation.replay import Replay, replay
 from verifai_jax.falsification.run import Run
 from verifai_jax.mtl.blame import broken_at
+from verifai_jax.pictures.replay import decisive_instant
 from verifai_jax.problem.problem import Problem
 from verifai_jax.systems.base import System
 
@@ -57,7 +58,7 @@ def last_chance(
     - `features`: the features that the environment may change; by default all that vary.
     - `forks`: number of forks simulated at once; `rounds`: batches for each refinement.
     - `gradients`: whether to search along gradients, too; of MuJoCo they take long to compile.
-    - `proof_seconds`: seconds for a proof that no action avoids the failure; 0 for none.
+    - `proof_seconds`: processor time for proofs that no action avoids the failure; 0 for none.
     - `seed`: the seed of the search; `progress`: as in `falsify`.
     **Returns:** a `LastChance`.
     **Raises:** `ValueError` for a row that does not fail, a system that cannot fork, and actions
@@ -99,7 +100,9 @@ def last_chance(
                 return OtherPolicy(problem, by)
             if by == "environment":
                 return Surroundings(problem, names)
-            return Controls(problem, length, dt, actions)
+            # Of the longest trace: the failing one may have ended early.
+            whole = jax.eval_shape(problem.system, given, failing.key).length
+            return Controls(problem, whole, dt, actions)
 
         means = problem.programs.get(PROGRAMS, (by, repr(actions), names, precision), make)
         # A decision at the last sample changes nothing.
@@ -118,8 +121,12 @@ def last_chance(
             own, slack = means.own(course)[:decisions], 1e-3 * (means.high - means.low)
             if np.any((own < means.low - slack) | (own > means.high + slack)):
                 notes.append("the policy's own actions leave the bounds of the actions")
-        broken = broken_at(problem.formulas[failing.worst], failing.trace, problem.end).values()
+        formula = problem.formulas[failing.worst]
+        broken = broken_at(formula, failing.trace, problem.end).values()
         first = min((int(np.argmax(at)) for at in broken), default=length - 1)
+        if first < last * means.period:  # What never comes fails at the end of its window.
+            decided = decisive_instant(formula, failing.trace, problem.end)
+            first = first if decided is None else decided[1]
         kept = sorted(search.alone, reverse=True)[:MAX_ESCAPES]
         return LastChance(
             number, means.who, float(np.asarray(failing.trace.clock())[first]),
@@ -155,10 +162,13 @@ def _escape(search: EscapeSearch, failing: Replay, instant: int, time: Any) -> E
 
 def _course(values: np.ndarray, low: float, high: float) -> str:
     """Describe the values of one entry of the actions."""
-    said = []
+    said, left = [], 1.0
     for end, word in ((low, "lowest"), (high, "highest")):
         share = float(np.mean(np.abs(values - end) <= AT_AN_END * (high - low)))
         if share > 0.99:
             return f"at its {word}, {end:z.4g},"
-        said += [f"at its {word}, {end:z.4g}, for {share:.0%} of the time"] * (share >= 0.1)
-    return ", ".join([*said, f"{values.mean():z.3g} on average"])
+        left -= share
+        said += [f"at its {word}, {end:z.4g}, for {100 * share:z.0f} % of the time"] * (
+            share >= 0.1
+        )
+    return ", ".join([*said, f"{values.mean():z.3g} on average"][: None if left > 0.01 else -1])

@@ -161,7 +161,7 @@ class Controls(Means):
         return np.asarray(forks.state.links[0])[1 :: self.period]
 
     def _advance(self, forks: Fork, decision: Any, state: Any, numbers: Any) -> Any:
-        """Return the state one decision later, and the extremes of all signals so far."""
+        """Return the state one decision later with all extremes so far, and their robustness."""
         plan = Choice(jnp.int32(0), jnp.broadcast_to(numbers, self.shape), decision + 1)
         rollout = self.system.rollout(self.fork(forks, plan).features, forks.key)
         loop, low, high = state
@@ -169,7 +169,8 @@ class Controls(Means):
             loop, signals = rollout.sample(loop, decision * self.period + k)
             low = jax.tree.map(jnp.minimum, low, signals)
             high = jax.tree.map(jnp.maximum, high, signals)
-        return loop, low, high
+        extremes = Trace(jax.tree.map(lambda *ends: jnp.stack(ends), low, high), dt=rollout.dt)
+        return (loop, low, high), jnp.min(trace_verdict(self.problem, extremes)[0])
 
 
 class Surroundings(Means):

@@ -48,7 +48,8 @@ class LastChance(Drawn, InNotebook):
     """The last instant at which a failure could have been avoided, as a bracket in seconds.
 
     - `row`: the number of the failing simulation, None for given features; `by`: who could have
-      avoided it; `failed`: the first instant at which a predicate breaks the formula.
+      avoided it; `failed`: the first instant at which a predicate breaks the formula, or for what
+      never comes the one that decides it.
     - `avoidable_until`: the last instant with an escape, None if none was found; `no_escape_from`:
       the next instant that was tried; from it on no escape was found; `bracket`: both.
     - `proved_from`: the instant from which the failure is proved unavoidable; None without a proof.
@@ -117,13 +118,24 @@ def plot_last_chance(result: LastChance, path: str | Path | None = None) -> Figu
     figure = plot_replay(replay, signals=shown)
     end = float(np.asarray(replay.trace.clock())[-1])
     for axes, signal in zip(figure.axes, shown, strict=False):
+        style = axes.get_lines()[0].get_drawstyle()
         for escape in result.escapes[::-1]:
             trace = escape.trace.trim()
             on = np.asarray(trace.clock()) >= escape.start - 1e-9
-            line = {"color": SAFE, "linewidth": 2.0 if escape is result.escape else 0.9}
-            axes.plot(np.asarray(trace.clock())[on], np.asarray(trace.signals[signal])[on], **line)
-        axes.axvspan(*result.bracket, color=NOT_CLAIMED, alpha=0.4, linewidth=0)
+            last = escape is result.escape
+            line = {"color": SAFE, "linewidth": 2.0 if last else 0.9, "drawstyle": style}
+            values = np.asarray(trace.signals[signal])[on]
+            drawn = axes.plot(np.asarray(trace.clock())[on], values, **line)
+            earlier = "earlier escapes" if escape is result.escapes[-1] else "_"
+            drawn[0].set_label("last escape" if last else earlier)
+        if result.escape is not None:
+            span = {"color": NOT_CLAIMED, "alpha": 0.4, "linewidth": 0}
+            axes.axvspan(*result.bracket, label="last chance", **span)
         if result.proved_from is not None:
-            axes.axvspan(result.proved_from, end, color=FAILING, alpha=0.08, linewidth=0)
-    figure.supxlabel(result.headline, fontsize=8, color=SAFE, wrap=True)
+            span = {"color": FAILING, "alpha": 0.08, "linewidth": 0}
+            axes.axvspan(result.proved_from, end, label="proved unavoidable", **span)
+    handles, labels = figure.axes[0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside right upper", fontsize=7, frameon=False)
+    color = FAILING if result.escape is None else SAFE
+    figure.supxlabel(result.headline, fontsize=8, color=color, wrap=True)
     return show_or_save(figure, path)

@@ -189,7 +189,7 @@ class EscapeSearch:
             mine.waiting.append(self._distinct(instant, self.means))
 
     def _distinct(self, instant: int, controls: Controls) -> Plans:
-        """Return sequences of whole-number actions that lead to distinct states, breadth first."""
+        """Return plans of whole-number actions to distinct states, a beam of the best so far."""
         each = np.meshgrid(*[(np.arange(n) + 0.5) / n for n in controls.levels])
         each = np.stack(each, -1).reshape(-1, controls.shape[1])
         plans, width = np.zeros((1, *controls.shape)), max(self.lanes // len(each), 1)
@@ -202,12 +202,13 @@ class EscapeSearch:
             lanes = np.resize(np.arange(len(plans)), width * len(each))
             before = jax.tree.map(partial(np.take, indices=lanes // len(each), axis=0), states)
             given = np.int32(decision), before, plans[lanes, decision]
-            after = jax.tree.map(np.asarray, controls.advance(self.forks, *given))
+            after, rho = jax.tree.map(np.asarray, controls.advance(self.forks, *given))
             # The first link remembers the last action alone.
             seen = jax.tree.leaves((after[0]._replace(links=after[0].links[1:]), *after[1:]))
             rows = np.concatenate([np.reshape(leaf, (len(lanes), -1)) for leaf in seen], axis=1)
             kept = np.unique(rows[: len(plans)], axis=0, return_index=True)[1]
-            kept = self.rng.permutation(kept)[:width]
+            kept = self.rng.permutation(kept)
+            kept = kept[np.argsort(-rho[kept], kind="stable")][:width]
             plans, states = plans[kept], jax.tree.map(partial(np.take, indices=kept, axis=0), after)
         return plans, np.full(len(plans), controls.shape[0])
 
@@ -270,9 +271,9 @@ def first_proved(
     search: EscapeSearch, controls: Controls, begin: int, precision: str, seconds: float
 ) -> tuple[int | None, str]:
     """Return the earliest decision from which no action helps, None and why without a proof."""
-    end, proved, high = time.perf_counter() + seconds, None, search.count
+    end, proved, high = time.process_time() + seconds, None, search.count
     try:
-        while begin < high and time.perf_counter() < end:
+        while begin < high and time.process_time() < end:
             # What is certain from an instant is certain from all later ones.
             middle = (begin + high) // 2
             prove = _by_trying if controls.levels[0] else _by_sets
