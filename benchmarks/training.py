@@ -84,7 +84,7 @@ def rejax_trainings(count: int) -> Trainings:
 
     from envs.cartpole_task import CartPoleTask
     from verifai_jax.addons.rl import Discrete, evaluate
-    from verifai_jax.systems.policy import Policy
+    from verifai_jax.addons.rl.policy import Policy
 
     made, params = gymnax.make("CartPole-v1")
 

@@ -25,10 +25,10 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Bool, Float
 
+from verifai_jax.addons.rl.policy import Layers, Policy, load_policy, scalar_network
 from verifai_jax.core.messages.errors import unknown_name
 from verifai_jax.systems.actions import Discrete
 from verifai_jax.systems.ode import Ode, ode, sin_cos
-from verifai_jax.systems.policy import Layers, Policy, load_policy, scalar_network
 
 Features = Mapping[str, Any]
 Scalar = Float[Array, ""]

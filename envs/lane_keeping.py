@@ -27,10 +27,10 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Key
 
 from verifai_jax.addons.rl import Continuous, Policy, load_policy
+from verifai_jax.addons.rl.policy import network, scalar_network
 from verifai_jax.core.values.waveform import Waveform
 from verifai_jax.systems.ode import Ode, ode, sin_cos
 from verifai_jax.systems.ode.integrators import rk4
-from verifai_jax.systems.policy import network, scalar_network
 
 Features = Mapping[str, Any]
 Scalar = Float[Array, ""]

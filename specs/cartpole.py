@@ -12,7 +12,7 @@ length) and 0.1 kg.
 import verifai_jax as vj
 from envs import cartpole
 from envs.cartpole_drawing import draw
-from verifai_jax.systems.policy import Policy
+from verifai_jax.addons.rl.policy import Policy
 
 ON_THE_TRACK = "abs(x) <= 2.4"
 UPRIGHT = "abs(theta) <= 0.20944"

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 import verifai_jax as vj
+from verifai_jax.addons.rl.policy import Policy, save_policy
 from verifai_jax.core.store.atomic_files import append, replacing, unwritable
 from verifai_jax.pictures.style import new_figure, show_or_save
 from verifai_jax.systems.actions import Continuous
-from verifai_jax.systems.policy import Policy, save_policy
 
 
 def test_a_file_is_replaced_once_it_is_whole(tmp_path):

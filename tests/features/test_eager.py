@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 import verifai_jax as vj
+from verifai_jax.addons.rl.policy import Policy, load_policy, save_policy
 from verifai_jax.features.domain import as_real, on_device
 from verifai_jax.systems.actions import Discrete
-from verifai_jax.systems.policy import Policy, load_policy, save_policy
 
 SPACE = {
     "x": vj.Box(-1.25, 1.35),

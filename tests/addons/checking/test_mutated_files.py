@@ -12,8 +12,8 @@ from mutated import altered, flipped, wrong_answers
 import verifai_jax as vj
 from verifai_jax.addons.checking.corpus import SavedCounterexample
 from verifai_jax.addons.monitoring.requirement_files import read_requirements, write_requirements
+from verifai_jax.addons.rl.policy import Policy, load_policy, save_policy
 from verifai_jax.systems.actions import Continuous
-from verifai_jax.systems.policy import Policy, load_policy, save_policy
 
 FEW, MANY = 40, 500
 

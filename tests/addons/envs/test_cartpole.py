@@ -10,10 +10,10 @@ from envs import cartpole as cp
 from envs.cartpole_task import CartPoleTask, Episode
 from specs.cartpole import balance_with
 from verifai_jax.addons.rl import Discrete, Policy, evaluate, load_policy
+from verifai_jax.addons.rl.policy import new_layers
 from verifai_jax.core.messages.errors import UnknownNameError
 from verifai_jax.core.values.trace import Status
 from verifai_jax.evaluation.verdicts import trace_verdict
-from verifai_jax.systems.policy import new_layers
 
 KEY = jax.random.key(0)
 

@@ -10,10 +10,10 @@ from envs import lane_keeping as lk
 from envs.lane_keeping_drawing import draw
 from specs import lane_keeping as specs
 from verifai_jax.addons.rl import Continuous, Discrete, Policy, evaluate, load_policy, policy_notes
+from verifai_jax.addons.rl.policy import new_layers
 from verifai_jax.core.values.waveform import Waveform
 from verifai_jax.pictures.style import new_figure
 from verifai_jax.search import PointList
-from verifai_jax.systems.policy import new_layers
 
 KEY = jax.random.key(0)
 PROBLEMS = {name: p for name in dir(specs) if isinstance(p := getattr(specs, name), vj.Problem)}

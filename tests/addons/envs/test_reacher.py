@@ -10,9 +10,9 @@ pytest.importorskip("mujoco.mjx")
 from envs import reacher as rc
 from specs.reacher import reach, reach_with
 from verifai_jax.addons.rl import PPO, Continuous, Discrete, Policy, evaluate, train
+from verifai_jax.addons.rl.policy import new_layers
 from verifai_jax.core.messages.errors import UnknownNameError
 from verifai_jax.evaluation.verdicts import trace_verdict
-from verifai_jax.systems.policy import new_layers
 
 KEY = jax.random.key(2)
 

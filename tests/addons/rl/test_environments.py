@@ -9,12 +9,12 @@ from checked_types import unchecked
 
 from envs import cartpole as cp
 from verifai_jax.addons.rl import PPO, Continuous, Discrete, Policy, Task, train
+from verifai_jax.addons.rl.policy import new_layers
 from verifai_jax.addons.rl.task.mjx import mjx_task
 from verifai_jax.addons.rl.task.ode import ode_task
 from verifai_jax.addons.training.sweeps import Trainer
 from verifai_jax.core.messages.errors import UnknownNameError
 from verifai_jax.systems.ode import ode
-from verifai_jax.systems.policy import new_layers
 
 KEY = jax.random.key(5)
 

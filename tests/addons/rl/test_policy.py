@@ -15,8 +15,8 @@ from verifai_jax.addons.rl import (
     policy_sources,
     save_policy,
 )
+from verifai_jax.addons.rl.policy import new_layers, scalar_network
 from verifai_jax.core.messages.errors import UnknownNameError
-from verifai_jax.systems.policy import new_layers, scalar_network
 
 LAYERS = (
     (jnp.array([[1.0, -1.0], [0.5, 2.0]]), jnp.array([0.1, -0.2])),

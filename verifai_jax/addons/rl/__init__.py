@@ -14,6 +14,12 @@ if TYPE_CHECKING:
     from verifai_jax.addons.rl.algorithms import ALGORITHMS as ALGORITHMS
     from verifai_jax.addons.rl.batched_training import BatchedTraining as BatchedTraining
     from verifai_jax.addons.rl.batched_training import Configuration as Configuration
+    from verifai_jax.addons.rl.policy import Policy as Policy
+    from verifai_jax.addons.rl.policy import PolicyFileError as PolicyFileError
+    from verifai_jax.addons.rl.policy import load_policy as load_policy
+    from verifai_jax.addons.rl.policy import policy_notes as policy_notes
+    from verifai_jax.addons.rl.policy import policy_sources as policy_sources
+    from verifai_jax.addons.rl.policy import save_policy as save_policy
     from verifai_jax.addons.rl.ppo import PPO as PPO
     from verifai_jax.addons.rl.pqn import PQN as PQN
     from verifai_jax.addons.rl.sac import SAC as SAC
@@ -25,11 +31,5 @@ if TYPE_CHECKING:
     from verifai_jax.addons.rl.task.task import Task as Task
     from verifai_jax.systems.actions import Continuous as Continuous
     from verifai_jax.systems.actions import Discrete as Discrete
-    from verifai_jax.systems.policy import Policy as Policy
-    from verifai_jax.systems.policy import PolicyFileError as PolicyFileError
-    from verifai_jax.systems.policy import load_policy as load_policy
-    from verifai_jax.systems.policy import policy_notes as policy_notes
-    from verifai_jax.systems.policy import policy_sources as policy_sources
-    from verifai_jax.systems.policy import save_policy as save_policy
 # Imported when first used: a folder inside needs few of these names.
 __getattr__, __dir__, __all__ = attach(__name__)

@@ -17,12 +17,12 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
 from verifai_jax.addons.rl.batched_training import StaticTask, numbers_of
+from verifai_jax.addons.rl.policy import Policy
 from verifai_jax.addons.rl.task.task import State, Task
 from verifai_jax.core.compute.compilation import jit_each
 from verifai_jax.core.compute.devices import Device, enable_compile_cache, spread_over_devices
 from verifai_jax.core.compute.keys import IMPLEMENTATION
 from verifai_jax.core.display.progress import shows_progress
-from verifai_jax.systems.policy import Policy
 
 POLICIES_PER_DEVICE = 8
 """Policies that a device simulates at a time."""

@@ -15,11 +15,11 @@ from jaxtyping import Float, Int
 
 from verifai_jax.addons.rl.algorithm import Algorithm
 from verifai_jax.addons.rl.batched_training import BatchedTraining, Configuration
+from verifai_jax.addons.rl.policy import Policy
 from verifai_jax.addons.rl.ppo import PPO
 from verifai_jax.addons.rl.task.task import Task
 from verifai_jax.core.display.progress import say_done, shows_progress
 from verifai_jax.core.user_code.callbacks import Callback, check_callbacks, notify
-from verifai_jax.systems.policy import Policy
 
 
 class Checkpoint(NamedTuple):

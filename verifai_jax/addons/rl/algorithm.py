@@ -17,8 +17,8 @@ from typing import Any, ClassVar, NamedTuple, Protocol, TypeAlias, TypeVar, runt
 
 from jaxtyping import Array, Float, Int, Key, Num, PyTree
 
+from verifai_jax.addons.rl.policy import ACTIVATIONS, Policy
 from verifai_jax.addons.rl.task.task import Task
-from verifai_jax.systems.policy import ACTIVATIONS, Policy
 
 T = TypeVar("T")
 Number = Num[Array, ""] | float | int

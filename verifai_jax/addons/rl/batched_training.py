@@ -25,6 +25,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Int, Integer, Key, PyTree
 
 from verifai_jax.addons.rl.algorithm import Algorithm, AlgorithmState, check_fit
+from verifai_jax.addons.rl.policy import Policy
 from verifai_jax.addons.rl.task.task import Task
 from verifai_jax.core.compute.compilation import KEPT, jit_each, known_options, power_of_two
 from verifai_jax.core.compute.devices import (
@@ -33,7 +34,6 @@ from verifai_jax.core.compute.devices import (
     split_sharding,
     spread_over_devices,
 )
-from verifai_jax.systems.policy import Policy
 
 RUNS_PER_ACCELERATOR = 64
 """Training runs under one `vmap` on an accelerator; a CPU core is busy with one."""

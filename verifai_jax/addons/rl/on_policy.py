@@ -12,7 +12,7 @@ from jaxtyping import Array, Float, Int, Key, PyTree
 
 from verifai_jax.addons.rl.algorithm import Number
 from verifai_jax.addons.rl.optimizer import Optimizer
-from verifai_jax.systems.policy import ACTIVATIONS, Layers
+from verifai_jax.addons.rl.policy import ACTIVATIONS, Layers
 
 Weights = TypeVar("Weights")
 Batch = TypeVar("Batch")

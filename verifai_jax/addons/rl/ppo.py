@@ -33,9 +33,9 @@ from verifai_jax.addons.rl.observations import (
 )
 from verifai_jax.addons.rl.on_policy import minibatch_epochs, minibatch_network
 from verifai_jax.addons.rl.optimizer import adam, annealed
+from verifai_jax.addons.rl.policy import Layers, Policy, network, new_layers, scale_to_range
 from verifai_jax.addons.rl.task.task import Task
 from verifai_jax.systems.actions import Action, Continuous, Discrete
-from verifai_jax.systems.policy import Layers, Policy, network, new_layers, scale_to_range
 
 
 @jax.tree_util.register_dataclass

@@ -38,9 +38,9 @@ from verifai_jax.addons.rl.observations import (
 )
 from verifai_jax.addons.rl.on_policy import minibatch_epochs, minibatch_network
 from verifai_jax.addons.rl.optimizer import adam, annealed
+from verifai_jax.addons.rl.policy import Layers, Policy, network, new_layers
 from verifai_jax.addons.rl.task.task import Task
 from verifai_jax.systems.actions import Discrete
-from verifai_jax.systems.policy import Layers, Policy, network, new_layers
 
 
 @jax.tree_util.register_dataclass

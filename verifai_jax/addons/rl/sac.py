@@ -27,6 +27,13 @@ from verifai_jax.addons.rl.observations import (
     update,
 )
 from verifai_jax.addons.rl.optimizer import adam, annealed
+from verifai_jax.addons.rl.policy import (
+    Layers,
+    Policy,
+    network,
+    new_layers,
+    scale_to_range,
+)
 from verifai_jax.addons.rl.replay_buffer import (
     ReplayBuffer,
     StoredTransitions,
@@ -36,13 +43,6 @@ from verifai_jax.addons.rl.replay_buffer import (
 )
 from verifai_jax.addons.rl.task.task import Task
 from verifai_jax.systems.actions import Continuous
-from verifai_jax.systems.policy import (
-    Layers,
-    Policy,
-    network,
-    new_layers,
-    scale_to_range,
-)
 
 LOG_STD = (-10.0, 2.0)
 """Bounds of the logarithm of the deviation.

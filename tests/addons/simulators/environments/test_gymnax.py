@@ -9,11 +9,11 @@ import pytest
 import verifai_jax as vj
 from envs import cartpole as cp
 from verifai_jax.addons.rl import Continuous, Discrete, Policy, load_policy
+from verifai_jax.addons.rl.policy import new_layers
 from verifai_jax.addons.simulators.environments.episode import episode_keys
 from verifai_jax.core.messages.errors import MissingExtra, UnknownNameError
 from verifai_jax.core.values.trace import Status
 from verifai_jax.core.values.waveform import Waveform
-from verifai_jax.systems.policy import new_layers
 from verifai_jax.testing import check_forks, check_system
 
 package = pytest.importorskip("gymnax")

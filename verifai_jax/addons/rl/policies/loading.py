@@ -34,13 +34,13 @@ from verifai_jax.addons.rl.policies.tensors import (
     normalisers,
 )
 from verifai_jax.addons.rl.policies.torch_archive import read_state, widened
+from verifai_jax.addons.rl.policy import Policy as OwnPolicy
+from verifai_jax.addons.rl.policy import load_policy
 from verifai_jax.core.compute.fingerprint import used_inputs
 from verifai_jax.core.messages.checks import check_count
 from verifai_jax.core.messages.errors import require, suggests_options
 from verifai_jax.core.store.foreign_archives import read_arrays
 from verifai_jax.core.store.foreign_files import ForeignFileError, read_bytes
-from verifai_jax.systems.policy import Policy as OwnPolicy
-from verifai_jax.systems.policy import load_policy
 
 log = logging.getLogger("verifai_jax.policies")
 Network = Callable[[dict[str, Array], PyTree], PyTree]

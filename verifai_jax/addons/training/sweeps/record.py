@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float, Int, Shaped
 
 from verifai_jax.addons.rl.policies import Policy as LoadedPolicy
-from verifai_jax.systems.policy import Policy
+from verifai_jax.addons.rl.policy import Policy
 
 if TYPE_CHECKING:
     from verifai_jax.addons.estimation.certification.result import Certificates

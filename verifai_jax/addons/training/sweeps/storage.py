@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from verifai_jax.addons.rl.policies import policy as load
+from verifai_jax.addons.rl.policy import Policy, save_policy
 from verifai_jax.addons.training.sweeps.record import Curve, SweepRecord, TrainedPolicy
 from verifai_jax.core.messages.text import one_line
 from verifai_jax.core.store import files
@@ -29,7 +30,6 @@ from verifai_jax.core.store.locks import settled, write_lock
 from verifai_jax.core.store.replacements import replacing_all
 from verifai_jax.core.user_code.sources import Sources
 from verifai_jax.features import FeatureSpace
-from verifai_jax.systems.policy import Policy, save_policy
 
 if TYPE_CHECKING:
     import pandas as pd

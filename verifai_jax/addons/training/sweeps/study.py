@@ -15,6 +15,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
+from verifai_jax.addons.rl.policy import Policy
 from verifai_jax.addons.training.sweeps.curves import check_curve
 from verifai_jax.addons.training.sweeps.hyperparameters import probe_values
 from verifai_jax.addons.training.sweeps.trainer import STEPS, StudyError, Trainer
@@ -27,7 +28,6 @@ from verifai_jax.features import FeatureSpace
 from verifai_jax.features.domain import Domain
 from verifai_jax.mtl import Formula
 from verifai_jax.problem.problem import Problem, ProblemError
-from verifai_jax.systems.policy import Policy
 
 
 @dataclass(frozen=True, eq=False, init=False)

@@ -22,13 +22,13 @@ from verifai_jax.addons.rl import algorithms
 from verifai_jax.addons.rl.algorithm import Algorithm
 from verifai_jax.addons.rl.batched_training import Configuration, untrained_policy
 from verifai_jax.addons.rl.policies import policy as load
+from verifai_jax.addons.rl.policy import Policy
 from verifai_jax.addons.rl.ppo import PPO
 from verifai_jax.addons.rl.task.task import Task
 from verifai_jax.addons.training.sweeps.hyperparameters import companions, probe_values
 from verifai_jax.core.messages.checks import check_count, check_positive, is_number
 from verifai_jax.core.messages.errors import unknown_name
 from verifai_jax.features import FeatureSpace
-from verifai_jax.systems.policy import Policy
 
 ALGORITHM, STEPS, WIDTH = "algorithm", "steps", "width"
 """Hyper-parameters that are no fields of an algorithm or a task."""

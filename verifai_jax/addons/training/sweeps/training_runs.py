@@ -24,6 +24,7 @@ from verifai_jax.addons.rl.batched_training import (
     policy_structure,
     untrained_policy,
 )
+from verifai_jax.addons.rl.policy import Policy
 from verifai_jax.addons.training.sweeps.clock import Clock, OutOfTime
 from verifai_jax.addons.training.sweeps.fingerprint import digest
 from verifai_jax.addons.training.sweeps.hyperparameters import Hyperparameters
@@ -32,7 +33,6 @@ from verifai_jax.addons.training.sweeps.study import Study
 from verifai_jax.core.compute.executors import Executor
 from verifai_jax.core.store.cache import Cache, CacheError
 from verifai_jax.core.store.log import Arrays
-from verifai_jax.systems.policy import Policy
 
 RECENT = 0.1
 """Share of the updates so far, the last ones, whose mean is the training return."""
