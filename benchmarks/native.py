@@ -156,7 +156,7 @@ def by_hand(rounds, n=1_048_576):
         "native engine": lambda: timed(engine),
         "falsify(uniform)": run,
         "falsify(uniform), confirm=False": lambda: run(confirm=False),
-        "falsify(uniform), engine='xla'": lambda: run(engine="xla"),
+        "falsify(uniform), engine='xla'": lambda: run(run_on=vj.RunOn(engine="xla")),
     }
     c()
     for side in sides.values():
@@ -203,8 +203,9 @@ if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("systems", nargs="*", choices=[*SYSTEMS, []], help="all when left out")
     parser.add_argument("--rounds", type=int, default=5)
+    parser.add_argument("--rows", type=int, default=1_048_576, help="of the cart-pole by hand")
     options = parser.parse_args()
-    by_hand(options.rounds)
+    by_hand(options.rounds, options.rows)
     beside_blas(options.rounds)
     for name in options.systems or SYSTEMS:
         print(name)
