@@ -45,6 +45,7 @@ from verifai_jax.core.compute.cores import available_cores
 from verifai_jax.core.compute.executors import Executor
 from verifai_jax.core.messages.text import format_error, one_line
 from verifai_jax.core.store.cache import Cache
+from verifai_jax.core.store.foreign_files import read_text
 from verifai_jax.core.store.log import Arrays
 from verifai_jax.core.values.trace import Status, Trace
 from verifai_jax.systems.blackbox.workers import Pool
@@ -321,8 +322,8 @@ class _Reports:
 def reported_steps(folder: Path) -> int:
     """Return the steps that a training with this folder has reported; 0 before the first."""
     try:
-        return int(folder.with_suffix(".steps").read_text() or 0)
-    except OSError:
+        return int(read_text(folder.with_suffix(".steps")) or 0)
+    except (OSError, ValueError):
         return 0
 
 
