@@ -38,7 +38,7 @@ import verifai_jax as vj
 from benchmarks.seeds import first_failures
 from verifai_jax.core.user_code.targets import load_target
 from verifai_jax.core.values.cube import Cube
-from verifai_jax.search import kinds, portfolio
+from verifai_jax.search import kinds, portfolio, surrogate
 from verifai_jax.search.search_program import compiled_search
 
 BATCH = {"uniform": 512, "halton": 512, "gradient": 8, "bayes": 8}
@@ -350,12 +350,21 @@ CONSTANTS = {
     "PRIOR_COSTS": (2.0, 8.0),
     "DISCOUNT": (0.95, 0.99),
     "MIN_SHARE": (0.02, 0.1),
-    "IN_VAIN": (1, 6),
-    "OPENING": (6, 12),
+    "IN_VAIN": (3, 12),
+    "OPENING": (4, 12),
+    "OPENING_ROWS": (10, 40),
+    "MODELLED": (0.6, 0.95),
     "AMONG": (2, 8),
     "TAKEN": (8,),
 }
 """Other values of the numbers of the default search."""
+OF_MODELS = {
+    "CAPACITY": (64, 256),
+    "ENOUGH": (4, 16),
+    "EVENLY": (0.05, 0.2),
+    "PATIENCE": (40, 160),
+}
+"""And of its models."""
 
 
 def on_constants(options):
@@ -372,14 +381,16 @@ def on_constants(options):
 
     usual = medians()
     print("as they are", usual, flush=True)
-    for name, values in CONSTANTS.items():
-        chosen = getattr(portfolio, name)
+    numbers = [(portfolio, name, values) for name, values in CONSTANTS.items()]
+    numbers += [(surrogate, name, values) for name, values in OF_MODELS.items()]
+    for module, name, values in numbers:
+        chosen = getattr(module, name)
         for value in values:
-            setattr(portfolio, name, value)
+            setattr(module, name, value)
             found = medians()
             ratio = np.exp(np.mean(np.log(found / usual)))
             print(f"{name} {value} instead of {chosen}: {ratio:.2f}", found, flush=True)
-        setattr(portfolio, name, chosen)
+        setattr(module, name, chosen)
 
 
 CASES = {

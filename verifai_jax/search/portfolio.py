@@ -1,11 +1,11 @@
 """A portfolio of searches that share their observations, with a budget that follows success.
 
 The members are complementary: gradients of clauses lead to corners and to points where clauses are
-equal, mutations need few simulations and no gradients, and cross-entropy fills the region of
-failures in large batches. A bandit divides the simulations: a member's share follows the discounted
-rate at which its points are among the best so far, with a small minimum; a member whose gradients
-are zero or not finite drops to that minimum at once. In large rounds the bandit only decides
-between descents and the other two. All members learn from every point, and descents start equally
+equal, models of the robustness (`surrogate`) say in small rounds which point is worth a simulation,
+mutations work on rough landscapes, and cross-entropy fills the region of failures in large batches.
+A bandit divides the simulations between descents and the others: the share of descents follows the
+discounted rate at which points are among the best so far, with a small minimum; where gradients are
+zero or not finite it drops at once. All members learn from every point, and descents start equally
 often from the best points and from new ones.
 
 Once a region of failures is described, all members look for failures elsewhere (`kinds`).
@@ -43,9 +43,10 @@ from verifai_jax.search.descent import (
 from verifai_jax.search.gradient import Gradient, GradientState
 from verifai_jax.search.kinds import ENOUGH, Kinds
 from verifai_jax.search.mutation import FEW, Mutation, MutationState
+from verifai_jax.search.surrogate import CHOICES, MAX_DIM, Surrogate
 from verifai_jax.search.wrapper import Wrapper
 
-GRADIENT, MUTATION, CROSS_ENTROPY = range(3)  # numbers of the members
+GRADIENT, MUTATION, CROSS_ENTROPY, MODEL = range(4)  # numbers of the members
 # The numbers before `PATIENT` were chosen by hand. About halved and doubled they took 0.87 to 1.2
 # times as many simulations on four problems (`search_quality.py constants`); the one that took 0.87
 # took more on others. `PATIENT` was not varied, and what follows says its own.
@@ -60,22 +61,22 @@ LESS_PATIENT = 1
 """The same once a kind of failure is described: of eight wells in four and six dimensions it found
 7.8 and 6.7 in the mean, with four rounds 7.4 and 6.2 (`benchmarks/RESULTS.md`)."""
 FILLED = 8
-"""Batch from which on cross-entropy has nine tenths of what it and mutations have, whatever gains
-say: those of mutations are small ones, near what is known, and there are none where the best points
-are equally good. By gains five problems of choices, numbers and plateaus took 1.07 to 1.23 times
-as many simulations, without gradients and in batches of 16, and with a fifth up to 1.5 times as
-many. Signals are left to the gains, as mutations know their shape: with nine tenths NN of the ARCH
-competition took 1.2 times as many. So are descents among numbers alone: the landscape of ripples
-took 1.07 times as many. In rounds of one simulation cross-entropy draws from the prior alone, and
-has a fifth until there is evidence."""
-IN_VAIN = 3
-"""Power of the share of coordinates that descents can move with which they count, and their gains.
-Without a factor on the gains they got on as long as the numbers alone can: five problems of choices
-and numbers took 1.03 to 1.4 times as many simulations."""
+"""Batch from which on cross-entropy has nine tenths of what mutations and it have; in rounds of one
+simulation, in which it draws from the prior alone, it has a fifth. Shares by gains drifted to
+mutations, whose gains are small: five problems took up to 1.5 times as many simulations."""
+MODELLED = 0.8
+"""Share of the models of what descents leave in small rounds, chosen by hand. By gains, of which
+the first few are luck, the other two get half of it after one round."""
+IN_VAIN = 6
+"""Power of the share of coordinates that descents can move with which their gains count: the models
+know what choices do. With 3 the medians of `menu`, `recipe`, `mixed` and `cruise` were 1.2 to 1.4
+times as high (`benchmarks/RESULTS.md`)."""
 OPENING = 6
-"""Descents before the budget is shared by evidence. With two instead, SB3 to SB5 together took 0.99
-times as many simulations; with twelve, and one of four with the whole cube, the
-landscape of ripples cost half as much again (`benchmarks/RESULTS.md`)."""
+"""Descents before the budget is shared by evidence, and before one starts from the best points."""
+OPENING_ROWS = 20
+"""Simulations after which the budget is shared by evidence at the latest: in rounds of 16 a slope
+of four descents each, and their first jumps. Without a limit, and with the models, the landscape of
+ripples took 370 simulations instead of 80, with that of four descents 215."""
 MOSTLY = 0.75
 """Share of coordinates that descents can move from which on some descents go first. Where a fifth
 of the coordinates or fewer are choices three problems took 0.36, 0.41 and 0.88 times as many
@@ -94,6 +95,7 @@ class PortfolioState(NamedTuple):
     gradient: GradientState | None
     mutation: MutationState
     cross_entropy: CrossEntropyState
+    model: Surrogate | None
     credit: Float[Array, " members"]  # simulations that each may still spend
     gains: Float[Array, " members"]
     costs: Float[Array, " members"]
@@ -108,7 +110,7 @@ class PortfolioState(NamedTuple):
 
 @dataclass(frozen=True)
 class Portfolio(Search[PortfolioState]):
-    """Gradient, mutations and cross-entropy together, sharing the budget by success; no tuning.
+    """Gradients, models, mutations and cross-entropy, sharing the budget by success; no tuning.
 
     **Arguments:**
     - `gradients`: whether to use gradients of the robustness. They are left out automatically if
@@ -151,7 +153,13 @@ class Portfolio(Search[PortfolioState]):
         descents, others = PRIOR_GAINS
         descents *= min(1.0, cube.dim / FEW)
         fitted = np.clip(batch / FILLED, 0.2, 0.9)
-        return np.array([descents, (1 - fitted) * others, fitted * others], np.float32)
+        modelled = MODELLED if self._models(cube, batch) else 0.0
+        shares = np.array([1 - fitted, fitted])
+        gains = [descents, *((1 - modelled) * others * shares), modelled * others]
+        return np.array(gains, np.float32)
+
+    def _models(self, cube: Cube, batch: int) -> bool:
+        return 0 < cube.dim <= MAX_DIM and batch <= MANY
 
     def init(self, key: Key[Array, ""], cube: Cube, batch: int) -> PortfolioState:
         keys = jax.random.split(key, 3)
@@ -163,10 +171,11 @@ class Portfolio(Search[PortfolioState]):
             gradient=gradient,
             mutation=Mutation().init(keys[1], cube, batch),
             cross_entropy=self._cross_entropy(batch).init(keys[2], cube, batch),
-            credit=jnp.zeros(3, jnp.float32),
+            model=Surrogate.nothing(cube.dim) if self._models(cube, batch) else None,
+            credit=jnp.zeros(4, jnp.float32),
             gains=jnp.asarray(self._prior_gains(cube, batch)),
-            costs=jnp.full(3, PRIOR_COSTS, jnp.float32),
-            rows=jnp.zeros(3, jnp.int32),
+            costs=jnp.full(4, PRIOR_COSTS, jnp.float32),
+            rows=jnp.zeros(4, jnp.int32),
             differentiates=jnp.array(False),
             opening=jnp.array(False),
             taken=jnp.full((TAKEN, cube.dim), jnp.inf, jnp.float32),
@@ -211,8 +220,7 @@ class Portfolio(Search[PortfolioState]):
                 # That from the middle of the cube goes before all.
                 opening = gradient.starts <= max(OPENING, len(gradient.fresh))
                 opening &= gradient.useless == 0
-                if cube.dim < FEW:
-                    opening &= state.barren < FEW * cube.dim
+                opening &= state.barren < min(OPENING_ROWS, FEW * cube.dim)
                 turn = opening | (credit[GRADIENT] >= 1)
             differentiates = plan.differentiate & turn
             allowed = jnp.where(opening, batch, jnp.floor(credit[GRADIENT]).astype(jnp.int32))
@@ -222,24 +230,44 @@ class Portfolio(Search[PortfolioState]):
         others = jnp.where(differentiates, 0, batch - descents)
         draws = jnp.minimum(jnp.floor(credit[CROSS_ENTROPY]).astype(jnp.int32), others)
         draws = jnp.maximum(draws, 0)
-        rows = jnp.stack([descents, others - draws, draws]).astype(jnp.int32)
+        # What no other takes is of the models, or of mutations where there are none.
+        rest = others - draws
+        mutations = jnp.clip(jnp.floor(credit[MUTATION]).astype(jnp.int32), 0, rest)
+        mutations = rest if before.model is None else mutations
+        rows = jnp.stack([descents, mutations, draws, rest - mutations]).astype(jnp.int32)
         member = self._members(rows, batch)[:, None]
         # The last of a batch of cross-entropy explore, which mutations do already.
         drawn = jnp.roll(drawn, batch - draws, axis=0)
         u = jnp.where(
             member == GRADIENT, points, jnp.where(member == CROSS_ENTROPY, drawn, mutated)
         )
+        if before.model is not None:
+            u = jnp.where(member == MODEL, self._modelled(before, cube, batch, rows[MODEL]), u)
         state = state._replace(rows=rows, differentiates=differentiates, opening=opening)
         if before.interior is None:
             return u, state
         points, descents = propose(before.interior, cube, batch)
         # At their turn the others have not been asked.
         none = before._replace(
-            rows=jnp.zeros(3, jnp.int32), differentiates=jnp.array(True), opening=jnp.array(False),
+            rows=jnp.zeros(4, jnp.int32), differentiates=jnp.array(True), opening=jnp.array(False),
             interior=descents,
         )  # fmt: skip
         state = choose(descents.turn, none, state._replace(interior=descents))
         return jnp.where(descents.turn, points, u), state
+
+    def _modelled(
+        self, state: PortfolioState, cube: Cube, batch: int, rows: Int[Array, ""]
+    ) -> Float[Array, "batch d"]:
+        model = state.model
+        assert model is not None
+        key = jax.random.fold_in(state.key, state.mutation.round)
+
+        def propose() -> Float[Array, "batch d"]:
+            others, _ = Mutation().ask(state.mutation._replace(key=key), cube, CHOICES * 2 // 3)
+            return model.propose(key, cube, batch, others, state.mutation.stale)
+
+        nothing = jnp.full((batch, cube.dim), 0.5, jnp.float32)
+        return jax.lax.cond(rows > 0, propose, lambda: nothing)
 
     def plan(self, state: PortfolioState, cube: Cube, batch: int) -> Plan:
         if state.gradient is None:
@@ -295,11 +323,13 @@ class Portfolio(Search[PortfolioState]):
             return points[order], score[order]
 
         mutation, fitted, zero = state.mutation, state.cross_entropy, jnp.int32(0)
+        model = None if state.model is None else Surrogate(*others(*state.model))
         points, score = others(mutation.points, mutation.score)
         elite, level = others(fitted.elite, fitted.score)
         left = state._replace(
             mutation=mutation._replace(points=points, score=score, verdicts=zero, stale=zero),
             cross_entropy=fitted._replace(elite=elite, score=level, stale=zero),
+            model=model,
         )
         return choose(jnp.any(new), left, state)._replace(kinds=kinds), common
 
@@ -317,7 +347,7 @@ class Portfolio(Search[PortfolioState]):
             limit = jnp.where(member == GRADIENT, state.mutation.score[0], limit)
         gained = known & ((common.score < limit) | (common.score == 0)) & common.usable
         proposed = jnp.arange(batch) < jnp.sum(state.rows)
-        is_member = (member[None] == jnp.arange(3)[:, None]) & proposed[None]
+        is_member = (member[None] == jnp.arange(4)[:, None]) & proposed[None]
         spent = jnp.sum(is_member, axis=1) * jnp.where(state.differentiates, 2.0, 1.0)
         total = jnp.sum(spent)
         kept = DISCOUNT**total
@@ -327,19 +357,20 @@ class Portfolio(Search[PortfolioState]):
         mutation = Mutation().tell(state.mutation, cube, common)
         # Boxes of several sizes around a point are one gain.
         descents = batch if state.gradient is None else len(state.gradient.fresh)
-        limits = np.array([descents, batch, batch])
+        limits = np.array([descents, batch, batch, batch])
         # Mutations begin when enough is explored, whatever descents have seen.
         descended = jnp.sum(common.usable & is_member[GRADIENT]).astype(jnp.int32)
         state = state._replace(
             mutation=mutation._replace(verdicts=jnp.maximum(mutation.verdicts - descended, 0)),
             cross_entropy=self._cross_entropy(batch).tell(state.cross_entropy, cube, common),
+            model=None if state.model is None else state.model.learned(common.u, common.score),
             # What it gains while it goes first says nothing about what it will.
             gains=jnp.where(
-                state.opening,
+                state.opening | ~known,
                 state.gains,
                 kept * state.gains + jnp.minimum(jnp.sum(is_member & gained[None], axis=1), limits),
             ),
-            costs=jnp.where(state.opening, state.costs, kept * state.costs + spent),
+            costs=jnp.where(state.opening | ~known, state.costs, kept * state.costs + spent),
             # Nobody saves, or owes, more than a few rounds.
             credit=jnp.clip(credit, -4.0 * batch, 4.0 * batch).astype(jnp.float32),
         )
@@ -380,7 +411,9 @@ class Portfolio(Search[PortfolioState]):
         if gradient is not None:
             gradient = self._gradient(cube).warm_start(gradient, cube, common)
         ce = self._cross_entropy(len(observations.rho))
+        model = None if state.model is None else state.model.learned(common.u, common.score)
         return state._replace(
+            model=model,
             gradient=gradient,
             mutation=Mutation().tell(state.mutation, cube, common),
             cross_entropy=ce.tell(state.cross_entropy, cube, common),
@@ -392,25 +425,24 @@ class Portfolio(Search[PortfolioState]):
         # Descents move the continuous coordinates alone, and are in vain where a choice is wrong.
         moved = len(cube.continuous) / max(cube.dim, 1)
         rate = rate.astype(jnp.float32).at[GRADIENT].multiply(moved**IN_VAIN)
-        descends = state.gradient is not None and not len(cube.discrete)
-        if batch >= FILLED and not (descends or cube.signals):
-            mutated, fitted = prior[MUTATION:] / np.sum(prior[MUTATION:])
-            both = rate[MUTATION] + rate[CROSS_ENTROPY]
-            rate = jnp.stack([rate[GRADIENT], mutated * both, fitted * both])
+        others = prior[MUTATION:]
+        rate = rate.at[MUTATION:].set(others / np.sum(others) * jnp.sum(rate[MUTATION:]))
         if state.gradient is None:
             dead, smallest = jnp.array(True), 0.0
         else:
             dead = state.gradient.useless >= 2
             smallest = jnp.where(dead, 0.02, MIN_SHARE)
         rate = rate.at[GRADIENT].multiply(jnp.where(dead, 0.0, 1.0))
-        min_share = jnp.full(3, MIN_SHARE, jnp.float32).at[GRADIENT].set(smallest)
+        min_share = jnp.full(4, MIN_SHARE, jnp.float32).at[GRADIENT].set(smallest)
+        if state.model is None:
+            rate, min_share = rate.at[MODEL].set(0.0), min_share.at[MODEL].set(0.0)
         share = rate / jnp.maximum(jnp.sum(rate), 1e-9)
         share = jnp.maximum(share, min_share)
         return (share / jnp.sum(share)).astype(jnp.float32)
 
     def _members(self, rows: Int[Array, " members"], batch: int) -> Int[Array, " batch"]:
         row = jnp.arange(batch)
-        return (row >= rows[0]).astype(jnp.int32) + (row >= rows[0] + rows[1])
+        return jnp.sum(row[:, None] >= jnp.cumsum(rows[:-1]), axis=1).astype(jnp.int32)
 
 
 @dataclass(frozen=True)
