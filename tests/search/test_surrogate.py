@@ -11,8 +11,8 @@ from verifai_jax.search.surrogate import (
     NOISES,
     NUGGETS,
     Surrogate,
-    _places,
-    _target,
+    positions,
+    targets,
 )
 
 CUBE = Cube((0, 0, 3), weights=(None, None, (0.1, 0.2, 0.7)), ordered=(True, True, False))
@@ -38,7 +38,7 @@ def test_the_mean_of_the_additive_model_is_that_of_ridge_regression():
     u, score = rows()
     model = Surrogate.nothing(3).learned(u, score)
     there = jnp.isfinite(model.score)
-    y = _target(model.score, there)
+    y = targets(model.score, there)
     nothing = jnp.zeros((1, 2 * 2 + 3)), jnp.zeros((1, CAPACITY))
     found = np.asarray(model._minima(CUBE, y, there, *nothing))[0]
     # Regression in NumPy; the columns are a line and a parabola of each number, and the cells.
@@ -58,7 +58,7 @@ def test_the_process_chooses_the_lowest_bound():
     u, score = rows()
     model = Surrogate.nothing(3).learned(u, score)
     there = jnp.isfinite(model.score)
-    y = _target(model.score, there)
+    y = targets(model.score, there)
     choices = np.random.default_rng(1).random((60, 3), np.float32)
     optimism = np.array([[0.0], [0.5], [3.0], [30.0]], np.float32)
     found = model._lowest(CUBE, y, there, jnp.asarray(choices), jnp.asarray(optimism))
@@ -74,7 +74,7 @@ def test_the_process_chooses_the_lowest_bound():
 
     known, y = np.asarray(model.u[:40]), np.asarray(y[:40], float)
     np.testing.assert_allclose(
-        np.linalg.norm(_places(known, CUBE)[0] - _places(known, CUBE)[1]),
+        np.linalg.norm(positions(known, CUBE)[0] - positions(known, CUBE)[1]),
         apart(known[:1], known[1:2])[0, 0], rtol=1e-5,
     )  # fmt: skip
     options = [(length, nugget) for length in LENGTHS for nugget in NUGGETS]

@@ -88,7 +88,7 @@ class Surrogate(NamedTuple):
         spread = jnp.max(self.score, where=there, initial=0.0) > jnp.min(self.score)
 
         def modelled() -> Float[Array, "batch d"]:
-            y = _target(self.score, there)
+            y = targets(self.score, there)
             normal = standard_normal(weights), standard_normal(noises)
             drawn = self._minima(cube, y, there, *normal)
             choices = jnp.concatenate([shared.reshape(-1, d), others])
@@ -130,11 +130,11 @@ class Surrogate(NamedTuple):
         choices: Float[Array, "m d"], optimism: Float[Array, "batch 1"],
     ) -> Float[Array, "batch d"]:  # fmt: skip
         """Return for each factor the choice with the lowest bound of the process."""
-        known, options = _places(self.u, cube), np.array(list(product(LENGTHS, NUGGETS)))
+        known, options = positions(self.u, cube), np.array(list(product(LENGTHS, NUGGETS)))
         lengths, nuggets = jnp.asarray(options.T[:, :, None, None], jnp.float32)
         values = jnp.where(there[:, None] & there, _matern(known, known, lengths), 0.0)
         best, factor, half = _fit(values, nuggets[:, 0], y, there)
-        cross = _matern(known, _places(choices, cube), lengths[best])
+        cross = _matern(known, positions(choices, cube), lengths[best])
         cross = solve_triangular(factor, jnp.where(there[:, None], cross, 0.0), lower=True)
         scale = half @ half / jnp.sum(there)
         std = jnp.sqrt(scale * jnp.maximum(1 - jnp.sum(cross**2, axis=0), 0.0))
@@ -183,21 +183,21 @@ def _features(u: Float[Array, "n d"], cube: Cube) -> Float[Array, "n p"]:
     return jnp.concatenate([line, line**2 - 1 / 3, *effects], axis=1)
 
 
-def _places(u: Float[Array, "n d"], cube: Cube) -> Float[Array, "n places"]:
+def positions(u: Float[Array, "n d"], cube: Cube) -> Float[Array, "n p"]:
     """Return points at root mean square distances over the coordinates; choices differ by 1."""
     chosen = [each / np.sqrt(2, dtype=np.float32) for each in _chosen(u, cube)]
-    places = jnp.concatenate([u[:, np.array(_parts(cube)[1], int)], *chosen], axis=1)
-    return places / np.sqrt(cube.dim, dtype=np.float32)
+    joined = jnp.concatenate([u[:, np.array(_parts(cube)[1], int)], *chosen], axis=1)
+    return joined / np.sqrt(cube.dim, dtype=np.float32)
 
 
 def _matern(one: Float[Array, "n p"], two: Float[Array, "m p"], length: Array) -> Array:
-    """Return the covariance of Matern with 5/2 between places."""
+    """Return the covariance of Matern with 5/2 between positions."""
     square = jnp.sum(one**2, axis=1)[:, None] + jnp.sum(two**2, axis=1) - 2 * one @ two.T
     r = jnp.sqrt(5 * jnp.maximum(square, 0.0)) / length
     return (1 + r + r**2 / 3) * jnp.exp(-r)
 
 
-def _target(score: Float[Array, " n"], there: Bool[Array, " n"]) -> Float[Array, " n"]:
+def targets(score: Float[Array, " n"], there: Bool[Array, " n"]) -> Float[Array, " n"]:
     """Return what the models learn: the logarithm of the robustness in quartiles, of mean 0."""
     positive = jnp.sort(jnp.where(there & (score > 0), score, jnp.inf))
     quartile = positive[jnp.sum(jnp.isfinite(positive)) // 4]
