@@ -77,7 +77,10 @@ def prove_around(
         far = np.ceil((point + size / 2) / NARROWEST) * NARROWEST
         begin = np.where(chosen, np.maximum(np.maximum(near, first), 0), low)
         stop = np.where(chosen, np.minimum(np.minimum(far, last), 1), high)
-        work.boxes = whole.within(begin, stop)
+        # The intersections of the boxes with the box between the two corners, as open boxes.
+        lower, upper = np.maximum(whole.low, begin), np.minimum(whole.high, stop)
+        some = (lower < upper).all(axis=1)
+        work.boxes = Boxes.between(lower[some], upper[some], whole.inside[some])
         hope = _Hope(begin, stop, point, chosen)
         work.wanted, pause = hope.touches, (end - now) / (2 * SLICES)
         for i in range(SLICES):
