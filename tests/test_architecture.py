@@ -303,7 +303,7 @@ def asked_of(source: str, room: str, kinds: set[str]) -> list[str]:
     return asked
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_nobody_outside_of_its_room_asks_for_the_class_of_a_formula_a_domain_or_a_search():
     wrong = []
     for room, bases in KINDS.items():

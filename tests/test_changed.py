@@ -6,7 +6,7 @@ from changed import importers, paths_for
 LAWS = ["tests/test_architecture.py", "tests/test_language.py", "tests/test_public_names.py"]
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_a_file_calls_for_its_room_and_for_those_that_import_it():
     found = paths_for(["verifai_jax/pictures/replay.py"])
     assert {"tests/addons/reports", "tests/cli", "tests/pictures", *LAWS} <= set(found)

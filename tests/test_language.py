@@ -89,7 +89,7 @@ def shadowed(package: Path) -> Iterator[tuple[str, str]]:
             yield from [(f"{here}.{node.name}", here)] * exists
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_first_words(package):
     wrong = [
         f"{file}:{line} {text}"
@@ -176,7 +176,7 @@ def is_dialect(name: str) -> bool:
     return name not in USUAL and bool(DIALECT & set(name.lower().split("_")))
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_names_are_plain_english(package):
     wrong = [str(file) for file in FILES if is_dialect(file.stem)]
     wrong += [

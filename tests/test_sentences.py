@@ -54,7 +54,7 @@ ALLOWED = {
 """Files that may take such a text apart, and why."""
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_no_sentence_is_parsed():
     wrong = [
         f"{file.relative_to(PACKAGE)}:{line} {text}"

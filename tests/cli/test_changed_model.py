@@ -146,7 +146,7 @@ def test_a_run_that_recorded_no_model_is_reported_as_such(call, folder):
     assert "Not recorded: nobody can say" in (folder / "report.html").read_text()
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_an_estimate_and_a_comparison_are_reported_with_both_hashes(call):
     Path("new.py").write_text(SPEC)
     estimate = call("estimate spec.py:sum --budget 400 --method monte_carlo --json")

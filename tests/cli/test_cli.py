@@ -73,7 +73,7 @@ def test_falsify_and_replay(call, tmp_path):
     assert (tmp_path / "runs" / "ramp-2" / "table.parquet").exists()
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_options_of_a_search(call, tmp_path):
     output = call(
         "falsify",

@@ -140,7 +140,7 @@ class Killed(BaseException):
     pass
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_compiled_simulations_are_kept(tmp_path, monkeypatch, problem):
     from verifai_jax.evaluation.engine import Engine
 

@@ -58,7 +58,7 @@ def interrupted(monkeypatch):
     monkeypatch.setattr(loop.Rounds, "advance", interrupting)
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("verb", "target", "options"),
     [
@@ -98,7 +98,7 @@ def test_a_command_names_what_the_record_alone_does_not(tmp_path, monkeypatch):
     assert apart == f"verifai-jax falsify ../spec.py:p --resume '{folder}' --stop-after 3"
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_a_run_of_fuzz_goes_on_in_python(tmp_path):
     def system(features):
         if features["a"] > 1.5:

@@ -44,7 +44,7 @@ def test_a_backend_that_runs_already_is_left_alone():
     assert done.stdout.strip() == "1"
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_a_full_disk_keeps_no_halves_of_programs(tmp_path):
     code = (
         "import shutil, types, jax\n"

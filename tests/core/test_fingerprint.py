@@ -129,7 +129,7 @@ print(of(scaled(TABLE)), identity(Portfolio(), {"b": 1, "a": 2.5}, frozenset("xy
 """
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_another_process_says_the_same():
     said = {
         subprocess.run(

@@ -33,7 +33,7 @@ def pictures(html):
     return [Image.open(io.BytesIO(base64.b64decode(text))) for text in found]
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_results_show_themselves(problem, run):
     replay = run.replay(run.best)
     shown = {
@@ -143,7 +143,7 @@ def test_a_table_is_shown_and_written(tmp_path, index):
 
 
 @pytest.mark.addons
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_names_of_others_steer_no_terminal_and_draw_no_warnings(tmp_path):
     # Right-to-left writing, a clear screen, a character that the font lacks; a long name.
     name, signal = "a\u202eb \N{SLIGHTLY SMILING FACE} " + "long" * 80, "x\x1b[2J"

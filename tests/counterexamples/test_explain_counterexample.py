@@ -49,7 +49,7 @@ def explained(driven):
     return explain(driven)
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_the_predicate_the_instant_and_the_features(explained):
     assert isinstance(explained, Explained)
     assert explained.row == 0
@@ -152,7 +152,7 @@ def test_numbers_and_spans_are_written_so_that_they_differ():
     assert spans_of(vj.Box(0.0, 1.0), 4.0) is None
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_the_command(tmp_path):
     from verifai_jax.cli.explain import explain as command
     from verifai_jax.core.user_code.targets import load_target

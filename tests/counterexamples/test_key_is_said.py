@@ -7,7 +7,7 @@ import pytest
 import verifai_jax as vj
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_a_study_says_that_it_holds_the_random_key():
     def system(features, key):
         return vj.Trace({"x": features["a"] + 0.8 * jax.random.normal(key) * jnp.ones(2)}, dt=1.0)

@@ -120,7 +120,7 @@ def test_what_it_says(edges):
     assert float(found.features["x2"]) == 2.0
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_the_same_seed_gives_the_same(edges):
     one, two = shrink(edges, seed=3, budget=300), shrink(edges, seed=3, budget=300)
     np.testing.assert_array_equal(one.u, two.u)
@@ -156,7 +156,7 @@ def test_another_nominal(edges):
     assert "the nominal features fail themselves" in str(already)
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_each_kind_by_itself():
     problem = problem_of("sides", 2, lambda u: jnp.where(u[0] > 0.5, 0.8 - u[0], u[0] - 0.4))
     run = vj.simulate(problem, [{"x0": 5.5, "x1": 5.0}, {"x0": -1.0, "x1": 0.0}], progress=False)

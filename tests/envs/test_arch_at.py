@@ -181,7 +181,7 @@ def test_shifting_up_and_down_is_that_of_a_plain_program(simulate):
     np.testing.assert_allclose(trace["rpm"], rows[:, 1], rtol=0, atol=1e-6)
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_derivatives_are_those_of_differences():
     system = at.automatic_transmission(duration=5.0)
 

@@ -90,7 +90,7 @@ def test_controller_and_plant_are_those_of_a_plain_program(simulate):
     np.testing.assert_allclose(found, wanted, rtol=0, atol=1e-4)
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_derivatives_are_those_of_differences():
     system = nn.neural_network_controller(1.0)
 

@@ -226,7 +226,7 @@ class TestDrivers:
 
 
 class TestCars:
-    @pytest.mark.thorough
+    @pytest.mark.slow
     def test_a_steered_car_stays_on_an_arc_and_comes_back_to_it(self, double):
         path = road.Path.start(0.0, 0.0).turn(40.0, 4.0)
 

@@ -132,7 +132,7 @@ def test_the_system_agrees_with_an_independent_simulation():
     np.testing.assert_allclose(got[apart], expected[apart], atol=0.15)
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_slopes_are_finite_differences():
     """Of the least gap, along random directions, off the decision to halt or to go on."""
     with jax.enable_x64():

@@ -56,7 +56,7 @@ def problem(**options: Any):
     return vj.Problem("two", SPACE, TwoEngines(**options), "always x <= 0.9")
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_a_gradient_needs_the_backend_that_jax_traces():
     run = vj.falsify(problem(), "gradient", 32, batch=8)
     assert run.backend == "mjx"
@@ -122,7 +122,7 @@ def test_a_model_that_mjx_cannot_do_is_simulated_natively(monkeypatch):
     assert "tendons with pulleys" in choice.why
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_runs_remember_their_backend(tmp_path):
     two = problem()
     whole = vj.falsify(two, "uniform", 64, batch=16, run_on=vj.RunOn(backend="native"))

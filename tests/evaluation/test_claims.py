@@ -60,7 +60,7 @@ def test_a_search_goes_on_where_nothing_is_confirmed(artefact):
     assert len(run.table.unconfirmed)
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_true_failures_are_claimed():
     problem = vj.Problem("slow", SPACE, Decay(0.125), "eventually[0, 4] x <= 0.3")
     run = vj.falsify(problem, budget=64, batch=1, stop=vj.Stop(after=1))
@@ -71,7 +71,7 @@ def test_true_failures_are_claimed():
     assert "1 confirmed in double precision, at a third and a quarter of the step" in run.summary()
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_slopes_are_left_out_where_there_are_none():
     space = {"a": vj.Box(0, 10), "b": vj.Box(0, 1)}
 

@@ -98,7 +98,7 @@ def aliased(time, x, control, features):
     return jnp.stack(kinds)[features["kind"]]
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_what_only_looks_constant_at_the_steps_is_not_confirmed():
     system = vj.ode(
         aliased, lambda f, key: f["a"], signals=lambda t, x, control, f: {"x": x},
@@ -431,7 +431,7 @@ def test_a_black_box_may_be_refined():
     )
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_features_are_those_of_the_table():
     space = vj.FeatureSpace(
         {
@@ -505,7 +505,7 @@ def test_a_row_worse_than_all_before_is_examined_whatever_the_limit():
     assert verdicts([0.7, 0.95], 4) == ["confirmed"] * 2
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_the_worst_row_of_a_long_run_has_a_verdict():
     smooth = plain(lambda f, key: f["x"], "always x <= 0.2")
     run = vj.falsify(smooth, budget=4096, batch=256, seed=1, progress=False)
@@ -586,7 +586,7 @@ circle = oscillator()
 """
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_command_line(circles, tmp_path):
     from verifai_jax.cli.confirm import confirm as command
 
@@ -689,7 +689,7 @@ def weighted(features, key):
     return Trace({"x": jnp.sum(features["a"] * WEIGHTS) * jnp.ones(11)}, dt=0.1)
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_numpy_constants_work_in_both_precisions():
     problem = vj.Problem("weighted", {"a": vj.Box(0.0, 1.0)}, weighted, "always x < 0.2")
     single = vj.falsify(problem, "uniform", 16, batch=16, progress=False)

@@ -173,7 +173,7 @@ class Iterated:
         return Trace({"x": x[None]}, dt=1.0)
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_a_loop_without_reverse_mode_is_differentiated_forward():
     space = {f"f{i}": vj.Box(0, 1) for i in range(6)}
     problem = vj.Problem("loop", space, Iterated(), "x <= 0.5")
@@ -194,7 +194,7 @@ def test_a_loop_without_reverse_mode_is_differentiated_forward():
     np.testing.assert_allclose(gradient, np.repeat(-slope[:, None] / 6, 6, axis=1), atol=1e-4)
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_gradients_that_are_not_finite_are_reported_by_row():
     def system(features, key):
         # At the left of the space the square root has an infinite slope.

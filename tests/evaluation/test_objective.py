@@ -37,7 +37,7 @@ def test_it_is_the_robustness_of_the_engine():
         np.testing.assert_allclose(one, verdicts.rho[:, column], rtol=1e-5, atol=1e-6)
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_features_and_points_are_two_ways_to_say_the_same():
     of_unit = jax.jit(PROBLEM.objective(SMOOTH))
     of_features = jax.jit(PROBLEM.objective(SMOOTH, of="features"))
@@ -57,7 +57,7 @@ def differences(function, at, step=1e-6):
     return np.array([(float(function(a)) - float(function(b))) / (2 * step) for a, b in sides])
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_its_gradient_is_that_of_central_differences():
     with jax.enable_x64(True):
         of_unit = jax.jit(PROBLEM.objective(SMOOTH))

@@ -93,7 +93,7 @@ def test_a_counter_in_a_file_is_memory_too(tmp_path):
     assert of_run == of_confirm
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_a_deterministic_system_is_confirmed_and_costs_little():
     steady = Counter(lambda a, count: a - 0.5)
     run = falsified(steady, 40)
@@ -241,7 +241,7 @@ def test_fuzz_claims_what_came_again():
     assert "memory or chance of its own" in str(run).splitlines()[1]
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_certificates_show_what_came_again():
     systems = {0.0: failing_at(7), 1.0: Counter(lambda a, count: a - 0.3)}
     certificates = vj.certify(
@@ -265,7 +265,7 @@ def test_certificates_show_what_came_again():
     assert note.startswith("policy 0: the system has memory or chance of its own")
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 @pytest.mark.addons
 def test_a_corpus_holds_what_comes_again(tmp_path):
     wavering = Counter(lambda a, count: 1.0 if count % 2 else -1.0)

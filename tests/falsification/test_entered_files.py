@@ -55,7 +55,7 @@ def listed(entered: dict[str, str]) -> str:
 
 
 @pytest.mark.addons
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_one_call_enters_the_files_of_the_list_and_imports_no_other_search_or_engine():
     call = one_call()
     known = {line.split(" ")[0] for line in LISTED.read_text().splitlines()}

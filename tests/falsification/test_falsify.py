@@ -46,7 +46,7 @@ def test_rows_are_what_was_simulated(problem):
     assert run.best["rho"] == table["rho"].min()
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_the_usual_batch_leaves_a_search_time_to_learn(problem):
     assert vj.falsify(problem, "uniform", 3000).batch == 1024
     # A search that does not learn, and that nothing but the budget ends, has few rounds.
@@ -77,7 +77,7 @@ def test_passive_searches_do_not_depend_on_the_batch(problem, search):
     np.testing.assert_allclose(one["rho"], two["rho"], atol=1e-6)
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 @pytest.mark.parametrize("search", ["uniform", "gradient"])
 def test_results_do_not_depend_on_a_users_64_bit_setting(search):
     def run():
@@ -91,7 +91,7 @@ def test_results_do_not_depend_on_a_users_64_bit_setting(search):
     np.testing.assert_allclose(wide["rho"], plain["rho"], atol=1e-5)
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_random_systems_replay_and_do_not_depend_on_the_batch():
     def noisy(features, key):
         return vj.Trace({"x": features["a"] + jax.random.normal(key, (4,))}, dt=1.0)

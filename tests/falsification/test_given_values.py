@@ -83,7 +83,7 @@ def test_rows_before_a_search(tmp_path):
     )
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_nominal_values_are_held_as_they_are():
     problem = vj.Problem("given", SPACE, system, "side < 2", nominal=ROW)
     held = problem.only("count")

@@ -138,7 +138,7 @@ def test_a_black_box_is_guided_too_and_goes_on_as_it_was(tmp_path):
 
 
 @pytest.mark.addons
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_workers_of_an_executor_tell_the_same():
     search = vj.search.Diverse(vj.search.named("cross_entropy"), by="behaviour")
     options = {"budget": 96, "batch": 16, "seed": 0}

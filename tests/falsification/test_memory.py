@@ -40,7 +40,7 @@ def ours():
     return collections.Counter(name for name in names if name in owned)
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_problems_and_their_programs_are_freed():
     def run(number):
         vj.falsify(problem(number, 5), "uniform", 20, progress=False, confirm=False)
@@ -52,7 +52,7 @@ def test_problems_and_their_programs_are_freed():
     assert ours() - before == collections.Counter()
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_formulas_that_were_judged_are_bounded():
     trace = Trace({"x": jnp.zeros(3)}, dt=0.1)
     calls = []
@@ -99,7 +99,7 @@ def test_many_problems_need_little_more_memory_than_ten(tmp_path):
     assert many - few < 20
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_no_function_of_a_module_keeps_all_its_static_arguments():
     for file in Path(vj.__file__).parent.rglob("*.py"):
         for node in ast.parse(file.read_text()).body:

@@ -81,7 +81,7 @@ def test_every_text_gives_the_reason(runs, tmp_path):
     assert "its first 2 rows were given; leave out Start(rows=)" in runs["first"].summary()
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_the_reason_is_stored(runs, tmp_path):
     for origin, run in runs.items():
         assert vj.load(run.save(tmp_path / origin)).origin == origin

@@ -34,7 +34,7 @@ def same(one, other):
     return one.table.all.equals(other.table.all)
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name",
     [
@@ -99,7 +99,7 @@ def test_passive_searches_go_on_within_a_batch(problem):
     assert same(vj.resume(part, budget=64), whole)
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["cross_entropy", "portfolio"])
 def test_from_a_folder_after_a_kill(problem, name, tmp_path):
     longest = vj.falsify(problem, name, 240, batch=16)
@@ -213,7 +213,7 @@ class TestWarmStart:
             assert len(warm.table.counterexamples) >= 6 > len(cold.table.counterexamples)
         assert len(warm.table) == 16
 
-    @pytest.mark.thorough
+    @pytest.mark.slow
     def test_a_gradient_search_starts_from_the_nearest(self, problem):
         earlier = vj.falsify(problem, "uniform", 64, batch=64)
         warm = vj.falsify(problem, vj.Start("gradient", run=earlier), 16, batch=16)

@@ -95,7 +95,7 @@ def test_a_problem_keeps_its_target_in_what_is_derived_from_it(tmp_path):
     assert again.target == "specs/f.py:flat"
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 @pytest.mark.addons
 def test_an_archive_of_failures_has_room_for_those_that_are_wanted():
     stop = vj.Stop(after=300)
@@ -111,7 +111,7 @@ class Around(vj.search.Wrapper):
     search: vj.search.Search
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 @pytest.mark.addons
 def test_names_of_searches_around_others():
     assert vj.search.named("diverse") == vj.search.Diverse(vj.search.Portfolio())

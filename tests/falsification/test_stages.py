@@ -22,7 +22,7 @@ def problem(level):
     return vj.Problem("bowl", space, system, f"always height > {level}")
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_no_row_is_differentiated_while_failures_come(monkeypatch):
     monkeypatch.setattr(Engine, "_lower_gradient", None)  # Nothing is traced for it, either.
     run = vj.falsify(problem(0.2), budget=8 * BATCH, batch=BATCH, confirm=False)
@@ -38,7 +38,7 @@ def safe():
     return vj.falsify(problem(-1.0), budget=8 * BATCH, batch=BATCH, confirm=False)
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_descents_join_when_no_failure_comes(safe):
     differentiated = safe.table.all["differentiated"].to_numpy()
     assert not differentiated[: PATIENT * BATCH].any()
@@ -48,7 +48,7 @@ def test_descents_join_when_no_failure_comes(safe):
     assert (first["x"], first["y"]) == (0.5, 0.5)
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_small_rounds_begin_with_descents():
     run = vj.falsify(problem(-1.0), budget=MANY, batch=MANY, confirm=False)
     assert run.table.all["differentiated"].iloc[0]

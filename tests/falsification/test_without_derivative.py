@@ -86,7 +86,7 @@ def test_what_is_never_read_lacks_nothing():
     assert has_gradient(unread)
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_the_default_search_goes_on_and_says_so_once():
     run = vj.falsify(
         problem(on_host), budget=200, stop=vj.Stop(after=1), progress=False, confirm=False
@@ -98,7 +98,7 @@ def test_the_default_search_goes_on_and_says_so_once():
     assert (run.table.all["rho"] < 0).any()
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("step", "formula", "dim"),
     [

@@ -78,7 +78,7 @@ def test_lengths_are_equally_likely_and_masks_follow():
     np.testing.assert_array_equal(cars["x"], cars.values["x"])
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_absent_items_have_no_influence():
     u = jnp.linspace(0.05, 0.95, SPACE.dim).at[0].set(0.5)  # One car.
     other = u.at[5:9].set(0.01)  # All coordinates of the second.

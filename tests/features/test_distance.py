@@ -115,7 +115,7 @@ def distances(us):
     return [SPACE.distance(*pair) for pair in ((a, b), (b, a), (b, c), (a, c), (a, a))]
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 @given(points, points, points)
 @settings(max_examples=100, deadline=None)
 def test_is_a_metric(a, b, c):

@@ -69,7 +69,7 @@ domains = st.recursive(
 )
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 @given(domains, domains)
 @settings(max_examples=120, deadline=None)
 def test_round_trip(one, other):

@@ -67,7 +67,7 @@ def test_units_do_not_matter():
     np.testing.assert_allclose(one, other, rtol=1e-5)
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_absent_clauses_and_their_slopes():
     goals = goals_of([parse("x < 1 & (x < 2 | y < 1)")])
 

@@ -97,7 +97,7 @@ def test_online_ends_as_a_held_trace(text):
         assert monitor.finish(state) == definition(text, k + 1, "hold")[0]
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_the_table_of_the_page_is_what_is_computed():
     rows = re.findall(
         r"^\| `([^`]+)` \| (\[.*?\]) \| (\[.*?\]) \| (.+?) \|", PAGE.read_text(), re.M

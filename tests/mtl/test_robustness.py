@@ -40,7 +40,7 @@ def one_by_one(batch, lanes, semantics=hard):
     return np.stack([run(batch["x"][i], batch["y"][i]) for i in lanes])
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 @pytest.mark.parametrize("semantics", [hard, smooth(0.1)], ids=["hard", "smooth"])
 def test_a_batch_equals_its_traces_one_by_one(batch, semantics):
     def rho(x, y):
@@ -62,7 +62,7 @@ def test_a_batch_equals_its_traces_one_by_one(batch, semantics):
         np.testing.assert_allclose(gradient[i], expected, rtol=1e-4, atol=1e-5)
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_a_signal_that_all_lanes_share_has_a_gradient_for_each(batch):
     x, y = batch["x"][:5], batch["y"][0]
 

@@ -121,7 +121,7 @@ def ramp(features, key):
     )  # fmt: skip
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_the_bounds_of_all_formulas_are_solved_for_their_signals(tmp_path):
     specs = {
         "near": "always abs(2 * y - 40) <= 39",  # y from 0.5 to 39.5, the far end is not drawn
@@ -232,7 +232,7 @@ def test_draw_is_looked_at_before_anything_is_simulated():
         vj.Problem("p", {"a": vj.Box(2, 3)}, system, "always x < 1", draw=lambda axes, trace: None)
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_animation(tmp_path):
     drawn = []
 

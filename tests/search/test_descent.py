@@ -51,7 +51,7 @@ def test_least_against_a_linear_program(seed, count):
     assert value <= np.max(clauses[:count]) + 1e-4
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_boxes_of_all_rows_that_are_simulated():
     """In large batches only the first rows are simulated: each lies in its descent's box."""
     search, cube, batch = Gradient(), Cube((0,) * D), 256
@@ -115,7 +115,7 @@ def test_a_maximum_of_clauses_does_not_stall_a_descent():
     assert max(costs) < 30 < 0.5 / share
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 @pytest.mark.parametrize("slope", [pytest.param(0.0, marks=pytest.mark.slow), np.nan])
 def test_the_portfolio_leaves_gradients_that_say_nothing(slope):
     cube, search = Cube((0, 0, 0)), Portfolio()

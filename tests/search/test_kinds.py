@@ -138,7 +138,7 @@ def runs():
     ]
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_the_default_search_leaves_what_it_has_described(runs):
     leaves, stays = (run.table.all for run in runs)
     first = int(np.flatnonzero(stays["violated"])[0])

@@ -112,7 +112,7 @@ def test_without_descents_it_is_the_portfolio_without_gradients():
     assert bool(jnp.all(before.fresh == after.fresh))
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_a_failure_ends_the_count_of_barren_rounds():
     def cut(u):  # Fails where the first coordinate is great.
         return 0.9 - u[0]

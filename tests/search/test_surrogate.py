@@ -33,7 +33,7 @@ def evidence(covariance, y):
     return -0.5 * len(y) * np.log(square) - 0.5 * np.linalg.slogdet(covariance)[1]
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_the_mean_of_the_additive_model_is_that_of_ridge_regression():
     u, score = rows()
     model = Surrogate.nothing(3).learned(u, score)
@@ -53,7 +53,7 @@ def test_the_mean_of_the_additive_model_is_that_of_ridge_regression():
     assert CUBE.cells(found[None])[0, 0] == np.argmin(weights[4:]) == 1
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_the_process_chooses_the_lowest_bound():
     u, score = rows()
     model = Surrogate.nothing(3).learned(u, score)

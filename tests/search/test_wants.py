@@ -103,7 +103,7 @@ def test_two_searches_want_what_either_does_in_the_smaller_rounds():
     assert both == Wants(coverage_ids=True, no_verdict_rows=True, max_batch=16)
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_parts_of_a_space_get_what_each_wants():
     class Noting(Search):
         seen: ClassVar[list[Observations]] = []
@@ -175,7 +175,7 @@ def test_a_wrapper_needs_a_search():
         Rounded("ce")
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_a_wrapper_keeps_the_contract():
     check_search(Rounded(CrossEntropy()), CUBE)
 

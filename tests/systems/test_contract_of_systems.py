@@ -21,7 +21,7 @@ def ramp(features, key):
     return Trace({"x": features["x0"] * jnp.linspace(0, 1, 5)}, dt=0.25)
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_ode():
     check_system(cartpole.cartpole(duration=1.0, terminate=True), SPACE)
 

@@ -54,7 +54,7 @@ def test_a_fork_has_the_undisturbed_trace_and_a_new_one_with_other_features():
     assert not np.array_equal(whole.signals["x"][38:60], other.signals["x"][38:60])
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "options",
     [
@@ -68,7 +68,7 @@ def test_odes(options):
     check_forks(pendulum(**options), SPACE)
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 @pytest.mark.addons
 def test_an_ode_with_faults():
     plain = vj.Problem("p", SPACE, pendulum(), "always[0, 1] x <= 0.8")
@@ -131,7 +131,7 @@ os.kill(os.getpid(), signal.SIGKILL)
 """
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_a_fork_of_a_killed_process_goes_on_in_another(tmp_path):
     here, file = os.path.dirname(__file__), tmp_path / "fork.npz"
     code = KILLED.format(here=here, root=os.path.dirname(os.path.dirname(here)), file=str(file))

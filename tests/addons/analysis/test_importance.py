@@ -78,7 +78,7 @@ def test_absence_is_information():
     assert importance(frame).ranked[0] == "x"
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_the_same_seed_gives_the_same_table(found):
     assert importance(failing_table(3000)).table.equals(found.table)
     assert not importance(failing_table(3000), seed=1).table.equals(found.table)

@@ -30,7 +30,7 @@ def check(name: str, seed: int, forks: int) -> None:
         assert vj.robustness(formula, escape.trace) >= 0, name
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name", [pytest.param(n, marks=() if n == "wall" else pytest.mark.slow) for n in SYSTEMS]
 )
@@ -58,7 +58,7 @@ def test_what_is_proved_begins_after_the_known_instant_and_before_the_failure(br
     assert found.no_escape_from <= found.proved_from
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_the_words_say_what_an_escape_had_to_do_and_the_picture_draws_it(braked, tmp_path):
     known, found = braked
     text = str(found)
@@ -121,7 +121,7 @@ def test_the_environment_avoids_it_by_a_feature_from_an_instant_on():
     assert "the other policy could avoid it" in str(other)
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_what_never_comes_fails_where_its_window_ends():
     system = vj.ode(
         lambda t, s, u, f: jnp.stack([s[1], u]), initial=lambda f, key: jnp.zeros(2) * f["g"],

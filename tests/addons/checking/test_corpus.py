@@ -97,7 +97,7 @@ def test_failing_fixed_and_without_a_verdict(corpus):
     assert str(other) == f"calm: 0 counterexamples in {corpus}\n  3 more files of other problems"
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_a_feature_that_was_renamed_moved_or_narrowed(corpus):
     def push(f, key):
         return system({**f, "wind": f["gust"]}, key)

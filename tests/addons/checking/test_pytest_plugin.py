@@ -15,7 +15,7 @@ from verifai_jax.addons.checking.check import min_budget
 from verifai_jax.statistics.confidence_sequences import anytime_interval
 
 pytest_plugins = ["pytester"]
-PLUGIN = ("-p", "_verifai_jax_pytest", "-p", "no:cacheprovider")
+PLUGIN = ("-p", "_verifai_jax_pytest", "-p", "no:cacheprovider", "-p", "no:zarr")
 CONTROLLER = """
 import jax.numpy as jnp
 import verifai_jax as vj

@@ -124,7 +124,7 @@ def test_a_run_that_was_stopped_goes_on_with_workers_and_without(tmp_path):
     pd.testing.assert_frame_equal(done.table.all, whole.table.all, check_exact=True)
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_a_constraint_is_kept_and_its_acceptance_is_that_of_the_rows_taken():
     space = vj.FeatureSpace(
         {"a": vj.Box(0, 3), "b": vj.Box(-1, 1)}, where=lambda f: f["a"] > f["b"] + 1
@@ -379,7 +379,7 @@ class Confused(ThreadPoolExecutor):
         return future
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_an_answer_to_another_call_is_dropped_and_asked_again():
     options = {"search": "uniform", "budget": 64, "batch": 64, "confirm": False, "progress": False}
     alone = vj.falsify(DECAY, **options)

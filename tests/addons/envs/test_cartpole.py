@@ -140,7 +140,7 @@ def test_shipped_network_balances_in_gymnasium_itself():
     assert total >= 475
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_shipped_network_fails_off_nominal():
     # What the whole toolkit is shown on: a controller of full return that breaks.
     system = cp.cartpole(cp.neural(), terminate=True)
@@ -166,7 +166,7 @@ def test_task_steps_like_gymnasium():
     assert over
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_an_episode_has_its_own_pole_and_start():
     task = CartPoleTask(masspole_range=1.0, length_range=0.5, x0_range=1.0, theta0_range=0.1)
     assert len(jax.tree.leaves(task)) == 5

@@ -91,7 +91,7 @@ class State:
         self.qpos = jnp.array([trace[name][sample] for name in ("x", "height", "pitch")])
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 @pytest.mark.parametrize("name", PROBLEMS)
 def test_an_ordinary_day_is_safe(name):
     problem = getattr(specs, name).on_backend("native")

@@ -323,7 +323,7 @@ def test_one_program_judges_any_policy_of_a_form(continuous):
     baseline.check()
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_pushing_along_solves_the_tasks():
     returns = evaluate(mc.ContinuousMountainCarTask(), pushing_along(True), episodes=50)
     assert returns.min() > 85

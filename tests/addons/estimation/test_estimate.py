@@ -39,7 +39,7 @@ def test_one_in_a_million(rare):
     assert rare.failures > 1000
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_says_what_is_guaranteed_and_what_is_not(rare):
     text = str(rare)
     assert "rare: fails with probability" in text
@@ -83,7 +83,7 @@ def test_a_black_box_without_gradient_with_simulations_that_fail():
     assert "neither safe nor failing" in str(found)
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_several_formulas_and_a_constraint():
     system = lambda f, key: vj.Trace({"x": f["x"][None], "y": f["y"][None]}, dt=1.0)  # noqa: E731
     space = vj.FeatureSpace(

@@ -67,7 +67,7 @@ def test_the_interval_holds_the_probability_of_the_whole(truth):
     np.testing.assert_allclose(kept["first.w"], kept["second.w"], atol=1e-5)
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_rows_of_runs_are_used_again(truth):
     runs = [
         vj.falsify(problem, "uniform", 4000, batch=2048, confirm=False, progress=False)

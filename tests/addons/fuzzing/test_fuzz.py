@@ -73,7 +73,7 @@ def test_what_is_covered_is_what_an_independent_count_says(run):
         covered["wheels"]
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_the_summary_and_the_corpus_are_of_the_data(run):
     corpus, text = run.corpus, str(run)
     marks = [len(part.names) for part in run.coverage.parts if part.what != "states"]
@@ -153,7 +153,7 @@ def test_without_a_formula_each_trouble_is_a_counterexample():
     assert run.coverage["cells"].total == 4
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_without_a_formula_a_jax_system_is_checked_too():
     def system(features, key):
         x = jnp.full(4, features["x"])
@@ -187,7 +187,7 @@ def test_what_is_wrong_is_refused_where_it_is_made(options, message):
     assert time.perf_counter() - started < 60
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_cells_of_a_behaviour():
     behaviour = Behaviour({"x": (0, 4, 4), "y": (0, 1, 2)}, [vj.parse("always (x < 9 & y < 2)")])
     trace = vj.Trace({"x": np.array([-1, 0.5, 3.9, 7]), "y": np.array([0, 0.9, 0.2, 0.2])}, dt=1.0)

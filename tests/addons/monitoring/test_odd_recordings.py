@@ -244,7 +244,7 @@ def check(seed, folder):
     assert (row.verdict == "holds") == holds, (seed, text_of(f))
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_formulas_on_odd_recordings_have_the_value_of_the_definition(tmp_path):
     for seed in range(40):
         check(seed, tmp_path)

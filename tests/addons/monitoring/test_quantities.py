@@ -113,7 +113,7 @@ def test_units_are_no_words_of_the_grammar():
                 assert (q.unit, q.scale[0], str(q)) == (unit, base, f"2.5 {unit}")
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_what_is_between_the_parentheses_holds_of_all():
     rng = np.random.default_rng(0)
     trace = Trace({"p": rng.normal(size=(9, 3)), "y": rng.normal(size=9)}, dt=1.0)

@@ -356,6 +356,7 @@ def names_in(program):
             yield from names_in(inner)
 
 
+@pytest.mark.slow
 def test_the_table_has_every_primitive():
     done = subprocess.run([sys.executable, "-c", NAMES], capture_output=True, text=True, check=True)
     excluded = set(" ".join(ELSEWHERE.values()).split())

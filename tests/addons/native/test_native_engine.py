@@ -73,6 +73,7 @@ def test_verdicts_are_those_of_xla(ending):
     assert jax.tree.structure(ours.features) == jax.tree.structure(theirs.features)
 
 
+@pytest.mark.slow
 def test_rows_before_the_first_native_one_are_those_of_xla(ending):
     u = points(ending)
     ours, theirs, native = evaluated(ending, u)
@@ -165,6 +166,7 @@ def test_auto_is_native_where_the_budget_is_worth_it(ending):
     assert not NativeEngine(engine, "auto", enough - 2)._is_worth
 
 
+@pytest.mark.slow
 def test_by_default_it_is_native_unless_few_simulations_may_do(ending, monkeypatch):
     monkeypatch.setattr(native_engine, "WORTH", 1)
     options = {"batch": 700, "confirm": False, "progress": False}
@@ -215,6 +217,7 @@ def test_what_is_not_translated_is_simulated_by_xla():
     assert "not natively: it has the operation sort, which is not translated" in note
 
 
+@pytest.mark.slow
 def test_without_a_compiler(ending, monkeypatch, tmp_path):
     monkeypatch.setenv("PATH", str(tmp_path))
     ending.programs.clear()
@@ -252,6 +255,7 @@ def test_with_a_cache_that_cannot_be_written(ending, monkeypatch, tmp_path):
     assert "the cache of compiled programs is switched off" in fallback_note(ending)
 
 
+@pytest.mark.slow
 def test_a_folder_that_others_can_write_to_is_refused(ending, monkeypatch, tmp_path):
     (tmp_path / "native").mkdir()
     (tmp_path / "native").chmod(0o777)
@@ -277,6 +281,7 @@ def test_a_damaged_library_is_made_anew(ending, monkeypatch, tmp_path):
     assert file.read_bytes() == written or len(list(folder.glob("*.so"))) == 2
 
 
+@pytest.mark.slow
 def test_a_program_that_computes_something_else_is_not_used(ending, monkeypatch, tmp_path):
     monkeypatch.setenv("VERIFAI_JAX_CACHE", str(tmp_path))
     ending.programs.clear()
@@ -320,6 +325,7 @@ def falling(**more):
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("number", ["9.81", "0.37", "0.75"])
 def test_a_constant_that_is_off_by_a_ten_thousandth_is_found(monkeypatch, tmp_path, number):
     monkeypatch.setenv("VERIFAI_JAX_CACHE", str(tmp_path))
@@ -345,6 +351,7 @@ def test_a_constant_that_is_off_by_a_ten_thousandth_is_found(monkeypatch, tmp_pa
     assert run.engine == "native"
 
 
+@pytest.mark.slow
 def test_a_system_that_draws_is_compared_at_rounding_too(monkeypatch, tmp_path):
     monkeypatch.setenv("VERIFAI_JAX_CACHE", str(tmp_path))
 
@@ -373,6 +380,7 @@ def test_a_network_of_convolutions_is_simulated_by_xla():
     assert "the operation conv_general_dilated, which is not translated" in fallback_note(problem)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("owner", "name"),
     [

@@ -230,6 +230,7 @@ def test_sums_and_the_like():
     check(lambda row, *_: (row.max(), row.min(), jnp.argmax(row), jnp.argmin(row)), 12, "most", 0)
 
 
+@pytest.mark.slow
 def test_matrix_products():
     rng = np.random.default_rng(2)
     wide, narrow = rng.normal(size=(40, 36)).astype(np.float32), rng.normal(size=(36, 3))

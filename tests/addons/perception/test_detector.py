@@ -33,7 +33,7 @@ def network():
     return detector(jax.random.key(1), SHAPE, kinds=2, values=3, channels=(4, 5, 6), hidden=(7,))
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_slices_and_convolutions_agree(network):
     images = jax.random.uniform(jax.random.key(0), (3, *SHAPE, 3))
     with jax.default_matmul_precision("highest"):

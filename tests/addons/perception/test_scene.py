@@ -216,7 +216,7 @@ def test_colours_are_those_of_a_ray_caster_with_many_samples(views, name):
     assert np.quantile(error, 0.99) < 0.15
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_shadows_lie_where_the_sun_does_not_come():
     sun = Sun(azimuth=0.7, elevation=0.8, ambient=0.2)
     solids = tuple(solid for solid in SOLIDS if not isinstance(solid, Cylinder))
@@ -373,7 +373,7 @@ def test_mistakes_are_named_before_anything_compiles(scene, options, message):
         jax.eval_shape(lambda: scene.render(**{"camera": Camera(4, 8), **options}))
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_an_image_has_the_camera_s_shape_whatever_is_traced():
     def image(x, fog):
         scene = Scene((Box((x, 0.0, 0.0), (1.0, 1.0, 1.0), hsv(x)), Sphere((9.0, x, 1.0), 1.0)))

@@ -118,7 +118,7 @@ def _row_of_failure(text, number):
     return int(re.search(rf"Failure {number}: row (\d+)", text)[1])
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_texts_of_people_are_text(report):
     page = read(report)
     assert page.scripts == ["application/json", "application/json", None]

@@ -54,7 +54,7 @@ def test_under_one_vmap_the_same_to_rounding(group, policies):
             np.testing.assert_allclose(a, b, atol=1e-4)
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_going_on_is_the_same_as_going_through(group, policies):
     training = BatchedTraining(group)
     assert list(training.advance({0: 256, 2: 256})) == [0, 2]

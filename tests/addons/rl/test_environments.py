@@ -359,7 +359,7 @@ def test_weights_of_a_reward_are_fields_that_a_sweep_may_vary():
         make(effort="x")
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_ode_task_of_choices_and_what_it_refuses():
     loop = ode(
         pendulum, lambda f, key: {"angle": 0.1, "rate": 0.0}, dt=0.05, steps=40, method="rk4"

@@ -105,7 +105,7 @@ def test_learns_the_corridor_and_the_same_from_the_same_seed():
     assert np.nanmean(trained.mean_return[-5:]) > np.nanmean(trained.mean_return[:5])
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_cut_off_is_not_terminated():
     # Of a reward of 1 for ever the value is 1 / (1 - 0.95) = 20, though episodes last 20 steps:
     # if each were over for good, it would be 12.8 at their beginning and less later.

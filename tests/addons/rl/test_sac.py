@@ -150,7 +150,7 @@ def test_noise_lasts_as_long_as_its_episode_and_has_the_policys_deviation():
     np.testing.assert_array_equal(seen.terminated, 0)
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_each_loss_has_a_gradient_for_its_own_weights():
     sac = SAC(hidden=(4,), value_hidden=(4,), environments=2, capacity=10)
     generator = np.random.default_rng(0)

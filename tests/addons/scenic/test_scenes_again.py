@@ -36,6 +36,7 @@ class TestThereAndBack:
     def program(self):
         return vj.scenic(WIDE)
 
+    @pytest.mark.slow
     def test_features_of_scenics_own_scenes_give_them_again(self, program):
         random.seed(0)
         for _ in range(8):
@@ -137,6 +138,7 @@ class TestProgramsThatDrawWhileTheyRun:
         assert len({round(end, 4) for end in ends}) > 1
         assert ends[0] == float(run({"seed": 0.1}, 1).signals["x"][-1])
 
+    @pytest.mark.slow
     def test_a_run_is_falsified_and_replayed(self):
         program = vj.scenic(CAR + PROGRAMS["behaviour"])
         problem = vj.Problem(

@@ -42,6 +42,7 @@ class TestWithScenic:
         assert program.space["broken.color"] == vj.Categorical("red", "blue", "white")
         assert set(program.objects) == {"ego", "cone1", "cone2", "cone3", "broken", "params"}
 
+    @pytest.mark.slow
     def test_gradients_are_those_of_finite_differences(self):
         program = vj.scenic(GALLERY / "cones.scenic")
 

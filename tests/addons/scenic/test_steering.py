@@ -59,6 +59,7 @@ class TestWithScenic:
         program = scenario.program
         assert simulate(program.scene(scenario.features)) < 0
 
+    @pytest.mark.slow
     def test_an_external_sampler_of_scenic(self):
         import scenic
 

@@ -18,6 +18,7 @@ pytestmark = [
 ]
 
 
+@pytest.mark.slow
 def test_a_behavior_that_asks_at_each_step_is_falsified():
     program = vj.scenic(GALLERY / "reacting.scenic", features={"push": PUSH})
     assert program.given == ("push",)

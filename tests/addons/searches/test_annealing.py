@@ -30,7 +30,7 @@ def run(search, cube, batch, rho, rounds, key=0):
     return jax.jit(lambda state: jax.lax.scan(step, state, None, length=rounds))(state)[1]
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_each_chain_has_the_density_of_its_temperature():
     # Two wells, one of which is a flat failure region; and a discrete coordinate.
     def rho(u):

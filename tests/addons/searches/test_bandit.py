@@ -22,7 +22,7 @@ def learned(cube, rho, rounds):
     return np.asarray(jax.lax.scan(step, state, None, length=rounds)[1].reshape(-1, cube.dim))
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_learns_before_the_first_failure():
     cube = Cube((0, 0, 7), ordered=(True, True, False))
 
@@ -34,7 +34,7 @@ def test_learns_before_the_first_failure():
     assert np.mean(cube.cells(late)[:, 0] == 4) > 0.7
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_draws_the_prior_where_all_points_are_equal():
     weights = (None, (0.7, 0.2, 0.1))
     cube = Cube((0, 3), weights=weights, ordered=(True, False))

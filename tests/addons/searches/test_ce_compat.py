@@ -111,7 +111,7 @@ def test_a_batch_is_as_its_rows_one_by_one(alpha):
     np.testing.assert_allclose(state.histograms.sum(-1), np.ones((6, 5)), atol=1e-5)
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_points_follow_the_histograms():
     cube = Cube((0, 3), weights=(None, (0.6, 0.3, 0.1)))
     search = CECompat(buckets=4)

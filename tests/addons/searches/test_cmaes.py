@@ -60,7 +60,7 @@ def test_in_ten_dimensions_as_the_cmaes_package(function, below, median, most):
     assert np.max(first) < most
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_the_same_robustness_everywhere_gives_the_prior():
     search, cube = CMAES(), Cube((0, 0))
 
@@ -109,7 +109,7 @@ def one_step(evolution, points, weights, worse):
     return mean + size * total, size_after, covariance, way, whitened, age + 1
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_a_step_is_that_of_the_tutorial():
     rng = np.random.default_rng(0)
     evolution = Evolution.begin(jnp.full(3, 0.5), jnp.float32(0.2), True)
@@ -125,7 +125,7 @@ def test_a_step_is_that_of_the_tutorial():
             np.testing.assert_allclose(got, wanted, rtol=2e-4, atol=1e-5)
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_a_diagonal_covariance_learns_the_scales():
     scales = 10.0 ** -jnp.arange(3)
     rng = np.random.default_rng(1)

@@ -49,7 +49,7 @@ def test_the_deciding_instant_is_that_of_explain(text):
         assert value == signals["xy".index(name)][round(why.time / 0.25)]
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_an_outcome_by_hand():
     def system(f, key):
         time = jnp.arange(16.0)

@@ -79,7 +79,7 @@ def test_finds_the_best_cells(ordered):
     assert np.median(np.abs(cells[:, 1] - 31)) <= 3
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_gives_up_greed_that_does_not_pay():
     def share_of_starts(rho):
         states, _ = learned(EpsilonGreedy(patience=10**4), Cube((0, 0)), rho, 100)

@@ -32,7 +32,7 @@ def whole(search, cube, batch=7):
     return points
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_orders_are_permutations():
     run = jax.jit(permuted, static_argnums=1)
     for total in (1, 2, 3, 5, 7, 12, 441, 10_201):

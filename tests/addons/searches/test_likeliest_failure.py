@@ -118,7 +118,7 @@ def test_it_is_the_nearest_point_of_a_half_space():
         vj.shrink(run, by="likelihood", nominal={"x": 0.0}, progress=False)
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_departures_are_those_of_the_density():
     space = vj.FeatureSpace({
         "a": vj.Normal(1.0, 2.0),

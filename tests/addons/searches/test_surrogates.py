@@ -205,7 +205,7 @@ class TestDefault:
         first = [c for c in begun if c.startswith("force")]
         np.testing.assert_array_equal(resumed.table.all[first][:1], begun[first][:1])
 
-    @pytest.mark.thorough
+    @pytest.mark.slow
     def test_it_can_be_set(self, monkeypatch):
         monkeypatch.setattr("verifai_jax.falsification.validation.SLOW", 0.0)
         run = vj.falsify(problem(), "portfolio", 8, progress=False)

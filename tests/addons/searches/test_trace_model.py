@@ -33,7 +33,7 @@ def data():
     return jnp.asarray(x, jnp.float32), jnp.asarray(coefficients, jnp.float32), jnp.asarray(mask)
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_short_lengths_and_near_rows_leave_a_finite_model_that_can_be_fitted():
     """In 32 bits squares of points have no digits left for the distance of neighbours."""
     rng = np.random.default_rng(0)

@@ -71,7 +71,7 @@ def test_a_film_sees_what_moves(gl, speed):
     assert share_of_red(wall) == 0
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_a_models_own_camera_is_taken_where_it_sees_the_motion(gl):
     side = '<camera name="side" pos="0.5 -2 0.2" xyaxes="1 0 0 0 0 1" fovy="60"/>'
     motion = rolling(side, speed=1.0)

@@ -81,7 +81,7 @@ def red(picture):
     return columns.mean() + 0.5 - width / 2, rows.mean() + 0.5 - height / 2, np.ptp(columns) + 1
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_what_is_recorded_is_what_was_replayed(seen, motion):
     assert seen.violated
     np.testing.assert_array_equal(motion.qpos[:, 0], np.asarray(seen.trace["x"], float))

@@ -80,7 +80,7 @@ def test_a_repair_is_found_where_the_prior_has_its_mass():
     assert any(note.startswith("k is held in repaired: ") for note in compared.notes)
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_a_synthesis_says_what_it_varied():
     found = vj.synthesize(PROBLEM, ["k"], budget=3000, environments=8, aim=vj.Aim(held_out=200))
     assert found.holds

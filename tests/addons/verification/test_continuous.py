@@ -94,7 +94,7 @@ def wave(**options):
     return vj.Problem("wave", {"x": vj.Box(0, 1)}, system, "always x <= 1.5")
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_a_wave_between_samples_is_seen():
     problem = wave()
     assert vj.verify(problem, boxes=1, samples=0, progress=False).proved.mass == 1

@@ -31,7 +31,7 @@ def proved():
     return vj.verify(squares(), boxes=150, samples=0, progress=False)
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_a_point_is_in_the_rest_unless_its_box_is_decided(proved):
     """Points find their boxes by cuts as by comparing them with each box."""
     boxes, random = proved.boxes, np.random.default_rng(0)
@@ -68,7 +68,7 @@ def test_an_estimate_counts_nothing_where_it_is_proved(proved):
     assert "independent samples of this rest alone" in text
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_a_rare_failure_is_counted_in_what_a_proof_leaves():
     """Of one in four million, a hundred samples of the rest say more than splitting does."""
     problem = squares("always x <= 1.999")
@@ -78,7 +78,7 @@ def test_a_rare_failure_is_counted_in_what_a_proof_leaves():
     assert found.low <= truth <= found.high < 1.3 * truth
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_with_a_constraint_the_probability_is_that_of_what_it_accepts():
     problem = squares(where=lambda f: f["b"] > 0.3)
     proved = vj.verify(problem, boxes=250, samples=0, progress=False)
@@ -100,7 +100,7 @@ def test_what_is_proved_as_a_whole_needs_no_simulation():
         vj.falsify(problem, vj.Start(proved=proved))
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_a_run_simulates_nothing_that_is_proved(proved, tmp_path):
     run = vj.falsify(
         squares(), vj.Start("uniform", proved=proved), 200, folder=tmp_path, progress=False
@@ -114,7 +114,7 @@ def test_a_run_simulates_nothing_that_is_proved(proved, tmp_path):
     assert len(more.table) == 300
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_a_search_begins_where_bounds_are_loosest():
     """A needle of a share of 3e-6: its box has the lowest bound, and a search of it takes long."""
 
@@ -144,7 +144,7 @@ def test_a_proof_of_another_problem_proves_nothing(proved):
         vj.estimate(squares(), proved=proved, precision="float64")
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_parameters_are_proved_as_a_set():
     """The formula holds for all `w` where `1.25 + 0.1 d^2 <= gain <= 2.5 - 0.1 d^2`."""
 

@@ -19,7 +19,7 @@ half = vj.Problem("half", {"x": vj.Box(0, 1)}, system, "always x <= 0.5")
 """
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_the_command_prints_saves_goes_on_and_fails_by_its_gate(tmp_path):
     file, into = tmp_path / "model.py", tmp_path / "half.json"
     file.write_text(MODEL)

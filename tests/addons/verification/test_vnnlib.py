@@ -115,7 +115,7 @@ def test_small_networks_have_the_answers_that_are_known(block, tmp_path):
         answered(seed, tmp_path)
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_the_command_answers_for_a_network(tmp_path):
     arrays = small_network(np.random.default_rng(3), tmp_path / "net.onnx")
     above(tmp_path / "rule.vnnlib", greatest(arrays) - 0.1)

@@ -39,7 +39,7 @@ def leftovers(folder):
     return [p.name for p in folder.rglob("*") if p.name.startswith(".") or ".part" in p.name]
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_files_that_belong_together_are_replaced_together(tmp_path):
     folder, user = tmp_path / "link", tmp_path / "real"
     user.mkdir()
@@ -71,7 +71,7 @@ def test_files_that_belong_together_are_replaced_together(tmp_path):
     assert folder.is_symlink()
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_a_reader_who_is_killed_loses_nothing_either(tmp_path):
     folder, whole = tmp_path / "it", tmp_path / "cut"
     write(folder, "new")
@@ -188,7 +188,7 @@ def runs():
     return problem, few, vj.falsify(problem, "cross_entropy", 64, batch=16, progress=False)
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 @pytest.mark.parametrize("what", ["another", "own"])
 def test_a_saved_run_is_old_or_new(runs, tmp_path, what):
     problem, one, other = runs

@@ -282,7 +282,7 @@ def test_a_script_without_a_guard_is_told_so(tmp_path):
     assert "under `if __name__ == '__main__':`" in last
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_a_session_without_a_file_is_told_so():
     done = run("-", stdin=textwrap.dedent(SCRIPT) + "\nmain()\n")
     assert done.returncode == 1

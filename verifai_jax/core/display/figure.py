@@ -95,7 +95,8 @@ def _figure_class() -> Any:
     class NotebookFigure(Figure):
         def draw(self, renderer: Any) -> None:
             layout = self.get_layout_engine()
-            if isinstance(layout, ConstrainedLayoutEngine) and self.canvas.is_saving():
+            draws_twice = self.axes and isinstance(layout, ConstrainedLayoutEngine)
+            if draws_twice and self.canvas.is_saving():
                 # For a layout matplotlib draws twice; the second time alone is seen.
                 return layout.execute(self)
             return super().draw(renderer)

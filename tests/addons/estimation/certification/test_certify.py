@@ -83,7 +83,7 @@ def test_verdicts_of_known_rates(certificates):
     assert certificates.stopped == "decided"
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 @pytest.mark.parametrize("traced", [True, False])
 def test_certificates_from_workers_are_the_same(traced):
     policies = POLICIES if traced else [lambda x, t=t: x - t for t in THRESHOLDS]

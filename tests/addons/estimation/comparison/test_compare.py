@@ -32,7 +32,7 @@ def make(threshold, name="square", noise=0.0, space=SPACE, spec="always x < 1"):
 BASE = make(0.9)
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_a_pair_of_systems_that_draw_fails_again_under_its_key():
     sides = make(0.9, noise=0.4), make(0.8, name="candidate", noise=0.4)
     result = vj.compare(*sides, budget=4000)
@@ -61,7 +61,7 @@ def test_a_regression_is_found_and_lies_where_it_does():
     assert vj.compare(make(0.8), BASE).verdict == "better"
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_equal_ones_differ_in_no_pair_and_several_hold_together():
     result = vj.compare(BASE, {"same": make(0.9), "bad": make(0.7)}, margin=0.01, budget=30_000)
     same, bad = result["same"], result["bad"]

@@ -82,7 +82,7 @@ def test_no_difference_where_terms_are_only_written_otherwise():
     assert found.table["gap"].max() < 1e-9
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_another_integrator_at_another_clock():
     found = compared(plant(), plant(method="euler", dt=0.025, steps=120))
     assert found.differs
@@ -141,7 +141,7 @@ def test_another_integrator_or_armature_of_mujoco(pendulums, change, said):
     assert said in str(found)
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_integrators_of_mujoco_that_are_one_where_only_joints_are_damped(pendulums):
     """MuJoCo's Euler treats the damping of joints implicitly."""
     found = pendulums({}, {"integrator": "implicitfast"})

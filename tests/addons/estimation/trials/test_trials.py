@@ -57,6 +57,7 @@ class TestRealTrials:
         assert found.rate.worth > 1.5 * found.rate.trials
         assert found.simulated.estimate < truth
 
+    @pytest.mark.slow
     def test_the_summary_is_made_of_the_counts(self, found, trials):
         text = str(found)
         assert f"60 real trials, {trials['failed'].sum()} failed" in text
@@ -92,6 +93,7 @@ class TestRealTrials:
         assert any("1 recording without a verdict" in note for note in judged.notes)
         assert ", 1 undecided" in str(judged)
 
+    @pytest.mark.slow
     def test_command(self, tmp_path, monkeypatch, trials):
         from verifai_jax.cli.main import main
 

@@ -74,7 +74,7 @@ def fails_at(speed, start, severity):
     return by_numpy(speed, start, lambda g: g if g < 15.0 - 9.0 * severity else NOTHING) <= 0
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_the_region_is_that_of_brute_force():
     loop = AbstractLoop(problem(), lambda s: braking(late(s)), vj.parse(ERROR), 0)
     region = sample_region(loop, 300, 0)

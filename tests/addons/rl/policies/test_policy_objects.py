@@ -97,7 +97,7 @@ def test_observations_are_scaled_clipped_and_stacked():
     np.testing.assert_allclose(seen, [2, 2, 3, 3, 4, 4])
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_weights_are_a_pytree_with_gradients_and_in_double_precision():
     loaded = policy(FILES / "ppo.zip")
     observation = jnp.array([0.1, 0.2, -0.3, 0.4])
@@ -111,7 +111,7 @@ def test_weights_are_a_pytree_with_gradients_and_in_double_precision():
     np.testing.assert_allclose(scaled.act(observation), [0.0, 0.0], atol=1e-6)
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_it_controls_a_system_and_is_falsified():
     actor = policy(FILES / "ppo.zip")
 
@@ -139,7 +139,7 @@ def test_it_controls_a_system_and_is_falsified():
     assert run.table.counterexamples["verdict"].notna().all()
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_a_recurrent_one_is_reset_with_the_episode():
     gymnasium = pytest.importorskip("gymnasium")
     actor = policy(FILES / "lstm.onnx", action="clip", low=(-1, -1), high=(1, 1))

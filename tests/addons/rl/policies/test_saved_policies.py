@@ -34,6 +34,7 @@ def observations_of(name):
         return file["observations"][:4]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "ending"),
     [

@@ -68,7 +68,7 @@ def test_derivatives_and_batches():
     np.testing.assert_allclose(forward, slopes[0], rtol=1e-3)
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_what_needs_too_many_steps_is_not_finite():
     pytest.importorskip("diffrax")
     system = van_der_pol(method=adaptive("Tsit5", max_steps=2))

@@ -100,7 +100,7 @@ def test_gymnax_and_gymnasium_agree(late):
             gymnasium("CartPole-v1", weighted, reset=reset, **options)({**features, "late": bad}, 0)
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_a_delay_is_searched_as_any_feature():
     pytest.importorskip("gymnax")
     from verifai_jax.addons.simulators.environments._gymnax import gymnax

@@ -184,7 +184,7 @@ def test_a_policy_network_is_an_object_with_act():
         observation, *_ = env.step(int(trace["action"][k]))
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_workers_make_their_own_environment():
     system = CARTPOLE(steps=50, workers=1)
     alone = CARTPOLE(steps=50)

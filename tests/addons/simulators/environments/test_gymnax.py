@@ -145,7 +145,7 @@ def test_gradient_that_the_environment_stops_is_refused():
         jax.eval_shape(jax.grad(lambda t: system({"theta0": t}, KEY)["x"][-1]), 0.1)
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_falsified_in_batches():
     problem = vj.Problem(
         "gymnax",
@@ -181,7 +181,7 @@ def test_time_limit_cuts_only_when_asked():
     assert int(cut({}, KEY).valid) == 6
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_signal_feature_sets_a_parameter_as_it_changes():
     system = gymnax(
         "Pendulum-v1",

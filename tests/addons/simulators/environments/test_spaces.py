@@ -241,7 +241,7 @@ def test_an_overshoot_may_be_passed_on_and_is_noted():
     assert any("was passed on (clip=False)" in note for note in run.notes)
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_workers_count_too():
     problem = machine_problem(workers=1)
     run = vj.falsify(problem, "uniform", budget=4, progress=False)

@@ -167,7 +167,7 @@ def test_an_array_is_refused(system):
             problem(system, table=vj.Box(0, 1)).check()
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_values_beyond_the_declared_range_are_a_note(system):
     beyond = problem(system, level=vj.Box(-1.0, 0.5), gear=vj.Categorical(2, 7))
     beyond.check()

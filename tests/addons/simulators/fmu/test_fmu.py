@@ -56,7 +56,7 @@ class TestSimulation:
         assert int(trace.valid) == 1
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_a_crash_is_one_row(file):
     space = {"mode": vj.Categorical(0, 1, 2), "x0": vj.Box(0.5, 1.5)}
     problem = vj.Problem("spring", space, vj.fmu(file, **TIMES), "always body_x < 1.4")

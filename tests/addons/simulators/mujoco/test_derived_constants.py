@@ -144,7 +144,7 @@ def full_inertia(compiled):
     return np.stack(full)
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_inertia_follows_size_and_mass(oracle, in_jax, in_c):
     for got in (in_jax, in_c):
         np.testing.assert_allclose(full_inertia(got), full_inertia(oracle), rtol=1e-9, atol=1e-12)

@@ -121,7 +121,7 @@ def python_controller(time, state, features):
 class TestControllersInPython:
     SPACE = vj.FeatureSpace({"k": vj.Box(0, 2)})
 
-    @pytest.mark.thorough
+    @pytest.mark.slow
     def test_native_calls_them_and_says_so(self):
         system = cart(controller=python_controller, backend="native", keyframe=0)
         problem = vj.Problem("cart", self.SPACE, system, "always x < 0.505")
@@ -137,7 +137,7 @@ class TestControllersInPython:
             np.testing.assert_allclose(system(k).signals["x"], traced(k).signals["x"], atol=1e-6)
         assert traced.notes == ()
 
-    @pytest.mark.thorough
+    @pytest.mark.slow
     def test_their_memory_goes_along(self):
         def counting(time, state, memory, features):
             if memory > 2:

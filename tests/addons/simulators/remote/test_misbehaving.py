@@ -65,7 +65,7 @@ def pooled():
     system.close()
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_every_exception_is_the_same_row_in_every_path(pooled):
     features = [{"a": float(number)} for number in (0, *TROUBLES)]
     plain = [outcome_of(lambda each=each: blackbox(troubled)(each)) for each in features]

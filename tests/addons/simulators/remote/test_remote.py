@@ -759,7 +759,7 @@ def process(tmp_path, port, *options):
     return subprocess.Popen([*command, *options, f"{file}:simulate"], stderr=subprocess.DEVNULL)
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_four_clients_one_killed_one_that_sends_garbage(tmp_path):
     space = {"a": vj.Box(-1.0, 1.0), "b": vj.Box(-1.0, 1.0)}
     done = threading.Event()

@@ -76,6 +76,7 @@ def test_every_arm_adds_what_it_says(whole):
     assert space.columns == ("x", "y")
 
 
+@pytest.mark.slow
 def test_numbers_are_those_of_the_networks(whole):
     result, _ = whole
     rng = np.random.default_rng(3)
@@ -121,6 +122,7 @@ def test_finished_work_is_read_and_the_rest_computed(whole):
         vj.augment(TASK, "none", seeds=2, folder=folder, **{**SMALL, "added": 25})
 
 
+@pytest.mark.slow
 def test_an_interrupted_study_goes_on(whole, tmp_path):
     result, _ = whole
     arms = ("none", "counterexamples", "random")
@@ -221,6 +223,7 @@ def test_training_that_diverges_is_told():
     assert "not finite   3 networks" in str(result)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("search", ["cross_entropy", "gradient"])
 def test_any_search_fills_the_table(search):
     options = {**SMALL, "steps": (STEPS, STEPS), "budget": 64}

@@ -109,7 +109,7 @@ def test_result_agrees_with_its_table(whole):
     assert result.baseline is result.certificates[2]
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_no_certificate_has_a_sample_that_was_trained_on(whole):
     result, certificates = whole
     seeds = [each.seed for each in certificates]
@@ -209,7 +209,7 @@ def test_a_function_that_trains_gets_where_its_episodes_begin(tmp_path):
     assert str(again.table.drop(columns="seconds")) == str(result.table.drop(columns="seconds"))
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_where_nothing_fails_it_is_certified_at_once():
     result = harden(Trainer(TASK, PPO_SMALL), staying_below(100.0), p=0.1, **SMALL)
     assert (result.stopped, result.safe) == ("certified", True)

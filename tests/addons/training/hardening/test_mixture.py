@@ -46,7 +46,7 @@ def test_a_task_that_cannot_start_is_refused():
     assert callable(OdeTask.start)
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("spec", "radius"), [("x <= 0.5", RADIUS), ("abs(x - 0.8) > 0.001", NARROW)]
 )

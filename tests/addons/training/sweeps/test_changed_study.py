@@ -15,7 +15,7 @@ from verifai_jax.core.store.cache import CacheError
 from verifai_jax.core.user_code.sources import Source
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_finished_work_of_another_study_is_not_gone_on_with(tmp_path, monkeypatch):
     monkeypatch.setattr(driver, "certify", quick_certificates)
     study, options = drifting(), {"configurations": 1, "folder": tmp_path / "work"}

@@ -32,6 +32,7 @@ def bits(policy):
     return [np.asarray(leaf).tobytes() for leaf in jax.tree.leaves(policy)]
 
 
+@pytest.mark.slow
 def test_trained_again_to_the_same_bits(swept, tmp_path, caplog):
     pytest.importorskip("onnx")
     for row in swept.table.index:

@@ -89,7 +89,7 @@ def test_components_of_the_unsafe_and_the_safe(planted):
     assert "unsafe configurations vary most along" in str(planted)
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_checkpoints_count_as_training_set_size():
     table = made(
         12,

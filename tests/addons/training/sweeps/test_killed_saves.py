@@ -84,7 +84,7 @@ def test_it_is_the_old_or_the_new(saver, tmp_path):
     assert killed_everywhere(lambda: new(folder), check) > 10
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_there_is_no_other():
     root = Path(verifai_jax.__file__).parent
     calling = set()

@@ -48,7 +48,7 @@ def call(tmp_path, monkeypatch):
 SMALL = ("--configurations", 3, "--samples", 64, "--no-pictures")
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_sweep_and_what_it_writes(call, tmp_path):
     output = call("specs/drift.py:safe", *SMALL, "--seed", 2)
     assert output.startswith("safe: 3 configurations")
@@ -63,7 +63,7 @@ def test_sweep_and_what_it_writes(call, tmp_path):
     assert (tmp_path / "sweeps" / "safe-2").exists()
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_resume_goes_on_with_what_was_asked_for(call, tmp_path, monkeypatch):
     asked = ("--search", "cross_entropy", "--set", "elite=0.5", "--halving", 2, "--seed", 3)
     whole = call("specs/drift.py:safe", *SMALL, *asked, "--folder", "whole")

@@ -76,7 +76,7 @@ def test_one_row_a_policy(whole):
     assert {"training", "certifying"} <= set(whole.record.seconds)
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_callbacks_see_each_policy_twice_also_from_the_cache(tmp_path):
     calls = [[], []]
     for seen in calls:
@@ -280,7 +280,7 @@ def test_interrupted_and_resumed_it_is_the_same_sweep(case, monkeypatch, tmp_pat
     same_tables(sweep(study, folder=tmp_path / "through", **how), through, but=())
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_a_store_of_another_sweep_says_what_differs(tmp_path):
     sweep(drifting(), configurations=2, certification=vj.Certification(samples=8), folder=tmp_path)
     for other, how, told in (

@@ -407,7 +407,7 @@ def test_a_large_sweep_shows_what_matters(large):
     assert {text.get_text() for text in figure.axes[2].get_yticklabels()} >= {"learning_rate"}
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_nothing_heavy_is_imported_to_read_a_summary():
     code = (
         "import sys, verifai_jax.addons.training.sweeps.result\n"

@@ -161,7 +161,7 @@ def winding(random):
     return function
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_networks_that_wind_contain_their_values():
     for seed in range(4):
         random = np.random.default_rng(seed)
