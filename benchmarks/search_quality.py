@@ -350,7 +350,7 @@ CONSTANTS = {
     "PRIOR_COSTS": (2.0, 8.0),
     "DISCOUNT": (0.95, 0.99),
     "MIN_SHARE": (0.02, 0.1),
-    "IN_VAIN": (3, 12),
+    "IN_VAIN": ((3, 3), (3, 12)),
     "OPENING": (4, 12),
     "OPENING_ROWS": (10, 40),
     "MODELLED": (0.6, 0.95),

@@ -67,10 +67,10 @@ mutations, whose gains are small: five problems took up to 1.5 times as many sim
 MODELLED = 0.8
 """Share of the models of what descents leave in small rounds, chosen by hand. By gains, of which
 the first few are luck, the other two get half of it after one round."""
-IN_VAIN = 6
-"""Power of the share of coordinates that descents can move with which their gains count: the models
-know what choices do. With 3 the medians of `menu`, `recipe`, `mixed` and `cruise` were 1.2 to 1.4
-times as high (`benchmarks/RESULTS.md`)."""
+IN_VAIN = 3, 6
+"""Power of the share of coordinates that descents can move with which their gains count, without and
+with models, which know what choices do: with 3 the medians of `menu`, `recipe`, `mixed` and `cruise`
+were 1.2 to 1.4 times as high (`benchmarks/RESULTS.md`)."""
 OPENING = 6
 """Descents before the budget is shared by evidence, and before one starts from the best points."""
 OPENING_ROWS = 20
@@ -360,17 +360,18 @@ class Portfolio(Search[PortfolioState]):
         limits = np.array([descents, batch, batch, batch])
         # Mutations begin when enough is explored, whatever descents have seen.
         descended = jnp.sum(common.usable & is_member[GRADIENT]).astype(jnp.int32)
+        early = state.opening if state.model is None else state.opening | ~known
         state = state._replace(
             mutation=mutation._replace(verdicts=jnp.maximum(mutation.verdicts - descended, 0)),
             cross_entropy=self._cross_entropy(batch).tell(state.cross_entropy, cube, common),
             model=None if state.model is None else state.model.learned(common.u, common.score),
             # What it gains while it goes first says nothing about what it will.
             gains=jnp.where(
-                state.opening | ~known,
+                early,
                 state.gains,
                 kept * state.gains + jnp.minimum(jnp.sum(is_member & gained[None], axis=1), limits),
             ),
-            costs=jnp.where(state.opening | ~known, state.costs, kept * state.costs + spent),
+            costs=jnp.where(early, state.costs, kept * state.costs + spent),
             # Nobody saves, or owes, more than a few rounds.
             credit=jnp.clip(credit, -4.0 * batch, 4.0 * batch).astype(jnp.float32),
         )
@@ -424,9 +425,12 @@ class Portfolio(Search[PortfolioState]):
         rate = (state.gains + 0.1 * prior) / (state.costs + 0.1 * PRIOR_COSTS)
         # Descents move the continuous coordinates alone, and are in vain where a choice is wrong.
         moved = len(cube.continuous) / max(cube.dim, 1)
-        rate = rate.astype(jnp.float32).at[GRADIENT].multiply(moved**IN_VAIN)
-        others = prior[MUTATION:]
-        rate = rate.at[MUTATION:].set(others / np.sum(others) * jnp.sum(rate[MUTATION:]))
+        power = IN_VAIN[state.model is not None]
+        rate = rate.astype(jnp.float32).at[GRADIENT].multiply(moved**power)
+        descends = state.gradient is not None and not len(cube.discrete)
+        if state.model is not None or (batch >= FILLED and not (descends or cube.signals)):
+            others = prior[MUTATION:]
+            rate = rate.at[MUTATION:].set(others / np.sum(others) * jnp.sum(rate[MUTATION:]))
         if state.gradient is None:
             dead, smallest = jnp.array(True), 0.0
         else:
