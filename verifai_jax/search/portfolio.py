@@ -68,9 +68,9 @@ MODELLED = 0.8
 """Share of the models of what descents leave in small rounds, chosen by hand. By gains, of which
 the first few are luck, the other two get half of it after one round."""
 IN_VAIN = 3, 6
-"""Power of the share of coordinates that descents can move with which their gains count, without and
-with models, which know what choices do: with 3 the medians of `menu`, `recipe`, `mixed` and `cruise`
-were 1.2 to 1.4 times as high (`benchmarks/RESULTS.md`)."""
+"""Powers of the share of coordinates that descents can move with which their gains count, without
+models and with them, which know what choices do: with 3 the medians of `menu`, `recipe`, `mixed`
+and `cruise` were 1.2 to 1.4 times as high (`benchmarks/RESULTS.md`)."""
 OPENING = 6
 """Descents before the budget is shared by evidence, and before one starts from the best points."""
 OPENING_ROWS = 20
