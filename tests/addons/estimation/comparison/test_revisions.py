@@ -47,6 +47,8 @@ def project(tmp_path, monkeypatch):
     (tmp_path / "specs" / "scale.txt").write_text("1.0")
     (tmp_path / "control" / "limit.py").write_text("LIMIT = 0.9\n")
     git(tmp_path, "init", "-q", "-b", "main")
+    # Python writes these for whoever imports a module of the checkout.
+    (tmp_path / ".gitignore").write_text("__pycache__/\n")
     git(tmp_path, "add", "-A")
     git(tmp_path, "commit", "-q", "-m", "first")
     (tmp_path / "control" / "limit.py").write_text("LIMIT = 0.7\n")
