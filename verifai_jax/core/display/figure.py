@@ -95,10 +95,9 @@ def _figure_class() -> Any:
     class NotebookFigure(Figure):
         def draw(self, renderer: Any) -> None:
             layout = self.get_layout_engine()
-            draws_twice = self.axes and isinstance(layout, ConstrainedLayoutEngine)
-            if draws_twice and self.canvas.is_saving():
+            if isinstance(layout, ConstrainedLayoutEngine) and self.canvas.is_saving():
                 # For a layout matplotlib draws twice; the second time alone is seen.
-                return layout.execute(self)
+                return layout.execute(self) if self.axes else None
             return super().draw(renderer)
 
         def savefig(self, *arguments: Any, **options: Any) -> None:
