@@ -168,6 +168,10 @@ def pytest_configure(config: pytest.Config) -> None:
 
 def pytest_collection_finish(session: pytest.Session) -> None:
     """Leave what is imported out of garbage collections: nothing of it goes before the end."""
+    # A test may edit a module twice in a second, which a compiled file cannot tell: from here on
+    # none is kept.
+    sys.dont_write_bytecode = True
+    os.environ["PYTHONDONTWRITEBYTECODE"] = "1"
     gc.collect()
     gc.freeze()
 
