@@ -27,18 +27,22 @@ def rows(count=40):
     return u, (score + 0.01 * rng.normal(size=count)).astype(np.float32)
 
 
+def learned():
+    """The models of the rows, which of their points are there, and what they learn of each."""
+    model = Surrogate.nothing(3).learned(*rows())
+    there = jnp.isfinite(model.score)
+    return model, there, targets(model.score, there)
+
+
 def evidence(covariance, y):
     """The logarithm of the evidence, with the scale that makes it greatest."""
     square = y @ np.linalg.solve(covariance, y)
     return -0.5 * len(y) * np.log(square) - 0.5 * np.linalg.slogdet(covariance)[1]
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_the_mean_of_the_additive_model_is_that_of_ridge_regression():
-    u, score = rows()
-    model = Surrogate.nothing(3).learned(u, score)
-    there = jnp.isfinite(model.score)
-    y = targets(model.score, there)
+    model, there, y = learned()
     nothing = jnp.zeros((1, 2 * 2 + 3)), jnp.zeros((1, CAPACITY))
     found = np.asarray(model._minima(CUBE, y, there, *nothing))[0]
     # Regression in NumPy; the columns are a line and a parabola of each number, and the cells.
@@ -53,12 +57,9 @@ def test_the_mean_of_the_additive_model_is_that_of_ridge_regression():
     assert CUBE.cells(found[None])[0, 0] == np.argmin(weights[4:]) == 1
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_the_process_chooses_the_lowest_bound():
-    u, score = rows()
-    model = Surrogate.nothing(3).learned(u, score)
-    there = jnp.isfinite(model.score)
-    y = targets(model.score, there)
+    model, there, y = learned()
     choices = np.random.default_rng(1).random((60, 3), np.float32)
     optimism = np.array([[0.0], [0.5], [3.0], [30.0]], np.float32)
     found = model._lowest(CUBE, y, there, jnp.asarray(choices), jnp.asarray(optimism))

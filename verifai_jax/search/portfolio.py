@@ -336,7 +336,7 @@ class Portfolio(Search[PortfolioState]):
     def _learn(
         self, state: PortfolioState, cube: Cube, observations: Observations, common: Observations
     ) -> PortfolioState:
-        """Tell the three members, and count what the one that proposed a point has gained."""
+        """Tell the members, and count what the one that proposed a point has gained."""
         batch = len(observations.rho)
         member = self._members(state.rows, batch)
         # A gain is a point among the best, once there are enough of them. A descent that began at

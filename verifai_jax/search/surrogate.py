@@ -43,7 +43,7 @@ PATIENCE = 80
 """Simulations without progress after which half of the proposals are drawn from the prior: slopes
 may lead away from the failures."""
 CHOICES = 384
-"""Points among which the process chooses, of which a third are drawn from the prior."""
+"""Candidates that the process compares. A third of them are drawn from the prior."""
 MAX_DIM = 256
 """Coordinates up to which there are models: more are left to the other members."""
 

@@ -97,16 +97,19 @@ def system(names=FEATURES, **options):
     return model(TEXT, bind=bind, **{**settings, **options})
 
 
-@pytest.mark.slow
-def test_backends_agree_on_every_kind_of_feature():
+def rows_and_keys():
     """A row with the first values, one with the second, and one for each second value alone."""
     rows = {}
     for i, (name, (_, first, second)) in enumerate(FEATURES.items()):
         column = np.full(len(FEATURES) + 2, first, np.float32)
         column[[i + 1, -1]] = second
         rows[name] = column
-    keys = jax.random.split(jax.random.key(0), len(FEATURES) + 2)
-    both = system()
+    return rows, jax.random.split(jax.random.key(0), len(FEATURES) + 2)
+
+
+@pytest.mark.slow
+def test_backends_agree_on_every_kind_of_feature():
+    (rows, keys), both = rows_and_keys(), system()
     in_c = both.with_backend("native").simulate_batch(rows, keys)
     in_jax = jax.jit(jax.vmap(both.with_backend("mjx")))(rows, keys)
     for name in SIGNALS:

@@ -86,14 +86,12 @@ class TestAgainstC:
         check_system(balls(backend="warp"), space, tolerance=0.0)
 
     def test_every_kind_of_feature(self):
-        from test_mujoco_parity import FEATURES, system  # pyright: ignore[reportMissingImports]
+        from test_mujoco_parity import (  # pyright: ignore[reportMissingImports]
+            rows_and_keys,
+            system,
+        )
 
-        rows = {}
-        for i, (name, (_, first, second)) in enumerate(FEATURES.items()):
-            column = np.full(len(FEATURES) + 2, first, np.float32)
-            column[[i + 1, -1]] = second
-            rows[name] = column
-        keys = jax.random.split(jax.random.key(0), len(FEATURES) + 2)
+        rows, keys = rows_and_keys()
         here, there = (
             system().with_backend(name).simulate_batch(rows, keys) for name in ("warp", "native")
         )
