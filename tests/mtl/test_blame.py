@@ -5,7 +5,7 @@ import pytest
 
 import verifai_jax as vj
 from verifai_jax.mtl import parse
-from verifai_jax.mtl.blame import broken_at
+from verifai_jax.mtl.blame import broken_at, certain_from
 from verifai_jax.mtl.host_values import HostValues
 
 # In each, a predicate stands where more of it can only help; `condition` makes no difference.
@@ -59,3 +59,31 @@ def test_only_windows_are_to_blame():
     (at,) = broken_at(parse("always[70, 100] x > 0"), vj.Trace({"x": x}, dt=1.0)).values()
     assert list(np.flatnonzero(at)) == [80]
     assert not broken_at(parse("always[90, 100] x > 0"), vj.Trace({"x": x}, dt=1.0))
+
+
+HELPS = {"p": 1.0, "q": 1.0, "c": -1.0}  # the values that help each of the formulas
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize("end", ["hold", "truncate"])
+@pytest.mark.parametrize("text", FORMULAS)
+def test_a_formula_is_broken_from_where_the_best_that_may_follow_does_not_help(text, end):
+    rng, formula, instants = np.random.default_rng(1), parse(text), set()
+    for _ in range(100):
+        signals = {name: rng.choice([-1.0, 1.0], 12) for name in HELPS}
+        found = None
+        for k in reversed(range(12)):
+            then = {n: np.where(np.arange(12) <= k, x, HELPS[n]) for n, x in signals.items()}
+            if HostValues.of(vj.Trace(then, dt=1.0), end).holds(formula):
+                break
+            found = k
+        assert certain_from(formula, vj.Trace(signals, dt=1.0), end) == found
+        instants.add(found)
+    assert len(instants) > 1
+
+
+def test_what_never_comes_is_broken_at_the_end_of_its_window():
+    low = vj.Trace({"x": -np.ones(11)}, dt=0.5)
+    assert certain_from(parse("eventually[0, 3] x > 0"), low) == 6
+    assert certain_from(parse("always x > 0"), low) == 0
+    assert certain_from(parse("always (x > -0.5 | x < 0)"), low) is None

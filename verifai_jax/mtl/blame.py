@@ -1,9 +1,12 @@
-"""The instants at which the predicates of a violated formula break it.
+"""The instants at which the predicates of a violated formula break it, and when that is certain.
 
     broken_at(parse("always[70, 100] x > 0"), trace)    # {x > 0: only instants from 70 s on}
+    certain_from(parse("eventually[0, 5] x > 0"), trace)    # the sample at 5 s
 
 A walk from the formula down follows the operands that are false (or true, below a negation).
 """
+
+from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Bool, Int
@@ -11,8 +14,10 @@ from jaxtyping import Bool, Int
 from verifai_jax.core.values.trace import Trace
 from verifai_jax.mtl import formula as ast
 from verifai_jax.mtl.evaluate import End
+from verifai_jax.mtl.expression import Signal
 from verifai_jax.mtl.formula import Formula, surface
 from verifai_jax.mtl.host_values import HostValues
+from verifai_jax.mtl.rewriting import expand, replaced
 
 Mask = Bool[np.ndarray, " time"]
 
@@ -26,6 +31,28 @@ def broken_at(formula: Formula, trace: Trace, end: End = "hold") -> dict[Formula
     **Returns:** by predicate the samples of the trace, without those after its last valid one.
     """
     return _Blame(HostValues.of(trace, "truncate" if end == "truncate" else "hold")).of(formula)
+
+
+def certain_from(formula: Formula, trace: Trace, end: End = "hold") -> int | None:
+    """Return the sample from which on a formula is broken whatever follows, None if it holds.
+
+    What a predicate says of a sample is known from that sample on. So the earlier one that is false
+    decides `always`, and the last one of its window `eventually`: the formula has this instant as
+    its robustness if predicates have values whose size falls with time.
+
+    **Arguments:** as in `broken_at`.
+    """
+    values, formula = (
+        HostValues.of(trace, "truncate" if end == "truncate" else "hold"),
+        expand(formula),
+    )
+    leaves = [part for part in dict.fromkeys(formula.subformulas(True)) if part.is_predicate]
+    left = values.length - np.arange(values.length)
+    signals = {f"p{i}": left * values.truth(part) for i, part in enumerate(leaves)}
+    marks = {part: ast.Atom(Signal(name)) for part, name in zip(leaves, signals, strict=True)}
+    timed = replace(values, signals=signals, truths=frozenset(), _padded={}, _known={})
+    rho = float(timed.first(replaced(formula, marks))) if leaves else 0.0
+    return int(values.length + rho) // values.stride if -np.inf < rho < 0 else None
 
 
 class _Blame:

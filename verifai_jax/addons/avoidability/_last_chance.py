@@ -20,8 +20,7 @@ from verifai_jax.counterexamples.fixed_key import note_on_key
 from verifai_jax.counterexamples.selection import Row, problem_of, select_row
 from verifai_jax.evaluation.replay import Replay, replay
 from verifai_jax.falsification.run import Run
-from verifai_jax.mtl.blame import broken_at
-from verifai_jax.pictures.replay import decisive_instant
+from verifai_jax.mtl.blame import certain_from
 from verifai_jax.problem.problem import Problem
 from verifai_jax.systems.base import System
 
@@ -122,11 +121,8 @@ def last_chance(
             if np.any((own < means.low - slack) | (own > means.high + slack)):
                 notes.append("the policy's own actions leave the bounds of the actions")
         formula = problem.formulas[failing.worst]
-        broken = broken_at(formula, failing.trace, problem.end).values()
-        first = min((int(np.argmax(at)) for at in broken), default=length - 1)
-        if first < last * means.period:  # What never comes fails at the end of its window.
-            decided = decisive_instant(formula, failing.trace, problem.end)
-            first = first if decided is None else decided[1]
+        first = certain_from(formula, failing.trace, problem.end)
+        first = length - 1 if first is None else first
         kept = sorted(search.alone, reverse=True)[:MAX_ESCAPES]
         return LastChance(
             number, means.who, float(np.asarray(failing.trace.clock())[first]),

@@ -48,8 +48,7 @@ class LastChance(Drawn, InNotebook):
     """The last instant at which a failure could have been avoided, as a bracket in seconds.
 
     - `row`: the number of the failing simulation, None for given features; `by`: who could have
-      avoided it; `failed`: the first instant at which a predicate breaks the formula, or for what
-      never comes the one that decides it.
+      avoided it; `failed`: the first instant from which on the formula is broken whatever follows.
     - `avoidable_until`: the last instant with an escape, None if none was found; `no_escape_from`:
       the next instant that was tried; from it on no escape was found; `bracket`: both.
     - `proved_from`: the instant from which the failure is proved unavoidable; None without a proof.
