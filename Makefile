@@ -98,7 +98,7 @@ notebooks: .venv/installed
 
 # They take half of the time of all.
 LONG_NOTEBOOKS := 02_searches_and_error_tables.ipynb 04_rare_events.ipynb \
-  05_safe_hyperparameters.ipynb 06_perception.ipynb 07_augmentation.ipynb
+  05_safe_hyperparameters.ipynb 06_perception.ipynb 07_augmentation.ipynb 08_tempe.ipynb
 notebooks-short: .venv/installed
 	$(BIN)/python notebooks/execute.py --at-once 2 \
 	  $(filter-out $(LONG_NOTEBOOKS), $(sort $(notdir $(wildcard notebooks/*.ipynb))))
