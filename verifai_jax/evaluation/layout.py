@@ -27,7 +27,7 @@ PLAIN = frozenset((
     "abs", "add", "add_any", "and", "bitcast_convert_type", "broadcast_in_dim", "ceil", "clamp",
     "concatenate", "convert_element_type", "copy", "copy_p", "div", "dot_general", "dynamic_slice",
     "dynamic_update_slice", "eq", "expand_dims", "floor", "gather", "ge", "gt", "integer_pow",
-    "iota", "is_finite", "le", "lt", "max", "min", "mul", "ne", "neg", "not",
+    "iota", "is_finite", "le", "lt", "max", "min", "mul", "ne", "neg", "not", "one_minus_square",
     "optimization_barrier", "or", "pad", "reduce_and", "reduce_max", "reduce_min", "reduce_or",
     "reduce_sum", "rem", "reshape", "rev", "round", "scatter", "select_n", "shift_left",
     "shift_right_arithmetic", "shift_right_logical", "sign", "slice", "split", "sqrt", "square",
