@@ -41,6 +41,10 @@ shows in one of these, and a million checks take longer than what they look at."
 INSTANCES = 3
 """Functions made within another one, by the same lines of it, whose calls are checked."""
 
+COUNTED: Counter[Callable[..., Any]] = Counter()
+"""Calls so far. A variable of each function would be memory that it keeps from call to call, of
+which the package warns."""
+
 
 def check_first_calls() -> None:
     """Let jaxtyping's import hook make the checks of a function when it is called, and not always.
@@ -59,15 +63,13 @@ def check_first_calls() -> None:
         if made[fn.__code__] > INSTANCES:
             return fn
         checked: list[Callable[..., Any]] = []
-        calls = 0
 
         @functools.wraps(fn)
         def wrapped(*args: Any, **kwargs: Any) -> Any:
             __tracebackhide__ = True
-            nonlocal calls
-            if calls >= CALLS:
+            if COUNTED[fn] >= CALLS:
                 return fn(*args, **kwargs)
-            calls += 1
+            COUNTED[fn] += 1
             if not checked:
                 checked.append(whole(typechecker=typechecker)(fn))
             return checked[0](*args, **kwargs)

@@ -52,7 +52,7 @@ def test_first_points_come_first_and_the_search_goes_on_as_ever():
     "search", ["cross_entropy", pytest.param("coverage", marks=pytest.mark.addons), "portfolio"]
 )
 def test_a_search_learns_from_them_and_resuming_keeps_them(search, tmp_path):
-    options = {"batch": 8, "first": FIRST, "seed": 3}
+    options, search = {"batch": 8, "seed": 3}, vj.Start(search, rows=FIRST)
     whole = vj.falsify(PROBLEM, search, 40, **options)
     vj.falsify(PROBLEM, search, 2, folder=tmp_path / "run", **options | {"batch": 2})
     stored = vj.load(tmp_path / "run", PROBLEM)
@@ -68,10 +68,10 @@ def test_a_search_learns_from_them_and_resuming_keeps_them(search, tmp_path):
     part = vj.falsify(PROBLEM, search, 40, callbacks=[stop], **options)
     assert (part.stopped, len(part.table) < 40) == ("interrupted", True)
     assert vj.resume(part, budget=40).table.all.equals(whole.table.all)
-    if search == "cross_entropy":
+    if search.search == "cross_entropy":
         # Its first proposals are drawn near the elite of what it was told.
         told = [{"a": 0.98, "b": 0.02 * i} for i in range(8)]
-        near = vj.falsify(PROBLEM, vj.Start(search, rows=told), 16, batch=8).table.all[8:]
+        near = vj.falsify(PROBLEM, vj.Start(search.search, rows=told), 16, batch=8).table.all[8:]
         assert near["a"].mean() > 0.8
 
 

@@ -72,8 +72,8 @@ def test_every_form_is_simulated_as_it_is(problem, precision):
 
 @pytest.mark.slow
 def test_rows_before_a_search(tmp_path):
-    options = {"batch": 8, "first": [ROW], "folder": tmp_path / "run"}
-    run = vj.falsify(PROBLEM, "cross_entropy", 16, **options)
+    options = {"batch": 8, "folder": tmp_path / "run"}
+    run = vj.falsify(PROBLEM, vj.Start("cross_entropy", rows=[ROW]), 16, **options)
     assert run.table.all.loc[0, NUMBERS].tolist() == numbers("float32")
     assert run.table.all.loc[0, "verdict"] == "confirmed"
     assert (

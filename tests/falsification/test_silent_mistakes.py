@@ -2,6 +2,7 @@
 
 import itertools
 import random
+from contextlib import suppress
 from pathlib import Path
 
 import jax
@@ -12,7 +13,7 @@ import pytest
 import verifai_jax as vj
 from verifai_jax.core.compute.jaxprs import programs_read
 from verifai_jax.core.compute.purity import difference
-from verifai_jax.core.user_code.targets import definitions
+from verifai_jax.core.user_code.targets import NothingDefined, definitions
 from verifai_jax.problem.problem import ProblemError
 from verifai_jax.problem.silent_mistakes import silent_mistakes
 
@@ -154,15 +155,16 @@ def test_the_specifications_of_this_project_get_no_false_note():
     # In a model of an aircraft the heading has no part in the altitude; who knows the distance of
     # the cones needs no eyes for colours and weather.
     right = ("feature 'psi' influences no signal", "features 'car_hue', 'car_value', 'car_gap'")
-    checked = 0
+    problems: dict[str, vj.Problem] = {}
     for file in sorted((ROOT / "specs").glob("**/*.py")):
         if file.stem in ("__init__", "tuning", "hopper", "reacher", "lstm"):
             continue
-        for name, problem in definitions(str(file), vj.Problem).items():
-            found = [note for note in silent_mistakes(problem) if not note.startswith(right)]
-            assert not found, f"{file}:{name}: {found}"
-            checked += 1
-    assert checked > 40
+        with suppress(NothingDefined):  # Such as a training.
+            problems |= {f"{file}:{n}": p for n, p in definitions(str(file), vj.Problem).items()}
+    assert len(problems) > 40
+    for name, problem in problems.items():
+        found = [note for note in silent_mistakes(problem) if not note.startswith(right)]
+        assert not found, f"{name}: {found}"
 
 
 class TestRuns:

@@ -168,7 +168,7 @@ def is_held(values: Shaped[np.ndarray, "t *vector"]) -> bool:
     """Return whether a signal keeps each of its values for two samples or more, as if held."""
     if values.dtype.kind in "biu":
         return True
-    changes = np.any((values[1:] != values[:-1]).reshape(len(values) - 1, -1), axis=1)
+    changes = (values[1:] != values[:-1]).any(axis=tuple(range(1, values.ndim)))
     return bool(changes.any() and not np.any(changes[1:] & changes[:-1]))
 
 

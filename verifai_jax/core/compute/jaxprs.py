@@ -30,7 +30,10 @@ WRITTEN_OUT: dict[str, Callable[..., Any]] = {
 
 def called(step: Any) -> Any | None:
     """Return the program that an equation calls once on its operands; None if it calls none."""
-    if (function := WRITTEN_OUT.get(step.primitive.name)) is not None:
+    function = WRITTEN_OUT.get(step.primitive.name)
+    if step.primitive.name == "call_hi_primitive":
+        function = step.params["_prim"].expand
+    if function is not None:
         operands = [jax.ShapeDtypeStruct(each.aval.shape, each.aval.dtype) for each in step.invars]
         return jax.make_jaxpr(function)(*operands)
     if step.primitive.name not in CALLS | CUSTOM_CALLS:

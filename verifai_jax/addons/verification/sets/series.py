@@ -10,7 +10,7 @@ Source: R. Moore, Methods and applications of interval analysis, SIAM (1979), se
 """
 
 import functools
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -48,6 +48,12 @@ CURVED = frozenset({
     "square", "tan", "tanh",
 })  # fmt: skip
 """Functions with derivatives of all orders, which JAX knows."""
+SLOPES: dict[str, Callable[[Array], Array]] = {
+    "asinh": lambda x: jax.lax.rsqrt(1 + x * x),
+    "erf": lambda x: 2 / np.sqrt(np.pi) * jnp.exp(-x * x),
+    "erfc": lambda x: -2 / np.sqrt(np.pi) * jnp.exp(-x * x),
+}
+"""Derivatives in one formula, for which JAX 0.12 has branches by the size of the number."""
 LINEAR = frozenset({
     "add", "add_any", "broadcast_in_dim", "concatenate", "copy", "convert_element_type", "cumsum",
     "neg", "reduce_sum", "reshape", "rev", "slice", "split", "squeeze", "stack", "sub", "transpose",
@@ -167,6 +173,9 @@ class Rates:
             for i, operand in enumerate(operands):
 
                 def slope(*values: Array, i: int = i) -> Array:
+                    if step.primitive.name in SLOPES:
+                        return SLOPES[step.primitive.name](*values)
+
                     def of(x: Array) -> Array:
                         return step.primitive.bind(*values[:i], x, *values[i + 1 :], **step.params)
 
