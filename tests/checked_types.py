@@ -13,6 +13,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator
 from types import CodeType
 from typing import Any
+from weakref import WeakKeyDictionary
 
 import jaxtyping
 import numpy as np
@@ -41,7 +42,7 @@ shows in one of these, and a million checks take longer than what they look at."
 INSTANCES = 3
 """Functions made within another one, by the same lines of it, whose calls are checked."""
 
-COUNTED: Counter[Callable[..., Any]] = Counter()
+COUNTED: WeakKeyDictionary[Callable[..., Any], int] = WeakKeyDictionary()
 """Calls so far. A variable of each function would be memory that it keeps from call to call, of
 which the package warns."""
 
@@ -67,9 +68,9 @@ def check_first_calls() -> None:
         @functools.wraps(fn)
         def wrapped(*args: Any, **kwargs: Any) -> Any:
             __tracebackhide__ = True
-            if COUNTED[fn] >= CALLS:
+            if (calls := COUNTED.get(fn, 0)) >= CALLS:
                 return fn(*args, **kwargs)
-            COUNTED[fn] += 1
+            COUNTED[fn] = calls + 1
             if not checked:
                 checked.append(whole(typechecker=typechecker)(fn))
             return checked[0](*args, **kwargs)

@@ -81,7 +81,7 @@ def resident():
 
 for number in range(123):
     vj.falsify(problem(number), "uniform", 100, progress=False)
-    if number == 9:
+    if number == 39:  # Programs of the last ones are kept.
         few = resident()
 print(few, resident())
 """
@@ -89,7 +89,7 @@ print(few, resident())
 
 @pytest.mark.slow
 @pytest.mark.skipif(not os.path.exists("/proc/self/statm"), reason="there is no /proc")
-def test_many_problems_need_little_more_memory_than_ten(tmp_path):
+def test_many_problems_need_little_more_memory_than_forty(tmp_path):
     environment = {**os.environ, "VERIFAI_JAX_CACHE": str(tmp_path)}
     done = subprocess.run(
         [sys.executable, "-c", SOAK, os.path.dirname(__file__)], env=environment,
