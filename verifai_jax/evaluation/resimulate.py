@@ -42,8 +42,8 @@ ONE_BY_ONE = 16
 SEEDS = 32
 """Seeds of a host system's rows that are made in one call, so that one program makes all."""
 LANES = (64, 256)
-"""Rows that a device replays together if there are more: the second number for more rows than
-`CALLS` calls of the first would take, since a call costs something whatever its size."""
+"""Rows that all devices replay together if there are more, and that each does where there are more
+than `CALLS` calls of the first would take, since a call costs something whatever its size."""
 CALLS = 6
 """Calls of the smaller program up to which the larger one is not compiled. Of a quadrotor of four
 states six calls take 0.12 s, the two of the larger program 0.10 s, and 0.28 s to compile."""
@@ -159,7 +159,8 @@ class Replays:
         """Return the number of replays in one call, for numbers of rows and repetitions."""
         if count <= ONE_BY_ONE:
             return ONE_BY_ONE
-        some, many = (lanes * len(jax.local_devices()) for lanes in LANES)
+        # Few rows are divided among the devices, so that most lanes have one.
+        some, many = LANES[0], LANES[1] * len(jax.local_devices())
         return many if count * times > CALLS * some else some
 
     def _keys(self, numbers: Int[np.ndarray, " n"], together: int) -> Key[Array, " together"]:
