@@ -319,13 +319,15 @@ def first_of_library(problem, library, budget, seeds):
 
 def on_small(options):
     """One line a problem: every search."""
+    from held_out_problems import HELD_OUT
     from small_problems import SMALL
 
+    problems = SMALL | HELD_OUT
     names = options.searches.split(",") if options.searches else list(vj.search.names())
     libraries = list(LIBRARIES) if options.libraries else []
     print("| problem | " + " | ".join(names + libraries) + " |")
     for name in options.problems or SMALL:
-        cells, problem = [name], SMALL[name]
+        cells, problem = [name], problems[name]
         for search in names + libraries:
             try:
                 if search in LIBRARIES:

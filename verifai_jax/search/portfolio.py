@@ -263,7 +263,7 @@ class Portfolio(Search[PortfolioState]):
         key = jax.random.fold_in(state.key, state.mutation.round)
 
         def propose() -> Float[Array, "batch d"]:
-            others, _ = Mutation().ask(state.mutation._replace(key=key), cube, CHOICES * 2 // 3)
+            others, _ = Mutation().ask(state.mutation._replace(key=key), cube, CHOICES // 3)
             return model.propose(key, cube, batch, others, state.mutation.stale)
 
         nothing = jnp.full((batch, cube.dim), 0.5, jnp.float32)
@@ -360,11 +360,17 @@ class Portfolio(Search[PortfolioState]):
         limits = np.array([descents, batch, batch, batch])
         # Mutations begin when enough is explored, whatever descents have seen.
         descended = jnp.sum(common.usable & is_member[GRADIENT]).astype(jnp.int32)
-        early = state.opening if state.model is None else state.opening | ~known
+        early, model = state.opening, state.model
+        if model is not None:
+            early |= ~known
+            model = model.learned(common.u, common.score)
+            # Where mutations begin again, elsewhere, so do the models.
+            again = known & jnp.isinf(mutation.score[0])
+            model = choose(again, Surrogate.nothing(cube.dim), model)
         state = state._replace(
             mutation=mutation._replace(verdicts=jnp.maximum(mutation.verdicts - descended, 0)),
             cross_entropy=self._cross_entropy(batch).tell(state.cross_entropy, cube, common),
-            model=None if state.model is None else state.model.learned(common.u, common.score),
+            model=model,
             # What it gains while it goes first says nothing about what it will.
             gains=jnp.where(
                 early,
