@@ -26,7 +26,7 @@ from verifai_jax.core.messages.checks import check_fraction
 from verifai_jax.core.values.cube import Cube
 from verifai_jax.search.base import Asked, Observations, Search, check_options
 from verifai_jax.search.best_points import keep_best
-from verifai_jax.search.draws import draw_columns, standard_normal
+from verifai_jax.search.draws import draw_uniform, standard_normal
 
 # The numbers below were chosen by hand. Nine variants were compared on NN of the ARCH competition:
 # half to a sixth of the exploration, steps up to 0.2, eight and sixteen parents, patience of 80.
@@ -94,9 +94,30 @@ class Mutation(Search[MutationState]):
         )
 
     def ask(self, state: MutationState, cube: Cube, batch: int) -> Asked[MutationState]:
-        d = cube.dim
+        u = self._proposed(state, cube, self._numbers(state, cube, batch))
+        return u, state._replace(round=state.round + 1)
+
+    def ask_for_both(
+        self, state: MutationState, cube: Cube, batch: int, key: Key[Array, ""], more: int
+    ) -> tuple[Float[Array, "batch d"], Float[Array, "more d"], MutationState]:
+        """Propose points as `ask` does, and more of them with another key, by one program."""
+        numbers = (
+            self._numbers(state, cube, batch),
+            self._numbers(state._replace(key=key), cube, more),
+        )
+        u = self._proposed(state, cube, jnp.concatenate(numbers))
+        return u[:batch], u[batch:], state._replace(round=state.round + 1)
+
+    def _numbers(self, state: MutationState, cube: Cube, rows: int) -> Float[Array, "rows numbers"]:
+        """Draw the random numbers of so many proposals."""
         key = jax.random.fold_in(state.key, state.round)
-        coins, values, cuts, masks, noise = draw_columns(key, batch, 16, d, d, d, d)
+        return draw_uniform(key, (rows, 16 + 4 * cube.dim))
+
+    def _proposed(
+        self, state: MutationState, cube: Cube, numbers: Float[Array, "n numbers"]
+    ) -> Float[Array, "n d"]:
+        """Return the proposals of these random numbers."""
+        coins, values, cuts, masks, noise = jnp.split(numbers, 16 + cube.dim * np.arange(4), axis=1)
         idle = jnp.minimum(state.stale / self.idle, 1.0)
         # Where all points are equally good there is nothing to start from, nor to lean to.
         level = (state.highest <= state.score[0]) & (state.score[0] >= 0)
@@ -108,8 +129,7 @@ class Mutation(Search[MutationState]):
         # The longer without progress, the more it explores.
         share = self.exploration + (MAX_EXPLORATION - self.exploration) * idle
         explores = (state.verdicts < self.first) | level | (coins[:, 15] < share)
-        u = jnp.where(explores[:, None], fresh, changed)
-        return u, state._replace(round=state.round + 1)
+        return jnp.where(explores[:, None], fresh, changed)
 
     def tell(self, state: MutationState, cube: Cube, observations: Observations) -> MutationState:
         # Of failures, which are equally good, the worst are kept, and of equal ones the newest.

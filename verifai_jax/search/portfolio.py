@@ -202,8 +202,15 @@ class Portfolio(Search[PortfolioState]):
         return self
 
     def ask(self, state: PortfolioState, cube: Cube, batch: int) -> Asked[PortfolioState]:
-        before = state
-        mutated, mutation = Mutation().ask(state.mutation, cube, batch)
+        before, modelled = state, None
+        if state.model is None:
+            mutated, mutation = Mutation().ask(state.mutation, cube, batch)
+        else:
+            key = jax.random.fold_in(state.key, state.mutation.round)
+            mutated, others, mutation = Mutation().ask_for_both(
+                state.mutation, cube, batch, key, CHOICES // 3
+            )
+            modelled = partial(state.model.propose, key, cube, batch, others, state.mutation.stale)
         drawn, cross_entropy = self._cross_entropy(batch).ask(state.cross_entropy, cube, batch)
         state = state._replace(mutation=mutation, cross_entropy=cross_entropy)
         share = self._shares(state, cube, batch)
@@ -241,8 +248,10 @@ class Portfolio(Search[PortfolioState]):
         u = jnp.where(
             member == GRADIENT, points, jnp.where(member == CROSS_ENTROPY, drawn, mutated)
         )
-        if before.model is not None:
-            u = jnp.where(member == MODEL, self._modelled(before, cube, batch, rows[MODEL]), u)
+        if modelled is not None:
+            u = jax.lax.cond(
+                rows[MODEL] > 0, lambda: jnp.where(member == MODEL, modelled(), u), lambda: u
+            )
         state = state._replace(rows=rows, differentiates=differentiates, opening=opening)
         if before.interior is None:
             return u, state
@@ -254,20 +263,6 @@ class Portfolio(Search[PortfolioState]):
         )  # fmt: skip
         state = choose(descents.turn, none, state._replace(interior=descents))
         return jnp.where(descents.turn, points, u), state
-
-    def _modelled(
-        self, state: PortfolioState, cube: Cube, batch: int, rows: Int[Array, ""]
-    ) -> Float[Array, "batch d"]:
-        model = state.model
-        assert model is not None
-        key = jax.random.fold_in(state.key, state.mutation.round)
-
-        def propose() -> Float[Array, "batch d"]:
-            others, _ = Mutation().ask(state.mutation._replace(key=key), cube, CHOICES // 3)
-            return model.propose(key, cube, batch, others, state.mutation.stale)
-
-        nothing = jnp.full((batch, cube.dim), 0.5, jnp.float32)
-        return jax.lax.cond(rows > 0, propose, lambda: nothing)
 
     def plan(self, state: PortfolioState, cube: Cube, batch: int) -> Plan:
         if state.gradient is None:

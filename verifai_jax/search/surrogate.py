@@ -95,21 +95,22 @@ class Surrogate(NamedTuple):
         - `others`: proposals of other searches, among which the process chooses too.
         - `stale`: the number of simulations since the last progress.
         """
-        x, d = _features(self.u, cube), cube.dim
+        p, d = _features(self.u, cube).shape[1], cube.dim
         if d == 0:  # One point is all that there is.
             return jnp.zeros((batch, 0), jnp.float32)
         each = -(-CHOICES // (3 * batch))
-        widths = 2, d, x.shape[1], CAPACITY, each * d, each * (2 + ELITE)
-        coins, prior, weights, noises, shared, steps = draw_columns(key, batch, *widths)
+        widths = 2, d, each * d, each * 2, p + CAPACITY + each * ELITE
+        coins, prior, shared, sizes, numbers = draw_columns(key, batch, *widths)
         evenly = jnp.maximum(EVENLY, stale / (stale + PATIENCE))
         there = jnp.isfinite(self.score)
         spread = jnp.max(self.score, where=there, initial=0.0) > jnp.min(self.score)
 
         def modelled() -> Float[Array, "batch d"]:
             y = targets(self.score, there)
-            normal = standard_normal(weights), standard_normal(noises)
-            drawn = self._minima(cube, y, there, *normal)
-            near = self._near(steps.reshape(-1, 2 + ELITE))
+            normal = standard_normal(numbers)
+            weights, noises, steps = jnp.split(normal, [p, p + CAPACITY], axis=1)
+            drawn = self._minima(cube, y, there, weights, noises)
+            near = self._near(sizes.reshape(-1, 2), steps.reshape(-1, ELITE))
             choices = jnp.concatenate([shared.reshape(-1, d), others, near])
             lowest = self._lowest(cube, y, there, choices, -jnp.log1p(-coins[:, 1:]))
             return jnp.where(coins[:, :1] < evenly + ADDITIVE * (1 - evenly), drawn, lowest)
@@ -185,13 +186,14 @@ class Surrogate(NamedTuple):
         mean = jnp.sum(jnp.where(there, points[order], 0.0), axis=0) / count
         return order, mean, jnp.where(there, points[order] - mean, 0.0) / jnp.sqrt(count)
 
-    def _near(self, random: Float[Array, "m r"]) -> Float[Array, "m d"]:
+    def _near(
+        self, coins: Float[Array, "m 2"], normal: Float[Array, "m elite"]
+    ) -> Float[Array, "m d"]:
         """Return steps from the best four points, each half as often as the one before."""
         order, _, spread = self._best(self.u)
-        rank = jnp.floor(-jnp.log2(jnp.maximum(random[:, 0], 2.0**-3))).astype(jnp.int32)
-        size = STEPS[0] * (STEPS[1] / STEPS[0]) ** random[:, 1:2]
-        step = size * (standard_normal(random[:, 2:]) @ spread)
-        return jnp.clip(self.u[order[rank]] + step, 0.0, 1.0)
+        rank = jnp.floor(-jnp.log2(jnp.maximum(coins[:, 0], 2.0**-3))).astype(jnp.int32)
+        size = STEPS[0] * (STEPS[1] / STEPS[0]) ** coins[:, 1:]
+        return jnp.clip(self.u[order[rank]] + size * (normal @ spread), 0.0, 1.0)
 
 
 def _fit(
@@ -206,13 +208,15 @@ def _fit(
     covariances = jnp.broadcast_to(covariances, (len(noises), n, n))
     covariances += jnp.eye(n) * jnp.where(there, noises, 1.0)[:, None]
 
-    def evidence(covariance: Array) -> tuple[Array, Array, Array]:
-        factor = jnp.linalg.cholesky(covariance)
-        half = solve_triangular(factor, y, lower=True)
-        found = -0.5 * count * jnp.log(half @ half) - jnp.sum(jnp.log(jnp.diag(factor)))
-        return jnp.where(jnp.isfinite(found), found, -jnp.inf), factor, half
-
-    found, factors, halves = jax.lax.map(evidence, covariances)
+    # All at once: a loop over them would be compiled, too.
+    factors = jax.lax.linalg.cholesky(covariances, symmetrize_input=False)
+    halves = jax.lax.linalg.triangular_solve(
+        factors, jnp.broadcast_to(y[:, None], (len(noises), n, 1)), left_side=True, lower=True
+    )[..., 0]
+    diagonals = jnp.diagonal(factors, axis1=1, axis2=2)
+    found = -0.5 * count * jnp.log(jnp.sum(halves**2, axis=1))
+    found -= jnp.sum(jnp.log(diagonals), axis=1)
+    found = jnp.where(jnp.isfinite(found), found, -jnp.inf)
     best = jnp.argmax(found)
     return best, factors[best], halves[best]
 
