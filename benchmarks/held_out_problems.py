@@ -114,9 +114,49 @@ def colville(features, key):
     return vj.Trace({"out": jax.lax.stop_gradient(value)[None]}, dt=DT)
 
 
+def helix(features, key):
+    """Fletcher's and Powell's helical valley, without derivatives, and two numbers of no use."""
+    x, y, z = features["x"], features["y"], features["z"]
+    turn = jnp.arctan2(y, x) / (2 * jnp.pi)
+    value = 100 * ((z - 10 * turn) ** 2 + (jnp.hypot(x, y) - 1) ** 2) + (z - 2) ** 2
+    return vj.Trace({"out": jax.lax.stop_gradient(value)[None]}, dt=DT)
+
+
+def mill(features, key):
+    """Whole numbers that multiply, less a square and what a choice adds."""
+    f = features
+    left = f["a"] * f["b"] - 7 * f["c"] ** 2 - jnp.array([40, 211, 395])[f["kind"]]
+    return vj.Trace({"out": (jnp.abs(left) / 50 + jnp.abs(f["a"] - f["b"]) / 40)[None]}, dt=DT)
+
+
+def dock(features, key):
+    """A boat that two inputs push along and across, and that has to come to a quay slowly."""
+    times = jnp.arange(0, 8, DT)
+    inputs = jnp.stack([jax.vmap(features[n].over(8.0))(times) for n in ("along", "across")], 1)
+
+    def step(s, u):
+        current = 0.3 * jnp.sin(s[0])
+        return jnp.stack([s[2], s[3] + current, u[0] - 0.4 * s[2], 0.7 * u[1] - 0.5 * s[3]])
+
+    def moved(s, u):
+        return (s + DT * step(s, u),) * 2
+
+    _, states = jax.lax.scan(moved, jnp.zeros(4), inputs)
+    return vj.Trace({"x": states[:, 0], "y": states[:, 1], "v": states[:, 2]}, dt=DT)
+
+
+def crowd(features, key):
+    """Fifteen numbers whose neighbours attract each other, cut off above, under noise."""
+    u = features["u"]
+    pairs = jnp.tanh(3 * (u[1:] - 0.3)) * jnp.tanh(3 * (u[:-1] - 0.6))
+    value = jnp.minimum(4.2 + jnp.sum(pairs), 3.0) + 0.1 * jax.random.normal(key)
+    return vj.Trace({"out": value[None]}, dt=DT)
+
+
 LIMITS = {
     "chain": 2.0, "loop": 0.6, "train": 1.5, "ledges": 14.5, "funnels": 0.0, "relay": 0.565,
     "shaken": 3.4, "steered": 0.85, "colville": 4.0,
+    "helix": 1.0, "mill": 0.1, "dock": 2.0, "crowd": 0.0,
 }  # fmt: skip
 """Chosen for one failing sample in 500 to 10 000, fewer in `colville`."""
 
@@ -141,6 +181,13 @@ def held_out(name: str, limit: float) -> vj.Problem:
                     "speed": box(0.5, 3), "b": box(-1, 1)}, shaken, f"always abs(x) < {limit}"),
         "steered": ({"turn": vj.Signal(box(-1, 1), 12), "speed": box(0.5, 1.5)}, steered,
                     f"not eventually[4, 6] (far < {limit} and angle < 2)"),
+        "helix": ({"x": box(-3, 3), "y": box(-3, 3), "z": box(-8, 8), "a": box(0, 1),
+                   "b": box(0, 1)}, helix, f"always out > {limit}"),
+        "mill": ({"a": whole(1, 40), "b": whole(1, 40), "c": whole(1, 12),
+                  "kind": choice(0, 1, 2)}, mill, f"always out > {limit}"),
+        "dock": ({"along": vj.Signal(box(-1, 1), 8), "across": vj.Signal(box(-1, 1), 8)}, dock,
+                 f"not ((abs(y) < 0.4) until[0, 7] (x > {limit} and abs(v) < 0.1))"),
+        "crowd": ({"u": _unit(15)}, crowd, f"always out > {limit}"),
         "colville": ({"x": _unit(4, -3, 3)}, colville, f"always out > {limit}"),
     }  # fmt: skip
     space, system, formula = cases[name]
