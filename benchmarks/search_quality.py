@@ -11,7 +11,8 @@ share of failures is known, and with it what uniform sampling needs in the media
 a search's entry is how many times fewer it needs. On the controller the failure rate is measured
 first. A simulation with a derivative counts as one; the row `gradient (as 2)` counts it as two.
 
-`table` compares searches on thirty small problems (`small_problems`), one line a problem: the
+`table` compares searches on thirty small problems (`small_problems`), and nine that no search was
+tuned on (`held_out_problems`), one line a problem: the
 median cost of the first failure in rounds of 16, a differentiated simulation as two, and the seeds
 that found one if not all did. With `--libraries` the packages cmaes and Optuna (TPE) stand beside
 them, where they are installed.
@@ -319,13 +320,15 @@ def first_of_library(problem, library, budget, seeds):
 
 def on_small(options):
     """One line a problem: every search."""
+    from held_out_problems import HELD_OUT
     from small_problems import SMALL
 
+    problems = SMALL | HELD_OUT
     names = options.searches.split(",") if options.searches else list(vj.search.names())
     libraries = list(LIBRARIES) if options.libraries else []
     print("| problem | " + " | ".join(names + libraries) + " |")
-    for name in options.problems or SMALL:
-        cells, problem = [name], SMALL[name]
+    for name in options.problems or problems:
+        cells, problem = [name], problems[name]
         for search in names + libraries:
             try:
                 if search in LIBRARIES:
@@ -363,6 +366,11 @@ OF_MODELS = {
     "ENOUGH": (4, 16),
     "EVENLY": (0.05, 0.2),
     "PATIENCE": (40, 160),
+    "ADDITIVE": ((0.25, 0.25), (0.5, 0.5)),
+    "ALONG": ((0.5, 1.5, 5.0), (2.0, 6.0, 20.0)),
+    "ELITE": (16, 64),
+    "STEPS": ((0.05, 2.0), (0.5, 3.0)),
+    "GROUPS": (1, 4, 16),
 }
 """And of its models."""
 

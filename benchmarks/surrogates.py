@@ -15,7 +15,7 @@ import numpy as np
 
 import verifai_jax as vj
 
-SEARCHES = ("trace_surrogate", "turbo", "bayes", "cmaes", "portfolio", "uniform")
+SEARCHES = ("trace_surrogate", "turbo", "bayes", "portfolio", "uniform")
 
 
 def steps(signal, horizon, dt):

@@ -47,7 +47,7 @@ REFUSED = {
 
 
 # These take seconds to compile for each cube; what is continuous alone is so in the wide one.
-LARGE = ("Bandit", "Bayes", "CMAES", "Diverse", "Portfolio", "TuRBO", "TraceSurrogate")
+LARGE = ("Bandit", "Bayes", "Diverse", "Portfolio", "TuRBO", "TraceSurrogate")
 QUICK = ("mixed",)
 EACH = [
     pytest.param(

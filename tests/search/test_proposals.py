@@ -15,7 +15,7 @@ from verifai_jax.testing import check_search
 
 DOMAINS = {"x": vj.Box(0, 1), "y": vj.Box(0, 1), "kind": vj.Categorical("a", "b", "c")}
 
-LARGE = ("bayes", "cmaes", "turbo", "trace_surrogate")
+LARGE = ("bayes", "turbo", "trace_surrogate")
 
 
 def below(features):

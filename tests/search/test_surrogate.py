@@ -6,7 +6,10 @@ import pytest
 
 from verifai_jax.core.values.cube import Cube
 from verifai_jax.search.surrogate import (
+    ALONG,
     CAPACITY,
+    ELITE,
+    FLOOR,
     LENGTHS,
     NOISES,
     NUGGETS,
@@ -78,15 +81,46 @@ def test_the_process_chooses_the_lowest_bound():
         np.linalg.norm(positions(known, CUBE)[0] - positions(known, CUBE)[1]),
         apart(known[:1], known[1:2])[0, 0], rtol=1e-5,
     )  # fmt: skip
-    options = [(length, nugget) for length in LENGTHS for nugget in NUGGETS]
-    covariances = [matern(apart(known, known) / at) + by * np.eye(40) for at, by in options]
+    # The same by the covariance of the best points.
+    places, new = (np.asarray(positions(each, CUBE), float) for each in (known, choices))
+    best = places[np.argsort(model.score[:40], kind="stable")[:ELITE]]
+    inverse = np.linalg.inv(np.cov(best.T, bias=True) + FLOOR / 3 * np.eye(5)) / 5
+
+    def along(one, two):
+        gap = one[:, None] - two[None]
+        return np.sqrt(np.einsum("ijk,kl,ijl->ij", gap, inverse, gap))
+
+    far = [apart(known, known)] * 6 + [along(places, places)] * 6
+    options = [(at, by) for lengths in (LENGTHS, ALONG) for at in lengths for by in NUGGETS]
+    covariances = [
+        matern(each / at) + by * np.eye(40) for each, (at, by) in zip(far, options, strict=True)
+    ]
     best = int(np.argmax([evidence(each, y) for each in covariances]))
-    covariance, cross = covariances[best], matern(apart(known, choices) / options[best][0])
+    crossed = apart(known, choices) if best < 6 else along(places, new)
+    covariance, cross = covariances[best], matern(crossed / options[best][0])
     mean = cross.T @ np.linalg.solve(covariance, y)
     scale = y @ np.linalg.solve(covariance, y) / 40
     left = 1 - np.sum(cross * np.linalg.solve(covariance, cross), axis=0)
     bound = mean - optimism * np.sqrt(scale * np.maximum(left, 0))
+    # Each row chooses among a quarter of them.
+    bound = np.where((np.arange(60) - np.arange(4)[:, None]) % 4 == 0, bound, np.inf)
     np.testing.assert_array_equal(found, choices[bound.argmin(axis=1)])
+
+
+def test_steps_have_the_covariance_of_the_best_points():
+    model, _, _ = learned()
+    rng = np.random.default_rng(2)
+    coins = np.column_stack([np.full(20000, 0.7), np.full(20000, 0.0)]).astype(np.float32)
+    normal = rng.normal(size=(20000, ELITE)).astype(np.float32)
+    found = np.asarray(model._near(jnp.asarray(coins), jnp.asarray(normal)))
+    order = np.argsort(model.score, kind="stable")[:ELITE]
+    best = np.asarray(model.u)[order]
+    inside = np.all((found > 0) & (found < 1), axis=1)
+    assert inside.mean() > 0.5
+    step = 0.3 * (normal @ ((best - best.mean(axis=0)) / np.sqrt(ELITE)))
+    np.testing.assert_allclose(found[inside], (best[0] + step)[inside], atol=1e-4)
+    expected = 0.09 * np.cov(best.T, bias=True)
+    np.testing.assert_allclose(np.cov(step.T), expected, rtol=0.2, atol=5e-4)
 
 
 def test_it_keeps_the_best_half_and_the_newest_others():

@@ -208,7 +208,7 @@ class Portfolio(Search[PortfolioState]):
         else:
             key = jax.random.fold_in(state.key, state.mutation.round)
             mutated, others, mutation = Mutation().ask_for_both(
-                state.mutation, cube, batch, key, CHOICES * 2 // 3
+                state.mutation, cube, batch, key, CHOICES // 3
             )
             modelled = partial(state.model.propose, key, cube, batch, others, state.mutation.stale)
         drawn, cross_entropy = self._cross_entropy(batch).ask(state.cross_entropy, cube, batch)
@@ -355,11 +355,17 @@ class Portfolio(Search[PortfolioState]):
         limits = np.array([descents, batch, batch, batch])
         # Mutations begin when enough is explored, whatever descents have seen.
         descended = jnp.sum(common.usable & is_member[GRADIENT]).astype(jnp.int32)
-        early = state.opening if state.model is None else state.opening | ~known
+        early, model = state.opening, state.model
+        if model is not None:
+            early |= ~known
+            model = model.learned(common.u, common.score)
+            # Where mutations begin again, elsewhere, so do the models.
+            again = known & jnp.isinf(mutation.score[0])
+            model = choose(again, Surrogate.nothing(cube.dim), model)
         state = state._replace(
             mutation=mutation._replace(verdicts=jnp.maximum(mutation.verdicts - descended, 0)),
             cross_entropy=self._cross_entropy(batch).tell(state.cross_entropy, cube, common),
-            model=None if state.model is None else state.model.learned(common.u, common.score),
+            model=model,
             # What it gains while it goes first says nothing about what it will.
             gains=jnp.where(
                 early,

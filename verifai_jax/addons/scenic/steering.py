@@ -40,7 +40,7 @@ class Steps:
         if lacking := [name for name, needed in needs.items() if needed]:
             raise ValueError(
                 f"search {chosen!r} learns from {lacking[0]}, and a feedback is one number: use "
-                "cross_entropy, cmaes, bayes, turbo or another that learns from the robustness"
+                "cross_entropy, mutation, bayes, turbo or another that learns from the robustness"
             )
         check_count("batch", batch)
         key = run_keys(check_count("seed", seed, 0))[0]

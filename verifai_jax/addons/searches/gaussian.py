@@ -23,6 +23,8 @@ from jax.scipy.linalg import cho_solve, solve_triangular
 from jax.scipy.special import ndtri
 from jaxtyping import Array, Bool, Float, Key, PyTree
 
+from verifai_jax.search.surrogate import matern, squared_distances
+
 VARIANCE = (-3.0, 4.0)
 """Range of the logarithm of the variance. Data have variance 1, whose logarithm is well inside."""
 LENGTH = (-4.0, 8.0)
@@ -97,8 +99,7 @@ class GaussianProcess:
         inverse = jnp.exp(-hyper.lengths)
         # About the middle, so that the difference below loses few digits.
         left, right = ((x[:, plain] - 0.5) * inverse[plain] for x in (a, b))
-        square = jnp.sum(left**2, 1)[:, None] + jnp.sum(right**2, 1)[None] - 2 * left @ right.T
-        value = jnp.exp(hyper.variance) * matern(jnp.maximum(square, 0.0))
+        value = jnp.exp(hyper.variance) * matern(squared_distances(left, right))
         if len(codes) == 0:
             return value
         differ = (a[:, None, codes] != b[None, :, codes]).astype(value.dtype)
@@ -296,20 +297,6 @@ def _bounded(hyper: Hyper) -> Hyper:
         jnp.clip(hyper.lengths, *LENGTH),
         jnp.clip(hyper.noise, *NOISE),
     )
-
-
-@jax.custom_jvp
-def matern(square: Array) -> Array:
-    """Return Matern-5/2 of the squared distance; its derivative is finite at zero."""
-    r = jnp.sqrt(5 * square)
-    return (1 + r + r**2 / 3) * jnp.exp(-r)
-
-
-@matern.defjvp
-def _matern_jvp(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, Array]:
-    r = jnp.sqrt(5 * primals[0])
-    decay = jnp.exp(-r)
-    return (1 + r + r**2 / 3) * decay, -5 / 6 * (1 + r) * decay * tangents[0]
 
 
 @jax.custom_vjp
