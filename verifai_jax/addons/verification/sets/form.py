@@ -184,6 +184,8 @@ class Form:
 
 def overflown(low: Reals, high: Reals, highest: float) -> tuple[Reals, Reals]:
     """Return an interval that is unbounded if its numbers may overflow."""
+    if greatest(np.abs(low)) <= highest and greatest(np.abs(high)) <= highest:
+        return low, high
     low = np.where(np.isnan(low) | (low < -highest), -np.inf, low)
     high = np.where(np.isnan(high) | (high > highest), np.inf, high)
     # What is beyond it for certain is an infinity to the machine, and a number in real arithmetic.
@@ -199,20 +201,22 @@ def unknown(low: Reals, high: Reals) -> Reals:
 def rounded(
     centre: Reals, slopes: Reals | None, radius: Reals, size: Reals, dtype: np.dtype,
     ends: tuple[Reals, Reals] | None = None, frame: Frame | None = None, units: float = 1.0,
-    exact: bool = False,
+    exact: bool = False, tiny: float = 1.0,
 ) -> Form:  # fmt: skip
     """Return the result of an operation, widened by its error in so many units of rounding.
 
-    So are the `ends` of its interval; what is `exact` is never rounded, such as a maximum.
+    So are the `ends` of its interval; `tiny` is its absolute error, in smallest normal numbers.
+    What is `exact` is never rounded, such as a maximum.
     """
     kind = rounding(dtype)
-    share, absolute = (SLACK, 0.0) if exact else (kind.unit * units, kind.smallest)
+    share, absolute = (SLACK, 0.0) if exact else (kind.unit * units, kind.smallest * tiny)
     radius = radius + (share * size + absolute)
     low, high = (None, None) if ends is None else ends
     if low is not None and high is not None and not exact:
-        low, high = widened(low, high, share, kind.smallest)
+        low, high = widened(low, high, share, kind.smallest, absolute if tiny > 1 else 0.0)
     form = Form(centre, slopes, radius, size, dtype, low, high, frame)
-    if not size.max(initial=0.0) + radius.max(initial=0.0) <= kind.highest / 2:
+    # The radius has a share of the size, so that what is far within reach is found by one number.
+    if not greatest(radius) <= kind.highest * SLACK / 4:
         # What may overflow, or is NaN, is unbounded.
         wild = ~(size + radius <= kind.highest)
         if low is not None and high is not None:
@@ -222,13 +226,28 @@ def rounded(
     return form
 
 
-def widened(low: Reals, high: Reals, share: float, smallest: float) -> tuple[Reals, Reals]:
-    """Return ends that are apart by a share of each more; what is tiny keeps its sign."""
-    if share:
-        low, high = low - share * np.abs(low), high + share * np.abs(high)
-    if np.abs(low).min(initial=1.0) < smallest:
+def greatest(numbers: Reals) -> float:
+    """Return the greatest number, or NaN; without numbers an infinity."""
+    return np.maximum.reduce(numbers, axis=None, initial=-np.inf)
+
+
+def least(numbers: Reals) -> float:
+    """Return the least number, or NaN; without numbers an infinity."""
+    return np.minimum.reduce(numbers, axis=None, initial=np.inf)
+
+
+def widened(
+    low: Reals, high: Reals, share: float, smallest: float, absolute: float = 0.0
+) -> tuple[Reals, Reals]:
+    """Return ends that are apart by a share of each more, and by a number.
+
+    What is tiny keeps its sign.
+    """
+    below, above = np.abs(low), np.abs(high)
+    low, high = low - (share * below + absolute), high + (share * above + absolute)
+    if least(below) < 2 * (smallest + absolute):
         low = np.where(np.abs(low) < smallest, np.where(low < 0, -smallest, 0.0), low)
-    if np.abs(high).min(initial=1.0) < smallest:
+    if least(above) < 2 * (smallest + absolute):
         high = np.where(np.abs(high) < smallest, np.where(high > 0, smallest, 0.0), high)
     return low, high
 
@@ -266,11 +285,15 @@ def padded(form: Form, count: int) -> Reals:
 def joint_slopes(a: Form, b: Form, first: Reals | float, second: Reals | float) -> Reals | None:
     """Return the slopes of `first * a + second * b`, for forms of one frame."""
     if a.slopes is None:
-        return None if b.slopes is None else b.slopes * second
+        return None if b.slopes is None else _times(b.slopes, second)
     if b.slopes is None:
-        return a.slopes * first
+        return _times(a.slopes, first)
     count = max(len(a.slopes), len(b.slopes))
-    return padded(a, count) * first + padded(b, count) * second
+    return _times(padded(a, count), first) + _times(padded(b, count), second)
+
+
+def _times(slopes: Reals, factor: Reals | float) -> Reals:
+    return slopes if isinstance(factor, float) and factor == 1.0 else slopes * factor
 
 
 def exactly(centre: Reals, rest: Reals, dtype: np.dtype) -> Form | None:
@@ -301,12 +324,16 @@ def add(a: Form, b: Form, sign: float = 1.0) -> Form:
         if a.slopes is None and b.slopes is None:
             return spanned(*ends, a.dtype, 0)
         ends = overflown(*ends, rounding(a.dtype).highest)
-    (a, b), frame, _ = alike([a, b])
+    if a.frame != b.frame:
+        (a, b), *_ = alike([a, b])
     slopes = joint_slopes(a, b, 1.0, sign)
     centre = a.centre + b.centre if sign > 0 else a.centre - b.centre
-    form = rounded(centre, slopes, a.radius + b.radius, a.size + b.size, a.dtype, None, frame)
+    form = rounded(
+        centre, slopes, a.radius + b.radius, a.size + b.size, a.dtype, None, a.frame or b.frame
+    )
     form.low, form.high = ends or (None, None)
-    form.common = summed(form.radius, [(a, 1.0), (b, sign)])
+    if a.common is not None or b.common is not None:
+        form.common = summed(form.radius, [(a, 1.0), (b, sign)])
     return form
 
 
@@ -316,14 +343,17 @@ def _sum_end(one: Reals, other: Reals, dtype: np.dtype, side: int) -> Reals:
     end = one + other
     back = end - one
     # Knuth's error of the sum: it is zero where the sum is exact.
-    exact = (one - (end - back)) + (other - back) == 0
+    exact = one - (end - back) == back - other
     if dtype.itemsize < 8:
-        exact &= end.astype(dtype).astype(np.float64) == end
-    small = (end != 0) & (np.abs(end) < kind.smallest)
-    widened = np.where(exact & ~small, end, end + side * (kind.unit * np.abs(end) + kind.smallest))
+        exact &= end.astype(dtype) == end
+    size = np.abs(end)
+    widened = np.where(exact, end, end + side * (kind.unit * size + kind.smallest))
+    if least(size) < kind.smallest:
+        small = (size > 0) & (size < kind.smallest)
+        widened = np.where(small, end + side * (kind.unit * size + kind.smallest), widened)
     # A sum of numbers of one sign has that sign, or is zero.
-    signed = (one * side <= 0) & (other * side <= 0)
-    return np.where(signed, side * np.minimum(side * widened, 0.0), widened)
+    lesser, greater = (np.minimum, np.maximum) if side > 0 else (np.maximum, np.minimum)
+    return np.where(side * greater(one, other) <= 0, lesser(widened, 0.0), widened)
 
 
 def negative(a: Form) -> Form:
@@ -331,7 +361,7 @@ def negative(a: Form) -> Form:
     slopes = None if a.slopes is None else -a.slopes
     low = None if a.high is None else -a.high
     high = None if a.low is None else -a.low
-    common = summed(a.radius, [(a, -1.0)])
+    common = a.common and summed(a.radius, [(a, -1.0)])
     return Form(-a.centre, slopes, a.radius, a.size, a.dtype, low, high, a.frame, common)
 
 
@@ -343,11 +373,12 @@ def is_point(a: Form) -> bool:
 def scaled(a: Form, by: Reals) -> Form:
     """Return `a` times exact finite numbers."""
     slopes = None if a.slopes is None else a.slopes * by
-    size, scale = a.size * np.abs(by), np.abs(by)
-    ends = None
+    scale, ends = np.abs(by), None
+    size = a.size * scale
     if a.low is not None and a.high is not None:
-        one, other = a.low * by, a.high * by
-        ends = np.minimum(one, other), np.maximum(one, other)
+        ends = a.low * by, a.high * by
+        if not (by >= 0).all():
+            ends = np.minimum(*ends), np.maximum(*ends)
     # Times 0, 1, 2, 4 ... nothing is rounded.
     exact = bool(((np.frexp(scale)[0] == 0.5) & (scale >= 1) | (scale == 0)).all())
     if slopes is None and ends is not None and np.isfinite(size).all():
@@ -355,7 +386,8 @@ def scaled(a: Form, by: Reals) -> Form:
     form = rounded(
         a.centre * by, slopes, a.radius * scale, size, a.dtype, ends, a.frame, exact=exact
     )
-    form.common = summed(form.radius, [(a, by)])
+    if a.common is not None:
+        form.common = summed(form.radius, [(a, by)])
     return form
 
 

@@ -7,6 +7,7 @@ causes only a quadratic error, which the widening of results covers.
 """
 
 from collections.abc import Callable, Sequence
+from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -18,8 +19,10 @@ from verifai_jax.addons.verification.sets.form import (
     Reals,
     add,
     chosen,
+    greatest,
     is_point,
     joined,
+    least,
     negative,
     product,
     rounded,
@@ -46,10 +49,11 @@ class Function(NamedTuple):
     """A function of one number: its `value` in double precision.
 
     - `criticals`: where its derivative equals a slope.
+    - `tangents`: the same points of all numbers, each with its value; None if there is no formula.
     - `domain`: the interval outside of which it is NaN.
     - `units`, `tiny`: its error in units of rounding, and of the smallest normal number.
     - `range`: an interval that contains all results, including rounding.
-    - `rises`: whether its greatest values are at the ends of intervals.
+    - `rises`: whether it rises, so that its extremes are at the ends of intervals.
     """
 
     value: Callable[[Reals], Reals]
@@ -59,49 +63,65 @@ class Function(NamedTuple):
     tiny: float = TINY
     range: tuple[float, float] = (-np.inf, np.inf)
     rises: bool = False
+    tangents: Callable[[Reals], Sequence[tuple[Reals, Reals]]] | None = None
 
     def __call__(self, x: Form) -> Form:
         """Return the set of its values on a set."""
-        (low, high), (first, last) = x.bounds(), self.domain
-        outside, points = unknown(low, high) | (low > high), [low, high]
+        (low, high), (first, last), spread = x.bounds(), self.domain, x.spread
+        wide, outside, points = high - low, np.zeros(1, bool), [low, high]
+        # Nothing is an exception where all is within the domain, and as wide as some number.
+        plain = least(wide) > 0 and greatest(spread) < np.inf
         if np.isfinite(first) or np.isfinite(last):
-            outside |= (low < first) | (high > last)
-            points = [np.clip(low, first, last), np.clip(high, first, last)]
+            plain = plain and least(low) >= first and greatest(high) <= last
+            points = points if plain else [np.clip(low, first, last), np.clip(high, first, last)]
         values = [self.value(point) for point in points]
-        slope = (values[1] - values[0]) / (points[1] - points[0])
-        slope = np.where(np.isfinite(slope), slope, 0.0)
-        extremes = [] if self.rises else self._points(np.zeros_like(low), *points)
-        lowest, highest = _extremes([*values, *(self.value(point) for point in extremes)])
-        inner = self._points(slope, *points)
-        points, values = points + inner, values + [self.value(point) for point in inner]
-        below, above = _extremes([v - slope * p for v, p in zip(values, points, strict=True)])
-        size = np.maximum(np.abs(lowest), np.abs(highest))
-        offset, error, radius = below / 2 + above / 2, above / 2 - below / 2, x.radius
-        usable = np.isfinite(offset) & np.isfinite(x.spread) & ~outside
-        if not usable.all():
-            slope, offset, radius = (np.where(usable, a, 0.0) for a in (slope, offset, radius))
+        slope = (values[1] - values[0]) / (wide if plain else points[1] - points[0])
+        plain = plain and bool(np.isfinite(np.add.reduce(slope, axis=None)))
+        if not plain:
+            outside = unknown(low, high) | (low > high) | (low < first) | (high > last)
+            slope = np.where(np.isfinite(slope), slope, 0.0)
+        lowest, highest = values
+        if not self.rises:
+            extremes = self._points(np.zeros_like(low), *points)
+            lowest, highest = _extremes([*values, *(self.value(point) for point in extremes)])
+        off = [values[0] - slope * points[0]]
+        if plain and self.tangents is not None:
+            # The line through both ends is as far from one as from the other.
+            off += [np.where((low < at) & (at < high), value - slope * at, off[0])
+                    for at, value in self.tangents(slope)]  # fmt: skip
+        else:
+            inner = self._points(slope, *points)
+            off += [values[1] - slope * points[1], *(self.value(p) - slope * p for p in inner)]
+        below, above = _extremes(off)
+        size = highest if self.range[0] >= 0 else np.maximum(np.abs(lowest), np.abs(highest))
+        offset, error, radius = (below + above) / 2, (above - below) / 2, x.radius
+        if not plain:
+            usable = np.isfinite(offset) & np.isfinite(spread) & ~outside
+            slope, offset, radius, spread = (
+                np.where(usable, a, 0.0) for a in (slope, offset, radius, spread)
+            )
             error, size = np.where(usable, error, np.inf), np.where(outside, np.inf, size)
             lowest = np.where(outside, -np.inf, lowest)
             highest = np.where(outside, np.inf, highest)
         # Numbers of double precision between which the slope and the offset are rounded.
-        error = error + 4 * SLACK * (np.abs(offset) + np.abs(slope) * (x.size + np.abs(x.centre)))
-        ends, radius = (lowest, highest), np.abs(slope) * radius + error
-        if self.units:
-            tiny = self.tiny * rounding(x.dtype).smallest
-            ends, radius = (ends[0] - tiny, ends[1] + tiny), radius + tiny
+        steep = np.abs(slope)
+        margin = np.abs(offset) + steep * (spread + np.abs(x.centre))
         slopes = None if x.slopes is None else x.slopes * slope
         form = rounded(
-            slope * x.centre + offset, slopes, radius, size, x.dtype, ends, x.frame, self.units
-        )
-        if self.range != (-np.inf, np.inf) and form.low is not None and form.high is not None:
-            form.low = np.where(outside, -np.inf, np.clip(form.low, *self.range))
-            form.high = np.where(outside, np.inf, np.clip(form.high, *self.range))
-        form.common = summed(form.radius, [(x, slope)])
+            slope * x.centre + offset, slopes, steep * radius + error + 4 * SLACK * margin, size,
+            x.dtype, (lowest, highest), x.frame, self.units, not self.units, 1 + self.tiny,
+        )  # fmt: skip
+        if self.units and form.low is not None and form.high is not None:
+            if self.range[0] > -np.inf:
+                form.low = np.where(outside, -np.inf, np.maximum(form.low, self.range[0]))
+            if self.range[1] < np.inf:
+                form.high = np.where(outside, np.inf, np.minimum(form.high, self.range[1]))
+        form.common = x.common and summed(form.radius, [(x, slope)])
         return form
 
     def _points(self, slope: Reals, low: Reals, high: Reals) -> list[Reals]:
-        inner = self.criticals(slope, low, high)
-        return [np.clip(np.where(np.isnan(x), low, x), low, high) for x in inner]
+        # Of a number and NaN `fmax` is the number.
+        return [np.minimum(np.fmax(x, low), high) for x in self.criticals(slope, low, high)]
 
 
 def _extremes(values: Sequence[Reals]) -> tuple[Reals, Reals]:
@@ -186,6 +206,14 @@ _RSQRT = Function(
 )
 
 
+def _logits(slope: Reals) -> Sequence[tuple[Reals, Reals]]:
+    """Return where the logistic function has a slope, on both sides, and its values."""
+    value = slope / (0.5 + np.sqrt(np.maximum(0.25 - slope, 0)))
+    at = special.logit(value)
+    return (at, value), (-at, 1 - value)
+
+
+@cache
 def _of_power(n: int) -> Function:
     criticals = _even(lambda slope: np.abs(slope / n) ** (1 / (n - 1)))
     even = _POSITIVE if n % 2 == 0 else (-np.inf, np.inf)
@@ -207,9 +235,10 @@ FUNCTIONS: dict[str, Callable[[Form], Form]] = {
     "cbrt": Function(np.cbrt, _even(lambda a: (3 * a) ** -1.5), units=40.0, tiny=1e26),
     "tanh": Function(np.tanh, _even(lambda a: np.arccosh(1 / np.sqrt(a))), range=(-1.0, 1.0),
                      rises=True),
-    "logistic": Function(special.expit, _even(lambda a: special.logit(a / (
-        0.5 + np.sqrt(np.maximum(0.25 - a, 0))
-    ))), range=(0.0, 1.0), rises=True),
+    "logistic": Function(
+        special.expit, lambda a, *_: [point for point, _ in _logits(a)], range=(0.0, 1.0),
+        rises=True, tangents=lambda a: _logits(a),
+    ),
     "sinh": Function(np.sinh, _even(np.arccosh), units=60.0),
     "cosh": Function(np.cosh, _single(np.arcsinh), units=60.0, range=(1.0, np.inf)),
     "asinh": Function(np.arcsinh, _even(lambda a: np.sqrt(1 / a**2 - 1))),
@@ -234,7 +263,8 @@ FUNCTIONS: dict[str, Callable[[Form], Form]] = {
 
 def _above(knot: Any) -> Function:
     """Return the maximum with a number."""
-    return Function(lambda x: np.maximum(x, knot), lambda *_: [knot], units=0.0, rises=True)
+    return Function(lambda x: np.maximum(x, knot), lambda *_: [knot], units=0.0, rises=True,
+                    tangents=lambda _: [(knot, knot)])  # fmt: skip
 
 
 _RAMP = _above(0.0)._replace(range=_POSITIVE)

@@ -7,7 +7,9 @@ of JAX's primitives.
 """
 
 from collections.abc import Callable, Sequence
+from functools import cache
 from typing import Any, TypeAlias
+from weakref import WeakKeyDictionary
 
 import jax.numpy as jnp
 import numpy as np
@@ -30,6 +32,8 @@ RULES: dict[str, Rule] = {}
 Shortcut: TypeAlias = Callable[["Interpreter", Program, list[Value]], list[Value] | None]
 SHORTCUTS: dict[str, Shortcut] = {}
 """What functions do with sets as a whole, by the name of their call; None to go inside."""
+_CONSTANTS: WeakKeyDictionary[Program, list[Value]] = WeakKeyDictionary()
+"""The constants of programs as sets, which are those of every batch of boxes."""
 
 
 class MissingRule(NotImplementedError):
@@ -51,6 +55,7 @@ class Interpreter:
 
     def __init__(self, boxes: int, features: int) -> None:
         self.boxes, self.features = boxes, features
+        _keep_memory()
         self._literals: dict[int, tuple[Any, Value]] = {}
         self.latest: tuple[Any, ...] | None = None
         """The last step of a differential equation: what it was made of, and its results."""
@@ -74,8 +79,11 @@ class Interpreter:
     def closed(self, program: Program, inputs: Sequence[Value]) -> list[Value]:
         """Evaluate a program with its constants, or one without constants."""
         inner = getattr(program, "jaxpr", program)
-        pairs = zip(inner.constvars, getattr(program, "consts", ()), strict=True)
-        known = [constant(value, variable.aval.dtype) for variable, value in pairs]
+        known = _CONSTANTS.get(program)
+        if known is None:
+            pairs = zip(inner.constvars, getattr(program, "consts", ()), strict=True)
+            known = [constant(value, variable.aval.dtype) for variable, value in pairs]
+            _CONSTANTS[program] = known
         return run_through(inner, known, inputs, self.literal, self.step)
 
     def step(self, step: Equation, inputs: list[Value]) -> list[Value]:
@@ -90,8 +98,9 @@ class Interpreter:
             return self.concrete(step, inputs)
         try:
             results = found(self, step, inputs)
-            for value, form in zip(results, (out.aval for out in step.outvars), strict=True):
-                if (value.dtype, value.shape) != (form.dtype, form.shape):
+            for value, out in zip(results, step.outvars, strict=True):
+                form = out.aval
+                if value.shape != form.shape or value.dtype != form.dtype:
                     raise NotImplementedError(f"a result of type {form.str_short()}")
             return results
         except MissingRule:
@@ -110,6 +119,16 @@ class Interpreter:
         results = step.primitive.bind(*map(jnp.asarray, arrays), **step.params)
         results = results if step.primitive.multiple_results else [results]
         return [constant(r, f) for r, f in zip(results, forms, strict=True)]
+
+
+@cache
+def _keep_memory() -> None:
+    """Free an array of 32 MB, after which the C library keeps freed memory of that size.
+
+    Otherwise it returns that of most arrays at once, and the system fills new pages with zeros,
+    which takes a third of the time. The array itself is not touched.
+    """
+    np.empty(2**22 - 2**12)
 
 
 def constant(value: ArrayLike, dtype: np.dtype) -> Value:
