@@ -18,7 +18,7 @@ from jaxtyping import PyTree
 
 from verifai_jax.addons.verification.sets import flow
 from verifai_jax.mtl.fitting import changed_leaves, with_terms
-from verifai_jax.mtl.formula import Formula, Next, Prev, Term, Witness
+from verifai_jax.mtl.formula import Formula, Interval, Next, Prev, Term, Witness
 from verifai_jax.mtl.sampled import Duration, Operations, V, sampled_in, with_counted
 from verifai_jax.problem.problem import Problem, ProblemError
 from verifai_jax.systems.ode.closed_loop import Ode, substep
@@ -53,11 +53,10 @@ def between_samples(problem: Problem) -> Problem:
                 "continuous=True supports formulas with comparisons, not, and, or, always, "
                 f"eventually, historically, once and durations; {part} is about single samples"
             )
-        window = getattr(part, "interval", None)
-        if window is not None and (window.open_start or window.open_end):
+        if not getattr(part, "interval", Interval()).closed:
             raise ProblemError(
                 f"continuous=True needs windows with both of their ends, written [a,b]; {part} has "
-                f"the window {window}"
+                f"the window {part.interval}"
             )
 
     def during(time: Any, state: PyTree, control: Any, features: Any) -> Any:
@@ -86,14 +85,12 @@ class _Measure(Duration):
         window, (truth,) = self.window, operands
         assert window is not None
         first, last = first - window.open_start, last + window.open_end
-        if first == last:
-            return of.number(0.0)
         ends = of.before(truth, first), of.before(truth, last)
         part = of.apply("max", of.apply("min", *ends), _instants(of.number(0.0), of.number(1.0)))
         part = of.apply("min", of.apply("max", *ends), part)
         if last > first + 1:
             part = of.apply("+", part, of.total(of.before(truth, first + 1), last - first - 1))
-        return of.apply("*", part, of.number(of.dt))
+        return of.apply("*", part, of.number(of.dt if last > first else 0.0))
 
 
 def _measured(formula: Formula) -> Formula:

@@ -19,7 +19,7 @@ from jaxtyping import Array, Bool, Float, PyTree
 
 from verifai_jax.addons.verification.ranges import FeatureRanges
 from verifai_jax.addons.verification.sets import Form, Interpreter, Whole
-from verifai_jax.addons.verification.sets.interpreter import Value, as_form, as_whole
+from verifai_jax.addons.verification.sets.values import Value, as_form, as_whole
 from verifai_jax.core.compute.cores import available_cores
 from verifai_jax.core.compute.fingerprint import without_unused
 from verifai_jax.core.compute.precision import in_precision

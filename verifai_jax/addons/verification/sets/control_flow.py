@@ -6,15 +6,8 @@ from verifai_jax.addons.verification.sets.arrays import together
 from verifai_jax.addons.verification.sets.elementwise import of_rank, select
 from verifai_jax.addons.verification.sets.form import Form
 from verifai_jax.addons.verification.sets.frames import framed
-from verifai_jax.addons.verification.sets.interpreter import (
-    Equation,
-    Interpreter,
-    Program,
-    Value,
-    as_whole,
-    constant,
-    rule,
-)
+from verifai_jax.addons.verification.sets.interpreter import Equation, Interpreter, Program, rule
+from verifai_jax.addons.verification.sets.values import Value, as_whole, constant
 from verifai_jax.addons.verification.sets.whole import Whole
 from verifai_jax.core.compute.fingerprint import operands_of_scan
 

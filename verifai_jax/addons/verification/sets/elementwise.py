@@ -8,15 +8,8 @@ import numpy as np
 
 from verifai_jax.addons.verification.sets import functions, whole
 from verifai_jax.addons.verification.sets.form import Form, add, product, unknown
-from verifai_jax.addons.verification.sets.interpreter import (
-    Equation,
-    Interpreter,
-    Value,
-    as_form,
-    as_whole,
-    constant,
-    rule,
-)
+from verifai_jax.addons.verification.sets.interpreter import Equation, Interpreter, rule
+from verifai_jax.addons.verification.sets.values import Value, as_form, as_whole, constant
 from verifai_jax.addons.verification.sets.whole import Whole
 
 

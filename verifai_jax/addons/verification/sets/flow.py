@@ -20,8 +20,9 @@ from jax.extend.core import Primitive
 from jaxtyping import Array, PyTree
 
 from verifai_jax.addons.verification.sets.form import SLACK, Form, add, joined, scaled
-from verifai_jax.addons.verification.sets.interpreter import Interpreter, Value, as_form, rule
+from verifai_jax.addons.verification.sets.interpreter import Interpreter, rule
 from verifai_jax.addons.verification.sets.series import Rates
+from verifai_jax.addons.verification.sets.values import Value, as_form
 
 ORDER = 4
 """Order of the polynomials: that of the Runge-Kutta method whose step they take."""

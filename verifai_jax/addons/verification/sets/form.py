@@ -96,21 +96,24 @@ class Form:
         # What is below the smallest normal number may be taken for zero.
         low = np.where((low > 0) & (low < kind.smallest), 0.0, low)
         high = np.where((high < 0) & (high > -kind.smallest), 0.0, high)
-        bounded = np.isfinite(low) & np.isfinite(high)
-        centre = np.where(bounded, low / 2 + high / 2, 0.0)
-        radius = np.where(bounded, np.maximum(high - centre, centre - low), np.inf)
-        size = np.maximum(np.abs(low), np.abs(high))
-        radius = np.where((radius > 0) & bounded, radius + SLACK * size, radius)
+        centre, size = low / 2 + high / 2, np.maximum(np.abs(low), np.abs(high))
+        radius = np.maximum(high - centre, centre - low)
+        radius = np.where(radius > 0, radius + SLACK * size, radius)
+        if not greatest(size) < np.inf:
+            finite = np.isfinite(low) & np.isfinite(high)
+            centre, radius = np.where(finite, centre, 0.0), np.where(finite, radius, np.inf)
         return cls(centre, None, radius, size, dtype, low, high)
 
     @classmethod
     def leaf(cls, low: Reals, high: Reals, symbols: Reals, dtype: np.dtype) -> "Form":
         """Return numbers between ends; `symbols`, `[symbols, *shape]`, are 1 for those of each."""
         whole = cls.between(low, high, dtype)
-        slopes = symbols[:, None] * np.where(np.isfinite(whole.radius), whole.radius, 0.0)
-        own = np.any(symbols != 0, axis=0)[None] & np.isfinite(whole.radius)
-        radius = np.where(own, SLACK * whole.size, whole.radius)
-        return cls(whole.centre, slopes, radius, whole.size, dtype, whole.low, whole.high)
+        finite = np.isfinite(whole.radius)
+        slopes = symbols[:, None] * np.where(finite, whole.radius, 0.0)
+        radius = np.where((symbols != 0).any(0) & finite, SLACK * whole.size, whole.radius)
+        form = cls(whole.centre, slopes, radius, whole.size, dtype, whole.low, whole.high)
+        form._bounds = whole.low, whole.high
+        return form
 
     @property
     def shape(self) -> tuple[int, ...]:
@@ -124,7 +127,7 @@ class Form:
         if spread is None:
             spread = self.radius
             if self.slopes is not None:
-                spread = np.abs(self.slopes).sum(0) + spread
+                spread = np.add.reduce(np.abs(self.slopes), 0) + spread
             self._spread = spread
         return spread
 
@@ -149,12 +152,14 @@ class Form:
             numbers = np.arange(self.centre[0].size)
             moved = move(numbers.reshape(1, *self.shape), 1).ravel()
             common = picked(common, move(common.own, 1), moved, len(numbers))
-        return Form(
+        low, high = (end if end is None else move(end, 1) for end in (self.low, self.high))
+        form = Form(
             move(self.centre, 1), None if self.slopes is None else move(self.slopes, 2),
-            move(self.radius, 1), move(self.size, 1), self.dtype,
-            None if self.low is None else move(self.low, 1),
-            None if self.high is None else move(self.high, 1), self.frame, common,
+            move(self.radius, 1), move(self.size, 1), self.dtype, low, high, self.frame, common,
         )  # fmt: skip
+        if self._bounds is not None and self._bounds[0] is self.low:
+            form._bounds = low, high
+        return form
 
     def of_type(self, dtype: np.dtype) -> "Form":
         """Return the same numbers in another type that represents them exactly."""
@@ -239,15 +244,11 @@ def least(numbers: Reals) -> float:
 def widened(
     low: Reals, high: Reals, share: float, smallest: float, absolute: float = 0.0
 ) -> tuple[Reals, Reals]:
-    """Return ends that are apart by a share of each more, and by a number.
-
-    What is tiny keeps its sign.
-    """
-    below, above = np.abs(low), np.abs(high)
-    low, high = low - (share * below + absolute), high + (share * above + absolute)
-    if least(below) < 2 * (smallest + absolute):
+    """Return ends apart by a share of each and a number more; what is tiny keeps its sign."""
+    low, high = low - (share * np.abs(low) + absolute), high + (share * np.abs(high) + absolute)
+    if least(np.abs(low)) < smallest:
         low = np.where(np.abs(low) < smallest, np.where(low < 0, -smallest, 0.0), low)
-    if least(above) < 2 * (smallest + absolute):
+    if least(np.abs(high)) < smallest:
         high = np.where(np.abs(high) < smallest, np.where(high > 0, smallest, 0.0), high)
     return low, high
 
@@ -285,15 +286,11 @@ def padded(form: Form, count: int) -> Reals:
 def joint_slopes(a: Form, b: Form, first: Reals | float, second: Reals | float) -> Reals | None:
     """Return the slopes of `first * a + second * b`, for forms of one frame."""
     if a.slopes is None:
-        return None if b.slopes is None else _times(b.slopes, second)
+        return None if b.slopes is None else b.slopes * second
     if b.slopes is None:
-        return _times(a.slopes, first)
+        return a.slopes if isinstance(first, float) and first == 1.0 else a.slopes * first
     count = max(len(a.slopes), len(b.slopes))
-    return _times(padded(a, count), first) + _times(padded(b, count), second)
-
-
-def _times(slopes: Reals, factor: Reals | float) -> Reals:
-    return slopes if isinstance(factor, float) and factor == 1.0 else slopes * factor
+    return padded(a, count) * first + padded(b, count) * second
 
 
 def exactly(centre: Reals, rest: Reals, dtype: np.dtype) -> Form | None:
@@ -320,7 +317,7 @@ def add(a: Form, b: Form, sign: float = 1.0) -> Form:
         (low, high), (first, last) = a.bounds(), b.bounds()
         if sign < 0:
             first, last = -last, -first
-        ends = _sum_end(low, first, a.dtype, -1), _sum_end(high, last, a.dtype, 1)
+        ends = _sum_ends(low, high, first, last, a.dtype)
         if a.slopes is None and b.slopes is None:
             return spanned(*ends, a.dtype, 0)
         ends = overflown(*ends, rounding(a.dtype).highest)
@@ -328,18 +325,18 @@ def add(a: Form, b: Form, sign: float = 1.0) -> Form:
         (a, b), *_ = alike([a, b])
     slopes = joint_slopes(a, b, 1.0, sign)
     centre = a.centre + b.centre if sign > 0 else a.centre - b.centre
-    form = rounded(
-        centre, slopes, a.radius + b.radius, a.size + b.size, a.dtype, None, a.frame or b.frame
-    )
+    radius, size, frame = a.radius + b.radius, a.size + b.size, a.frame or b.frame
+    form = rounded(centre, slopes, radius, size, a.dtype, None, frame)
     form.low, form.high = ends or (None, None)
-    if a.common is not None or b.common is not None:
-        form.common = summed(form.radius, [(a, 1.0), (b, sign)])
+    form.common = summed(form.radius, [(a, 1.0), (b, sign)])
     return form
 
 
-def _sum_end(one: Reals, other: Reals, dtype: np.dtype, side: int) -> Reals:
-    """Return the end of a sum of intervals, widened by rounding only where there is any."""
-    kind = rounding(dtype)
+def _sum_ends(
+    low: Reals, high: Reals, first: Reals, last: Reals, dtype: np.dtype
+) -> tuple[Reals, Reals]:
+    """Return the ends of a sum of intervals, widened by rounding only where there is any."""
+    kind, one, other = rounding(dtype), np.array([-low, high]), np.array([-first, last])
     end = one + other
     back = end - one
     # Knuth's error of the sum: it is zero where the sum is exact.
@@ -347,13 +344,12 @@ def _sum_end(one: Reals, other: Reals, dtype: np.dtype, side: int) -> Reals:
     if dtype.itemsize < 8:
         exact &= end.astype(dtype) == end
     size = np.abs(end)
-    widened = np.where(exact, end, end + side * (kind.unit * size + kind.smallest))
     if least(size) < kind.smallest:
-        small = (size > 0) & (size < kind.smallest)
-        widened = np.where(small, end + side * (kind.unit * size + kind.smallest), widened)
+        exact &= (size == 0) | (size >= kind.smallest)
+    end = np.where(exact, end, end + (kind.unit * size + kind.smallest))
     # A sum of numbers of one sign has that sign, or is zero.
-    lesser, greater = (np.minimum, np.maximum) if side > 0 else (np.maximum, np.minimum)
-    return np.where(side * greater(one, other) <= 0, lesser(widened, 0.0), widened)
+    end = np.where(np.maximum(one, other) <= 0, np.minimum(end, 0.0), end)
+    return -end[0], end[1]
 
 
 def negative(a: Form) -> Form:
@@ -386,8 +382,7 @@ def scaled(a: Form, by: Reals) -> Form:
     form = rounded(
         a.centre * by, slopes, a.radius * scale, size, a.dtype, ends, a.frame, exact=exact
     )
-    if a.common is not None:
-        form.common = summed(form.radius, [(a, by)])
+    form.common = a.common and summed(form.radius, [(a, by)])
     return form
 
 
@@ -396,7 +391,7 @@ def interval_product(low: Reals, high: Reals, first: Reals, last: Reals) -> tupl
     ends = low * first, low * last, high * first, high * last
     lowest = np.minimum(np.minimum(ends[0], ends[1]), np.minimum(ends[2], ends[3]))
     highest = np.maximum(np.maximum(ends[0], ends[1]), np.maximum(ends[2], ends[3]))
-    if np.isfinite(lowest).all() and np.isfinite(highest).all():
+    if least(lowest) > -np.inf and greatest(highest) < np.inf:
         return lowest, highest
     bad = np.isnan(lowest)
     # An interval with zero inside and one without an end: none of the four products is NaN.

@@ -13,23 +13,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy import special
 
-from verifai_jax.addons.verification.sets.form import (
-    SLACK,
-    Form,
-    Reals,
-    add,
-    chosen,
-    greatest,
-    is_point,
-    joined,
-    least,
-    negative,
-    product,
-    rounded,
-    rounding,
-    scaled,
-    unknown,
-)
+from verifai_jax.addons.verification.sets import form as affine
+from verifai_jax.addons.verification.sets.form import SLACK, Form, Reals, rounded, rounding
 from verifai_jax.addons.verification.sets.layers import summed
 
 Criticals = Callable[[Reals, Reals, Reals], Sequence[Reals]]
@@ -49,7 +34,6 @@ class Function(NamedTuple):
     """A function of one number: its `value` in double precision.
 
     - `criticals`: where its derivative equals a slope.
-    - `tangents`: the same points of all numbers, each with its value; None if there is no formula.
     - `domain`: the interval outside of which it is NaN.
     - `units`, `tiny`: its error in units of rounding, and of the smallest normal number.
     - `range`: an interval that contains all results, including rounding.
@@ -63,46 +47,35 @@ class Function(NamedTuple):
     tiny: float = TINY
     range: tuple[float, float] = (-np.inf, np.inf)
     rises: bool = False
-    tangents: Callable[[Reals], Sequence[tuple[Reals, Reals]]] | None = None
 
     def __call__(self, x: Form) -> Form:
         """Return the set of its values on a set."""
         (low, high), (first, last), spread = x.bounds(), self.domain, x.spread
-        wide, outside, points = high - low, np.zeros(1, bool), [low, high]
+        wide, points = high - low, [low, high]
         # Nothing is an exception where all is within the domain, and as wide as some number.
-        plain = least(wide) > 0 and greatest(spread) < np.inf
+        plain = affine.least(wide) > 0 and affine.greatest(spread) < np.inf
         if np.isfinite(first) or np.isfinite(last):
-            plain = plain and least(low) >= first and greatest(high) <= last
+            plain = plain and affine.least(low) >= first and affine.greatest(high) <= last
             points = points if plain else [np.clip(low, first, last), np.clip(high, first, last)]
         values = [self.value(point) for point in points]
         slope = (values[1] - values[0]) / (wide if plain else points[1] - points[0])
         plain = plain and bool(np.isfinite(np.add.reduce(slope, axis=None)))
         if not plain:
-            outside = unknown(low, high) | (low > high) | (low < first) | (high > last)
+            outside = affine.unknown(low, high) | (low > high) | (low < first) | (high > last)
             slope = np.where(np.isfinite(slope), slope, 0.0)
         lowest, highest = values
         if not self.rises:
-            extremes = self._points(np.zeros_like(low), *points)
-            lowest, highest = _extremes([*values, *(self.value(point) for point in extremes)])
-        off = [values[0] - slope * points[0]]
-        if plain and self.tangents is not None:
-            # The line through both ends is as far from one as from the other.
-            off += [np.where((low < at) & (at < high), value - slope * at, off[0])
-                    for at, value in self.tangents(slope)]  # fmt: skip
-        else:
-            inner = self._points(slope, *points)
-            off += [values[1] - slope * points[1], *(self.value(p) - slope * p for p in inner)]
-        below, above = _extremes(off)
+            turns = self._points(np.float64(0), *points)
+            lowest, highest = _extremes([*values, *(self.value(point) for point in turns)])
+        inner = self._points(slope, *points)
+        points, values = points + inner, values + [self.value(point) for point in inner]
+        below, above = _extremes([v - slope * p for v, p in zip(values, points, strict=True)])
         size = highest if self.range[0] >= 0 else np.maximum(np.abs(lowest), np.abs(highest))
         offset, error, radius = (below + above) / 2, (above - below) / 2, x.radius
         if not plain:
             usable = np.isfinite(offset) & np.isfinite(spread) & ~outside
-            slope, offset, radius, spread = (
-                np.where(usable, a, 0.0) for a in (slope, offset, radius, spread)
-            )
-            error, size = np.where(usable, error, np.inf), np.where(outside, np.inf, size)
-            lowest = np.where(outside, -np.inf, lowest)
-            highest = np.where(outside, np.inf, highest)
+            kept, error = (slope, offset, radius, spread), np.where(usable, error, np.inf)
+            slope, offset, radius, spread = (np.where(usable, a, 0.0) for a in kept)
         # Numbers of double precision between which the slope and the offset are rounded.
         steep = np.abs(slope)
         margin = np.abs(offset) + steep * (spread + np.abs(x.centre))
@@ -112,12 +85,10 @@ class Function(NamedTuple):
             x.dtype, (lowest, highest), x.frame, self.units, not self.units, 1 + self.tiny,
         )  # fmt: skip
         if self.units and form.low is not None and form.high is not None:
-            if self.range[0] > -np.inf:
-                form.low = np.where(outside, -np.inf, np.maximum(form.low, self.range[0]))
-            if self.range[1] < np.inf:
-                form.high = np.where(outside, np.inf, np.minimum(form.high, self.range[1]))
+            lowest, highest = self.range
+            form.low, form.high = np.maximum(form.low, lowest), np.minimum(form.high, highest)
         form.common = x.common and summed(form.radius, [(x, slope)])
-        return form
+        return form if plain else _but(form, ~outside)
 
     def _points(self, slope: Reals, low: Reals, high: Reals) -> list[Reals]:
         # Of a number and NaN `fmax` is the number.
@@ -141,11 +112,11 @@ def _single(at: Callable[[Reals], Reals]) -> Criticals:
 
 
 def _periodic(at: Callable[[Reals], Reals], period: float) -> Criticals:
-    """Return the points of both signs in all periods that an interval of one period may touch."""
+    """Return the points of both signs that an interval of one period may touch."""
 
     def criticals(slope: Reals, low: Reals, high: Reals) -> Sequence[Reals]:
-        base, turn = at(slope), np.round((low / 2 + high / 2) / period)
-        return [s * base + period * (turn + k) for s in (1.0, -1.0) for k in (-1.0, 0.0, 1.0)]
+        base, middle = at(slope), low / 2 + high / 2
+        return [each + period * np.round((middle - each) / period) for each in (base, -base)]
 
     return criticals
 
@@ -160,7 +131,7 @@ def _sine(value: Callable[[Reals], Reals], criticals: Criticals) -> Callable[[Fo
         if not np.any(wide):
             return form
         end = np.where(np.isfinite(low) & np.isfinite(high), 1.0, np.inf)
-        return chosen([~wide, wide], [form, Form.between(-end, end, x.dtype)])
+        return affine.chosen([~wide, wide], [form, Form.between(-end, end, x.dtype)])
 
     return enclosed
 
@@ -170,7 +141,7 @@ def _whole(value: Callable[[Reals], Reals]) -> Callable[[Form], Form]:
 
     def enclosed(x: Form) -> Form:
         low, high = x.bounds()
-        nothing = unknown(low, high)
+        nothing = affine.unknown(low, high)
         ends = np.where(nothing, low, value(low)), np.where(nothing, high, value(high))
         return Form.between(*ends, x.dtype)
 
@@ -206,13 +177,6 @@ _RSQRT = Function(
 )
 
 
-def _logits(slope: Reals) -> Sequence[tuple[Reals, Reals]]:
-    """Return where the logistic function has a slope, on both sides, and its values."""
-    value = slope / (0.5 + np.sqrt(np.maximum(0.25 - slope, 0)))
-    at = special.logit(value)
-    return (at, value), (-at, 1 - value)
-
-
 @cache
 def _of_power(n: int) -> Function:
     criticals = _even(lambda slope: np.abs(slope / n) ** (1 / (n - 1)))
@@ -235,10 +199,9 @@ FUNCTIONS: dict[str, Callable[[Form], Form]] = {
     "cbrt": Function(np.cbrt, _even(lambda a: (3 * a) ** -1.5), units=40.0, tiny=1e26),
     "tanh": Function(np.tanh, _even(lambda a: np.arccosh(1 / np.sqrt(a))), range=(-1.0, 1.0),
                      rises=True),
-    "logistic": Function(
-        special.expit, lambda a, *_: [point for point, _ in _logits(a)], range=(0.0, 1.0),
-        rises=True, tangents=lambda a: _logits(a),
-    ),
+    "logistic": Function(special.expit, _even(lambda a: special.logit(a / (
+        0.5 + np.sqrt(np.maximum(0.25 - a, 0))
+    ))), range=(0.0, 1.0), rises=True),
     "sinh": Function(np.sinh, _even(np.arccosh), units=60.0),
     "cosh": Function(np.cosh, _single(np.arcsinh), units=60.0, range=(1.0, np.inf)),
     "asinh": Function(np.arcsinh, _even(lambda a: np.sqrt(1 / a**2 - 1))),
@@ -256,15 +219,15 @@ FUNCTIONS: dict[str, Callable[[Form], Form]] = {
         x - np.pi / 2 for x in _periodic(np.arccos, 2 * np.pi)(a, low + np.pi / 2, high + np.pi / 2)
     ]),
     "tan": _tangent,
-    "floor": _whole(np.floor), "ceil": _whole(np.ceil), "sign": _whole(np.sign), "neg": negative,
+    "floor": _whole(np.floor), "ceil": _whole(np.ceil), "sign": _whole(np.sign),
+    "neg": affine.negative,
 }  # fmt: skip
 """Functions of one number, by the name of JAX's primitive."""
 
 
 def _above(knot: Any) -> Function:
     """Return the maximum with a number."""
-    return Function(lambda x: np.maximum(x, knot), lambda *_: [knot], units=0.0, rises=True,
-                    tangents=lambda _: [(knot, knot)])  # fmt: skip
+    return Function(lambda x: np.maximum(x, knot), lambda *_: [knot], units=0.0, rises=True)
 
 
 _RAMP = _above(0.0)._replace(range=_POSITIVE)
@@ -283,16 +246,16 @@ def integer_power(x: Form, n: int) -> Form:
         return Form.constant(np.ones(x.shape), x.dtype)
     if n < 0:
         return _reciprocal(integer_power(x, -n))
-    return x if n == 1 else _of_power(n)(x)
+    return x.of_type(x.dtype) if n == 1 else _of_power(n)(x)
 
 
 def quotient(a: Form, b: Form) -> Form:
     """Return `a / b`; unbounded if `b` may be zero."""
-    if is_point(b) and np.all((b.centre != 0) & np.isfinite(b.centre)):
+    if affine.is_point(b) and np.all((b.centre != 0) & np.isfinite(b.centre)):
         inverse = 1 / b.centre
         if np.isfinite(inverse).all():
-            return _widened(scaled(a, inverse), 3.0)
-    return _widened(product(a, _reciprocal(b)), 3.0)
+            return _widened(affine.scaled(a, inverse), 3.0)
+    return _widened(affine.product(a, _reciprocal(b)), 3.0)
 
 
 def _widened(x: Form, units: float) -> Form:
@@ -309,33 +272,35 @@ def _widened(x: Form, units: float) -> Form:
 def greater(a: Form, b: Form) -> Form:
     """Return the maximum: `b + max(a - b, 0)`, which preserves common dependencies."""
     for one, other in ((a, b), (b, a)):
-        if is_point(other) and one.slopes is not None and np.isfinite(other.centre).all():
+        if affine.is_point(other) and one.slopes is not None and np.isfinite(other.centre).all():
             return _above(other.centre)(one)
     (low, high), (first, last) = a.bounds(), b.bounds()
-    nothing = unknown(low, high) | unknown(first, last)
+    nothing = affine.unknown(low, high) | affine.unknown(first, last)
     ours, theirs = (low >= last) & ~nothing, (first >= high) & ~nothing
     lowest, top = np.maximum(low, first), np.maximum(high, last)
     ends = np.where(nothing, -np.inf, lowest), np.where(nothing, np.inf, top)
     if a.slopes is None and b.slopes is None:
         return Form.between(*ends, a.dtype)
-    ramp = add(b, _RAMP(difference(a, b)))
+    ramp = affine.add(b, _RAMP(difference(a, b)))
     size = np.maximum(np.abs(ends[0]), np.abs(ends[1]))
     both = rounded(
         ramp.centre, ramp.slopes, ramp.radius, np.broadcast_to(size, ramp.size.shape),
         a.dtype, ends, ramp.frame, exact=True,
     )  # fmt: skip
-    return chosen([ours, theirs, ~(ours | theirs)], [a, b, both])
+    return affine.chosen([ours, theirs, ~(ours | theirs)], [a, b, both])
 
 
 def lesser(a: Form, b: Form) -> Form:
     """Return the minimum."""
-    return negative(greater(negative(a), negative(b)))
+    return affine.negative(greater(affine.negative(a), affine.negative(b)))
 
 
 def difference(a: Form, b: Form) -> Form:
     """Return the exact difference `a - b`, which decides a comparison."""
     a, b = a.of_type(np.dtype(np.float64)), b.of_type(np.dtype(np.float64))
-    return _but(add(a, b, -1.0), ~(unknown(*a.bounds()) | unknown(*b.bounds())))
+    return _but(
+        affine.add(a, b, -1.0), ~(affine.unknown(*a.bounds()) | affine.unknown(*b.bounds()))
+    )
 
 
 def remainder(a: Form, b: Form) -> Form:
@@ -357,26 +322,26 @@ def remainder(a: Form, b: Form) -> Form:
         return wide
     count = np.where(same, ends[0], 0.0)
     times = Form.between(count, count, a.dtype)
-    exact = add(a, product(times, b), -1.0)
+    exact = affine.add(a, affine.product(times, b), -1.0)
     exact.low = exact.high = None
-    return chosen([same, ~same], [exact, wide])
+    return affine.chosen([same, ~same], [exact, wide])
 
 
 def power(a: Form, b: Form) -> Form:
     """Return `a ** b` for positive numbers, or for an integer exponent."""
-    if is_point(b) and b.centre.size and (b.centre == b.centre.flat[0]).all():
+    if affine.is_point(b) and b.centre.size and (b.centre == b.centre.flat[0]).all():
         exponent = float(b.centre.flat[0])
         if exponent.is_integer() and abs(exponent) <= 64:
             return _widened(integer_power(a, int(exponent)), UNITS)
         if exponent == 0.5:
             return _widened(FUNCTIONS["sqrt"](a), UNITS)
-    return _but(FUNCTIONS["exp"](product(b, FUNCTIONS["log"](a))), a.bounds()[0] > 0)
+    return _but(FUNCTIONS["exp"](affine.product(b, FUNCTIONS["log"](a))), a.bounds()[0] > 0)
 
 
 def angle(y: Form, x: Form) -> Form:
     """Return the angle of a point `(x, y)`; the full circle if it may cross the negative x axis."""
     (low, high), (left, right) = y.bounds(), x.bounds()
-    nothing = unknown(low, high) | unknown(left, right)
+    nothing = affine.unknown(low, high) | affine.unknown(left, right)
     right_half, above, below = left > 0, low > 0, high < 0
     masks = [right_half, ~right_half & above, ~right_half & ~above & below]
     rest = ~(right_half | above | below)
@@ -391,11 +356,11 @@ def angle(y: Form, x: Form) -> Form:
 
     def turned(by: float, ratio: Form) -> Form:
         ends = np.full(ratio.centre.shape, by)
-        return add(Form.between(ends, ends, y.dtype), FUNCTIONS["atan"](ratio))
+        return affine.add(Form.between(ends, ends, y.dtype), FUNCTIONS["atan"](ratio))
 
-    ratio = negative(quotient(x, y))
+    ratio = affine.negative(quotient(x, y))
     cases = turned(0.0, quotient(y, x)), turned(np.pi / 2, ratio), turned(-np.pi / 2, ratio)
-    return _widened(chosen([*masks, rest], [*cases, circle]), UNITS)
+    return _widened(affine.chosen([*masks, rest], [*cases, circle]), UNITS)
 
 
 def selected(truth: np.ndarray, maybe: np.ndarray, no: Form, yes: Form) -> Form:
@@ -405,6 +370,6 @@ def selected(truth: np.ndarray, maybe: np.ndarray, no: Form, yes: Form) -> Form:
             return yes
         if not np.any(truth):
             return no
-        return chosen([truth, ~truth], [yes, no])
-    both = joined(no, yes)
-    return chosen([truth & ~maybe, maybe, ~truth & ~maybe], [yes, both, no])
+        return affine.chosen([truth, ~truth], [yes, no])
+    both = affine.joined(no, yes)
+    return affine.chosen([truth & ~maybe, maybe, ~truth & ~maybe], [yes, both, no])

@@ -10,8 +10,9 @@ import numpy as np
 
 from verifai_jax.addons.verification.sets.arrays import add_up, times_each
 from verifai_jax.addons.verification.sets.form import Form, is_point, rounded
-from verifai_jax.addons.verification.sets.interpreter import Interpreter, Value, constant, rule
+from verifai_jax.addons.verification.sets.interpreter import Interpreter, rule
 from verifai_jax.addons.verification.sets.layers import SLACK, refined, through_layer
+from verifai_jax.addons.verification.sets.values import Value, constant
 from verifai_jax.addons.verification.sets.whole import Whole
 from verifai_jax.core.compute.precision import in_precision
 
@@ -78,7 +79,7 @@ def _times(
             names = f"...{own},{its}->...{result}"
             return np.einsum(names, arrays, numbers, optimize=["einsum_path", (0, 1)])
         lead = arrays.shape[: arrays.ndim - len(own)]
-        sums = arrays.reshape(-1, len(numbers)) @ numbers
+        sums = arrays.reshape(math.prod(lead), -1) @ numbers
         return sums.reshape(*lead, *(sizes[c] for c in result))
 
     shape = np.broadcast_shapes(a.centre.shape, a.radius.shape, a.size.shape)

@@ -14,13 +14,8 @@ import numpy as np
 
 from verifai_jax.addons.verification.sets.form import Form, Reals, is_point, rounding, unknown
 from verifai_jax.addons.verification.sets.functions import FUNCTIONS, Function
-from verifai_jax.addons.verification.sets.interpreter import (
-    SHORTCUTS,
-    Interpreter,
-    Program,
-    Value,
-    as_form,
-)
+from verifai_jax.addons.verification.sets.interpreter import SHORTCUTS, Interpreter, Program
+from verifai_jax.addons.verification.sets.values import Value, as_form
 from verifai_jax.addons.verification.sets.whole import Whole
 from verifai_jax.core.compute.jaxprs import called
 from verifai_jax.systems.ode import sin_cos
