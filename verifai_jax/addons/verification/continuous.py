@@ -63,10 +63,9 @@ def between_samples(problem: Problem) -> Problem:
         left = jnp.where(time < (loop.steps - 0.5) * loop.dt, loop.dt, 0.0)
         inside = replace(loop, method=lambda *step: flow(*step)[1])
         states = substep(inside, features, control, time, state, left)
-        now = _instants(time, left)
         if loop.signals is None:
             return default_signals(states, control)
-        return loop.signals(now, states, control, features)
+        return loop.signals(_instants(time, left), states, control, features)
 
     system = replace(loop, method=lambda *step: flow(*step)[0], signals=during)
     spec = {name: _measured(formula) for name, formula in problem.formulas.items()}
@@ -76,9 +75,8 @@ def between_samples(problem: Problem) -> Problem:
 class _Measure(Duration):
     """The seconds, within a window of time, in which a formula holds: no period counts as whole.
 
-    A window from an instant within a sample's step starts and ends within steps, of which it has
-    as much together as one step. That step holds as long as one of them, or as long as some time
-    in between.
+    A window starts and ends within steps, of which it has as much together as one step: in these
+    the formula holds as long as in one of them, or some time in between.
     """
 
     def value(self, of: Operations[V], operands: Sequence[V], first: int, last: int) -> V:
@@ -97,9 +95,8 @@ def _measured(formula: Formula) -> Formula:
     """Return a formula whose durations are those of time, not of samples."""
 
     def measured(part: Term) -> Term | None:
-        if not isinstance(part, Duration):
-            return None
-        return _Measure.of([_measured(each) for each in part.counted], part.window)
+        own = [*map(_measured, part.counted)] if isinstance(part, Duration) else None
+        return own and _Measure.of(own, part.window)
 
     return changed_leaves(formula, lambda leaf: with_terms(leaf, measured))
 

@@ -120,9 +120,8 @@ class Enclosure:
         return Bounds(lowest, high.min(1), holds, truth, outside, moves)
 
     def _evaluated(self, program: Any, leaves: Sequence[Value], count: int) -> list[Value]:
-        interpreter = Interpreter(count, self.dim)
         with in_precision(self.precision):
-            return interpreter(program, leaves)
+            return Interpreter(count, self.dim)(program, leaves)
 
     def _leaves(self, low: Corners, high: Corners) -> list[Value]:
         """Return the features of boxes as sets, in the order of the leaves of their tree."""

@@ -25,13 +25,12 @@ def _reshape(params: Params) -> Move:
 
 
 def _broadcast(params: Params) -> Move:
-    axes, to = params["broadcast_dimensions"], params["to"]
+    to, kept = params["to"], params["broadcast_dimensions"]
+    new = [axis for axis in range(len(to)) if axis not in kept]
 
     def spread(array: np.ndarray, lead: int) -> np.ndarray:
-        shape, front = [1] * len(to), array.shape[:lead]
-        for axis, size in zip(axes, array.shape[lead:], strict=True):
-            shape[axis] = size
-        return np.broadcast_to(array.reshape(*front, *shape), (*front, *to))
+        wide = np.expand_dims(array, tuple(axis + lead for axis in new))
+        return np.broadcast_to(wide, array.shape[:lead] + to)
 
     return spread
 
@@ -46,9 +45,7 @@ def _slice(params: Params) -> Move:
 _MOVES: dict[str, Callable[[Params], Move]] = {
     "reshape": _reshape, "squeeze": _reshape, "expand_dims": _reshape, "slice": _slice,
     "broadcast_in_dim": _broadcast,
-    "transpose": lambda p: lambda a, lead: a.transpose(
-        *range(lead), *np.add(p["permutation"], lead)
-    ),
+    "transpose": lambda p: lambda a, n: a.transpose(*range(n), *np.add(p["permutation"], n)),
     "rev": lambda p: lambda a, lead: np.flip(a, tuple(axis + lead for axis in p["dimensions"])),
     "tile": lambda p: lambda a, lead: np.tile(a, (*(1,) * lead, *p["reps"])),
 }  # fmt: skip

@@ -69,8 +69,7 @@ def _flow(t: Interpreter, step: Any, inputs: list[Value]) -> list[Value]:
     # The signals of a step and its end are asked for one after the other.
     key = text, length, *map(id, inputs[:shared]), id(time), *map(id, state)
     if t.latest is None or t.latest[0] != key:
-        step_of = _Step(t, rates, inputs[:shared])
-        t.latest = key, inputs, step_of(time, state, length)
+        t.latest = key, inputs, _Step(t, rates, inputs[:shared])(time, state, length)
     return list(t.latest[2])
 
 

@@ -17,7 +17,7 @@ Algorithms 37 (2004); S. Rump, INTLAB, 1999.
 """
 
 from collections.abc import Callable, Sequence
-from functools import cache
+from functools import cache, partial
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -28,6 +28,12 @@ from verifai_jax.addons.verification.sets.layers import SLACK, Common, picked, s
 
 Reals = np.ndarray
 """Numbers of double precision, `[boxes, *shape]`; `[1, *shape]` if they are those of all boxes."""
+Ends = tuple[Reals, Reals]
+
+
+greatest = partial(np.maximum.reduce, axis=None, initial=-np.inf)
+least = partial(np.minimum.reduce, axis=None, initial=np.inf)
+"""The greatest and the least of numbers, or NaN if it is one of them; without any an infinity."""
 
 
 class Rounding(NamedTuple):
@@ -79,7 +85,7 @@ class Form:
         self.dtype, self.low, self.high = dtype, low, high
         self.frame = frame if slopes is not None else None
         self.common = common if slopes is not None else None
-        self._bounds: tuple[Reals, Reals] | None = None
+        self._bounds: Ends | None = None
         self._spread: Reals | None = None
 
     @classmethod
@@ -131,7 +137,7 @@ class Form:
             self._spread = spread
         return spread
 
-    def bounds(self) -> tuple[Reals, Reals]:
+    def bounds(self) -> Ends:
         """Return the ends of the set: the intersection of affine form and interval."""
         if self._bounds is None:
             if self.slopes is None and self.low is not None and self.high is not None:
@@ -187,7 +193,7 @@ class Form:
         return Form(self.centre, self.slopes[:count], radius, self.size, self.dtype, *ends)
 
 
-def overflown(low: Reals, high: Reals, highest: float) -> tuple[Reals, Reals]:
+def overflown(low: Reals, high: Reals, highest: float) -> Ends:
     """Return an interval that is unbounded if its numbers may overflow."""
     if greatest(np.abs(low)) <= highest and greatest(np.abs(high)) <= highest:
         return low, high
@@ -205,7 +211,7 @@ def unknown(low: Reals, high: Reals) -> Reals:
 
 def rounded(
     centre: Reals, slopes: Reals | None, radius: Reals, size: Reals, dtype: np.dtype,
-    ends: tuple[Reals, Reals] | None = None, frame: Frame | None = None, units: float = 1.0,
+    ends: Ends | None = None, frame: Frame | None = None, units: float = 1.0,
     exact: bool = False, tiny: float = 1.0,
 ) -> Form:  # fmt: skip
     """Return the result of an operation, widened by its error in so many units of rounding.
@@ -231,19 +237,7 @@ def rounded(
     return form
 
 
-def greatest(numbers: Reals) -> float:
-    """Return the greatest number, or NaN; without numbers an infinity."""
-    return np.maximum.reduce(numbers, axis=None, initial=-np.inf)
-
-
-def least(numbers: Reals) -> float:
-    """Return the least number, or NaN; without numbers an infinity."""
-    return np.minimum.reduce(numbers, axis=None, initial=np.inf)
-
-
-def widened(
-    low: Reals, high: Reals, share: float, smallest: float, absolute: float = 0.0
-) -> tuple[Reals, Reals]:
+def widened(low: Reals, high: Reals, share: float, smallest: float, absolute: float = 0.0) -> Ends:
     """Return ends apart by a share of each and a number more; what is tiny keeps its sign."""
     low, high = low - (share * np.abs(low) + absolute), high + (share * np.abs(high) + absolute)
     if least(np.abs(low)) < smallest:
@@ -314,10 +308,8 @@ def add(a: Form, b: Form, sign: float = 1.0) -> Form:
             return form
     ends = None
     if a.low is not None and b.low is not None:
-        (low, high), (first, last) = a.bounds(), b.bounds()
-        if sign < 0:
-            first, last = -last, -first
-        ends = _sum_ends(low, high, first, last, a.dtype)
+        first, last = b.bounds()
+        ends = _sum_ends(a.bounds(), (first, last) if sign > 0 else (-last, -first), a.dtype)
         if a.slopes is None and b.slopes is None:
             return spanned(*ends, a.dtype, 0)
         ends = overflown(*ends, rounding(a.dtype).highest)
@@ -332,11 +324,9 @@ def add(a: Form, b: Form, sign: float = 1.0) -> Form:
     return form
 
 
-def _sum_ends(
-    low: Reals, high: Reals, first: Reals, last: Reals, dtype: np.dtype
-) -> tuple[Reals, Reals]:
+def _sum_ends(a: Ends, b: Ends, dtype: np.dtype) -> Ends:
     """Return the ends of a sum of intervals, widened by rounding only where there is any."""
-    kind, one, other = rounding(dtype), np.array([-low, high]), np.array([-first, last])
+    kind, (one, other) = rounding(dtype), (np.array([-low, high]) for low, high in (a, b))
     end = one + other
     back = end - one
     # Knuth's error of the sum: it is zero where the sum is exact.
@@ -386,7 +376,7 @@ def scaled(a: Form, by: Reals) -> Form:
     return form
 
 
-def interval_product(low: Reals, high: Reals, first: Reals, last: Reals) -> tuple[Reals, Reals]:
+def interval_product(low: Reals, high: Reals, first: Reals, last: Reals) -> Ends:
     """Return the product of two intervals; unbounded if zero may meet infinity."""
     ends = low * first, low * last, high * first, high * last
     lowest = np.minimum(np.minimum(ends[0], ends[1]), np.minimum(ends[2], ends[3]))

@@ -7,7 +7,6 @@ of JAX's primitives.
 """
 
 from collections.abc import Callable, Sequence
-from functools import cache
 from typing import Any, TypeAlias
 from weakref import WeakKeyDictionary
 
@@ -49,7 +48,9 @@ class Interpreter:
 
     def __init__(self, boxes: int, features: int) -> None:
         self.boxes, self.features = boxes, features
-        _keep_memory()
+        # Once 32 MB are freed, which nobody touched, the C library keeps what arrays leave, and
+        # does not spend a third of the time on new pages of zeros.
+        np.empty(2**22 - 2**12)
         self.latest: tuple[Any, ...] | None = None
         """The last step of a differential equation: what it was made of, and its results."""
 
@@ -109,15 +110,6 @@ class Interpreter:
         results = step.primitive.bind(*map(jnp.asarray, arrays), **step.params)
         results = results if step.primitive.multiple_results else [results]
         return [constant(r, f) for r, f in zip(results, forms, strict=True)]
-
-
-@cache
-def _keep_memory() -> None:
-    """Free 32 MB that are not touched: from then on the C library keeps what arrays leave.
-
-    Otherwise it returns it at once, and a third of the time goes into new pages of zeros.
-    """
-    np.empty(2**22 - 2**12)
 
 
 def _where(step: Equation) -> str:

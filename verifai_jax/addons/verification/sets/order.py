@@ -1,7 +1,5 @@
 """Sorting, on sets: each position has the hull of the elements that may stand there."""
 
-from collections.abc import Sequence
-
 import numpy as np
 
 from verifai_jax.addons.verification.sets import functions
