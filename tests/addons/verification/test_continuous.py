@@ -1,5 +1,11 @@
 """About the differential equation itself: no solution leaves its bounds, at any time."""
 
+import json
+import runpy
+import subprocess
+import sys
+from pathlib import Path
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -293,3 +299,30 @@ def test_a_duration_is_proved_up_to_what_a_step_leaves_open():
     )  # fmt: skip
     assert kept.proved.mass == early.proved.mass == 1
     assert broken.throughout.mass == 1
+
+
+EXAMPLES = Path(__file__).parents[3] / "examples" / "verification"
+
+
+@pytest.mark.thorough
+def test_a_proof_about_a_plant_is_checked_again_by_another_program(tmp_path):
+    pytest.importorskip("mpmath")
+    problem = runpy.run_path(str(EXAMPLES / "held_pendulum_problem.py"))["problem"]
+    boxes, plant = tmp_path / "boxes.json", tmp_path / "plant.py"
+    found = vj.verify(problem, boxes=1, continuous=True, progress=False)
+    assert found.proved.mass == 1
+    found.save(boxes)
+
+    def checked(highest):
+        text = (EXAMPLES / "held_pendulum.py").read_text()
+        plant.write_text(text.replace("HIGHEST = 0.42", f"HIGHEST = {highest}"))
+        command = [sys.executable, EXAMPLES / "check_plant.py", plant, boxes]
+        return subprocess.run(command, capture_output=True, text=True, check=False)
+
+    assert checked(0.42).stdout == "1 boxes are proved, 1 of the features\n"
+    assert checked(0.35).stderr == "box 1 is not proved\n"
+    record = json.loads(boxes.read_text())
+    for end in ("low", "high", "state"):
+        record["boxes"][end] *= 2
+    boxes.write_text(json.dumps(record))
+    assert checked(0.42).stderr == "two boxes overlap\n"

@@ -20,8 +20,7 @@ Move = Callable[[np.ndarray, int], np.ndarray]
 def _reshape(params: Params) -> Move:
     if params.get("dimensions") is not None and "new_sizes" in params:
         raise NotImplementedError("a reshape that permutes")
-    shape = params["to"]
-    return lambda array, lead: array.reshape(array.shape[:lead] + shape)
+    return lambda array, lead: array.reshape(array.shape[:lead] + params["to"])
 
 
 def _broadcast(params: Params) -> Move:
