@@ -21,7 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from verifai_jax.addons.verification.sets import Form, Interpreter
-from verifai_jax.addons.verification.sets.interpreter import as_form
+from verifai_jax.addons.verification.sets.values import as_form
 
 NETWORKS = {
     "2-16-1 tanh": ((2, 16, 1), "tanh"), "4-20-1 tanh": ((4, 20, 1), "tanh"),

@@ -1,5 +1,11 @@
 """About the differential equation itself: no solution leaves its bounds, at any time."""
 
+import json
+import runpy
+import subprocess
+import sys
+from pathlib import Path
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -143,6 +149,9 @@ def smooth(t, s, u, f):
         (plant(smooth, exact_step=True), "'plant' has exact_step="),
         (plant(smooth, "(x >= 0) until (x <= 0.5)"), "until.* is about single samples"),
         (plant(smooth, "always (x <= 1 | next x <= 1)"), "next.* is about single samples"),
+        (plant(smooth, "always duration(prev x <= 1, 0.5) <= 1"), "prev.* is about single samples"),
+        (plant(smooth, "always(0,1] x <= 1"), r"needs windows with both of their ends.*\(0,1\]"),
+        (plant(smooth, "always duration(once[0,0.5) x <= 1, 0.5) <= 1"), r"the window \[0,0\.5\)"),
         (vj.Problem("function", {"x": vj.Box(0, 1)},
                     lambda f, key: vj.Trace({"x": f["x"] * jnp.ones(2)}, dt=1.0), "always x <= 1"),
          "continuous=True is about the equations of a system that vj.ode made"),
@@ -206,3 +215,114 @@ def test_windows_within_windows_a_jump_and_a_held_network_are_those_of_solutions
         assert np.all(lowest - 1e-6 <= seen)
         assert np.all(seen <= highest + 1e-6)
         assert np.max(highest - lowest) < 0.4
+
+
+DURATIONS = {
+    "last": "always duration(x > 0.5, 2) <= 0.6",
+    "shifted": "always[1, 3] duration(v <= 0.5, [0.5, 2]) >= 0.1",
+    "product": "eventually[0, 2] duration(x * v > 0, (0.2, 1.7]) > 0.3",
+    "sum": "always[1, 3] 2 * duration(once[0.2, 0.4] x > 0.5, 1.2) - x <= 3",
+    "nested": "eventually (x < 0.3 & duration(duration(x > 0, 1) > 0.45, 2) >= 0.4)",
+    "step": "always duration(x > 0, [0.3, 0.35]) <= 0.04",
+    "instant": "always duration(x > 0, [1, 1]) <= 1",
+}  # fmt: skip
+
+
+@pytest.mark.thorough
+def test_durations_are_those_of_solutions():
+    """Against sums over fifty parts of each step of solutions by DOP853."""
+    system = vj.ode(
+        lambda t, s, u, f: {"x": s["v"], "v": -f["k"] * s["x"] + 0.3 * jnp.cos(2 * t)},
+        lambda f, key: {"x": f["x"], "v": f["v"]}, dt=0.05, duration=4.0,
+        signals=lambda t, s, u, f: s,
+    )  # fmt: skip
+    space = {"x": vj.Box(0, 1), "v": vj.Box(-1, 1), "k": vj.Box(2, 5)}
+    problem = vj.Problem("durations", space, system, DURATIONS)
+    enclosure, random = Enclosure(between_samples(problem), "float64"), np.random.default_rng(0)
+    width = 2.0 ** -random.integers(4, 13, (30, 1)) * np.ones((1, 3))
+    low = np.floor(random.random((30, 3)) / width) * width
+    rho = enclosure._evaluated(enclosure._verdict, enclosure._leaves(low, low + width), 30)
+    times = np.linspace(0, 4, 4001)
+
+    def at(seconds):
+        return round(1000 * seconds)
+
+    def lasts(holds, first, last):
+        """Return the seconds within a window before each time."""
+        holds = holds.astype(float)
+        total = np.concatenate([[0], np.cumsum(holds[1:] + holds[:-1]) / 2000])
+        begin, end = (total[np.maximum(np.arange(4001) - at(s), 0)] for s in (last, first))
+        return end - begin
+
+    def once(holds, first, last):
+        row = np.concatenate([np.zeros(at(last), bool), holds])
+        views = np.lib.stride_tricks.sliding_window_view(row, at(last) + 1)
+        return views[:, : at(last) - at(first) + 1].any(1)
+
+    for u, lowest, highest in zip(
+        low + width * random.random((30, 3)), *rho[0].bounds(), strict=True
+    ):
+        x, v = solve_ivp(
+            lambda t, y, k=2 + 3 * u[2]: [y[1], -k * y[0] + 0.3 * np.cos(2 * t)], (0, 4),
+            [u[0], 2 * u[1] - 1], "DOP853", t_eval=times, rtol=1e-10, atol=1e-10,
+        ).y  # fmt: skip
+        between, early = slice(at(1), at(3) + 1), slice(at(2) + 1)
+        seen = np.array([
+            (0.6 - lasts(x > 0.5, 0, 2)).min(), (lasts(v <= 0.5, 0.5, 2) - 0.1)[between].min(),
+            (lasts(x * v > 0, 0.2, 1.7) - 0.3)[early].max(),
+            (3 - 2 * lasts(once(x > 0.5, 0.2, 0.4), 0, 1.2) + x)[between].min(),
+            np.minimum(0.3 - x, lasts(lasts(x > 0, 0, 1) > 0.45, 0, 2) - 0.4).max(),
+            (0.04 - lasts(x > 0, 0.3, 0.35)).min(), 1.0,
+        ])  # fmt: skip
+        # A crossing is known to a thousandth of a second.
+        assert np.all(lowest - 4e-3 <= seen)
+        assert np.all(seen <= highest + 4e-3)
+    wide = np.median(rho[0].bounds()[1] - rho[0].bounds()[0], axis=0)
+    assert np.all(wide <= 0.3), wide
+
+
+def falling(spec):
+    """Return `x' = -x` from 1 to 1.1: above a half for 0.69 to 0.79 seconds."""
+    system = vj.ode(
+        lambda t, s, u, f: {"x": -s["x"]}, lambda f, key: {"x": f["x"]}, dt=0.05, duration=2.0
+    )
+    return vj.Problem("falling", {"x": vj.Box(1, 1.1)}, system, spec)
+
+
+@pytest.mark.thorough
+def test_a_duration_is_proved_up_to_what_a_step_leaves_open():
+    kept, broken, early = (
+        vj.verify(falling(spec), boxes=8, continuous=True, progress=False) for spec in (
+            "always duration(x > 0.5, 2) <= 0.85", "always duration(x > 0.5, 2) <= 0.6",
+            "always[0, 1] duration(x > 0.5, 1) >= 0",
+        )
+    )  # fmt: skip
+    assert kept.proved.mass == early.proved.mass == 1
+    assert broken.throughout.mass == 1
+
+
+EXAMPLES = Path(__file__).parents[3] / "examples" / "verification"
+
+
+@pytest.mark.thorough
+def test_a_proof_about_a_plant_is_checked_again_by_another_program(tmp_path):
+    pytest.importorskip("mpmath")
+    problem = runpy.run_path(str(EXAMPLES / "held_pendulum_problem.py"))["problem"]
+    boxes, plant = tmp_path / "boxes.json", tmp_path / "plant.py"
+    found = vj.verify(problem, boxes=1, continuous=True, progress=False)
+    assert found.proved.mass == 1
+    found.save(boxes)
+
+    def checked(highest):
+        text = (EXAMPLES / "held_pendulum.py").read_text()
+        plant.write_text(text.replace("HIGHEST = 0.42", f"HIGHEST = {highest}"))
+        command = [sys.executable, EXAMPLES / "check_plant.py", plant, boxes]
+        return subprocess.run(command, capture_output=True, text=True, check=False)
+
+    assert checked(0.42).stdout == "1 boxes are proved, 1 of the features\n"
+    assert checked(0.35).stderr == "box 1 is not proved\n"
+    record = json.loads(boxes.read_text())
+    for end in ("low", "high", "state"):
+        record["boxes"][end] *= 2
+    boxes.write_text(json.dumps(record))
+    assert checked(0.42).stderr == "two boxes overlap\n"

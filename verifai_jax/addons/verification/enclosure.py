@@ -19,7 +19,7 @@ from jaxtyping import Array, Bool, Float, PyTree
 
 from verifai_jax.addons.verification.ranges import FeatureRanges
 from verifai_jax.addons.verification.sets import Form, Interpreter, Whole
-from verifai_jax.addons.verification.sets.interpreter import Value, as_form, as_whole
+from verifai_jax.addons.verification.sets.values import Value, as_form, as_whole
 from verifai_jax.core.compute.cores import available_cores
 from verifai_jax.core.compute.fingerprint import without_unused
 from verifai_jax.core.compute.precision import in_precision
@@ -120,9 +120,8 @@ class Enclosure:
         return Bounds(lowest, high.min(1), holds, truth, outside, moves)
 
     def _evaluated(self, program: Any, leaves: Sequence[Value], count: int) -> list[Value]:
-        interpreter = Interpreter(count, self.dim)
         with in_precision(self.precision):
-            return interpreter(program, leaves)
+            return Interpreter(count, self.dim)(program, leaves)
 
     def _leaves(self, low: Corners, high: Corners) -> list[Value]:
         """Return the features of boxes as sets, in the order of the leaves of their tree."""

@@ -65,8 +65,7 @@ def verify_network(
     """
     check_positive("budget", budget)
     cases, act = read_property(Path(rule)), vj.policy(network).act
-    parts = list[np.ndarray]()
-    masses = list[float]()
+    parts, masses = list[np.ndarray](), list[float]()
     for number, case in enumerate(cases):
         low, high = (_rounded(end, side) for end, side in ((case.low, -1), (case.high, 1)))
         case = replace(case, low=low, high=high)
@@ -85,8 +84,7 @@ def verify_network(
             if found.boxes.confirmed.any() or found.proved.mass == 1.0:
                 break
         if found is not None:
-            low, high = found.boxes.low, found.boxes.high
-            proved = found.boxes.state == PROVED
+            low, high, proved = found.boxes.low, found.boxes.high, found.boxes.state == PROVED
             corners = np.zeros((2, int(proved.sum()), len(case.low)))
             corners[1] = 1.0
             if len(varying):

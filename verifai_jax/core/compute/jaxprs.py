@@ -1,7 +1,7 @@
 """Programs that JAX traced: what is within them, their work, and how other values run through."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from functools import reduce
+from functools import lru_cache, reduce
 from typing import Any, TypeVar
 
 import jax
@@ -18,6 +18,7 @@ CALLS = frozenset({
 """Steps that call a function, which has no derivative of its own."""
 CUSTOM_CALLS = frozenset({"custom_jvp_call", "custom_vjp_call", "custom_vjp_call_jaxpr"})
 """Steps that call a function with a derivative of its own."""
+_ALL_CALLS = CALLS | CUSTOM_CALLS
 _PARAMETERS = ("jaxpr", "call_jaxpr", "fun_jaxpr", "call")
 """Parameters by which such steps hold the program of the function."""
 WRITTEN_OUT: dict[str, Callable[..., Any]] = {
@@ -30,15 +31,18 @@ WRITTEN_OUT: dict[str, Callable[..., Any]] = {
 
 def called(step: Any) -> Any | None:
     """Return the program that an equation calls once on its operands; None if it calls none."""
-    function = WRITTEN_OUT.get(step.primitive.name)
-    if step.primitive.name == "call_hi_primitive":
-        function = step.params["_prim"].expand
-    if function is not None:
-        operands = [jax.ShapeDtypeStruct(each.aval.shape, each.aval.dtype) for each in step.invars]
-        return jax.make_jaxpr(function)(*operands)
-    if step.primitive.name not in CALLS | CUSTOM_CALLS:
-        return None
-    return next(step.params[name] for name in _PARAMETERS if name in step.params)
+    name = step.primitive.name
+    if name in _ALL_CALLS:
+        return next(step.params[name] for name in _PARAMETERS if name in step.params)
+    if name in WRITTEN_OUT or name == "call_hi_primitive":
+        function = WRITTEN_OUT.get(name) or step.params["_prim"].expand
+        return _traced(function, *((each.aval.shape, each.aval.dtype) for each in step.invars))
+    return None
+
+
+@lru_cache(256)
+def _traced(function: Callable[..., Any], *operands: tuple[tuple[int, ...], Any]) -> Any:
+    return jax.make_jaxpr(function)(*(jax.ShapeDtypeStruct(*each) for each in operands))
 
 
 def programs_read(parameters: Mapping[str, Any]) -> Iterator[Any]:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from verifai_jax.addons.verification.sets import Form, Interpreter
-from verifai_jax.addons.verification.sets.interpreter import as_form
+from verifai_jax.addons.verification.sets.values import as_form
 
 LAYERS = (3, 24, 24, 24, 8)
 

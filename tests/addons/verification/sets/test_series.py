@@ -9,8 +9,9 @@ import pytest
 from jax.experimental.jet import jet
 
 from verifai_jax.addons.verification.sets.form import Form
-from verifai_jax.addons.verification.sets.interpreter import Interpreter, constant
+from verifai_jax.addons.verification.sets.interpreter import Interpreter
 from verifai_jax.addons.verification.sets.series import CURVED, Rates
+from verifai_jax.addons.verification.sets.values import constant
 from verifai_jax.core.compute.precision import in_precision
 
 ORDER = 4

@@ -8,5 +8,5 @@ from verifai_jax.addons.verification.sets import tables as tables
 from verifai_jax.addons.verification.sets.flow import flow as flow
 from verifai_jax.addons.verification.sets.form import Form as Form
 from verifai_jax.addons.verification.sets.interpreter import Interpreter as Interpreter
-from verifai_jax.addons.verification.sets.interpreter import MissingRule as MissingRule
+from verifai_jax.addons.verification.sets.values import MissingRule as MissingRule
 from verifai_jax.addons.verification.sets.whole import Whole as Whole

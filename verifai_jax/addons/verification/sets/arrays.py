@@ -9,64 +9,63 @@ import numpy as np
 
 from verifai_jax.addons.verification.sets import functions, whole
 from verifai_jax.addons.verification.sets.form import Form, alike, padded, product, total, unknown
-from verifai_jax.addons.verification.sets.interpreter import (
-    Equation,
-    Interpreter,
-    Params,
-    Value,
-    as_form,
-    as_whole,
-    constant,
-    rule,
-)
+from verifai_jax.addons.verification.sets.interpreter import Equation, Interpreter, Params, rule
+from verifai_jax.addons.verification.sets.values import Value, as_form, as_whole, constant
 from verifai_jax.addons.verification.sets.whole import Whole
 
-Move = Callable[[Params, np.ndarray, int], np.ndarray]
-"""A function of the parameters of a step, an array and the number of its leading axes."""
+Move = Callable[[np.ndarray, int], np.ndarray]
+"""A function of an array and the number of its leading axes."""
 
 
-def _reshape(params: Params, array: np.ndarray, lead: int) -> np.ndarray:
+def _reshape(params: Params) -> Move:
     if params.get("dimensions") is not None and "new_sizes" in params:
         raise NotImplementedError("a reshape that permutes")
-    return array.reshape(*array.shape[:lead], *params["to"])
+    return lambda array, lead: array.reshape(array.shape[:lead] + params["to"])
 
 
-def _broadcast(params: Params, array: np.ndarray, lead: int) -> np.ndarray:
-    shape = [1] * len(params["to"])
-    for axis, size in zip(params["broadcast_dimensions"], array.shape[lead:], strict=True):
-        shape[axis] = size
-    front = array.shape[:lead]
-    return np.broadcast_to(array.reshape(*front, *shape), (*front, *params["to"]))
+def _broadcast(params: Params) -> Move:
+    to, kept = params["to"], params["broadcast_dimensions"]
+    new = [axis for axis in range(len(to)) if axis not in kept]
+
+    def spread(array: np.ndarray, lead: int) -> np.ndarray:
+        wide = np.expand_dims(array, tuple(axis + lead for axis in new))
+        return np.broadcast_to(wide, array.shape[:lead] + to)
+
+    return spread
 
 
-def _slice(params: Params, array: np.ndarray, lead: int) -> np.ndarray:
+def _slice(params: Params) -> Move:
     strides = params["strides"] or (1,) * len(params["to"])
     cells = zip(params["start_indices"], params["limit_indices"], strides, strict=True)
-    return array[(..., *(slice(*each) for each in cells))]
+    key = (..., *(slice(*each) for each in cells))
+    return lambda array, lead: array[key]
 
 
-_MOVES: dict[str, Move] = {
+_MOVES: dict[str, Callable[[Params], Move]] = {
     "reshape": _reshape, "squeeze": _reshape, "expand_dims": _reshape, "slice": _slice,
     "broadcast_in_dim": _broadcast,
-    "transpose": lambda p, a, lead: a.transpose(*range(lead), *np.add(p["permutation"], lead)),
-    "rev": lambda p, a, lead: np.flip(a, tuple(axis + lead for axis in p["dimensions"])),
-    "tile": lambda p, a, lead: np.tile(a, (*(1,) * lead, *p["reps"])),
+    "transpose": lambda p: lambda a, n: a.transpose(*range(n), *np.add(p["permutation"], n)),
+    "rev": lambda p: lambda a, lead: np.flip(a, tuple(axis + lead for axis in p["dimensions"])),
+    "tile": lambda p: lambda a, lead: np.tile(a, (*(1,) * lead, *p["reps"])),
 }  # fmt: skip
-"""What primitives do with the elements of one array, behind leading axes."""
+"""What primitives do with the elements of one array, behind leading axes, by their parameters."""
 
 
 @rule(*_MOVES)
 def _moved(t: Interpreter, step: Equation, inputs: list[Value]) -> list[Value]:
-    params, move = {**step.params, "to": step.outvars[0].aval.shape}, _MOVES[step.primitive.name]
-    return [inputs[0].moved(lambda array, lead: move(params, array, lead))]
+    params = {**step.params, "to": step.outvars[0].aval.shape}
+    return [inputs[0].moved(_MOVES[step.primitive.name](params))]
 
 
 def together(values: Sequence[Value], join: Callable[[list[np.ndarray], int], np.ndarray]) -> Value:
     """Combine arrays into one; `join(arrays, leading)` performs the combination."""
 
     def leading(arrays: list[np.ndarray], lead: int) -> np.ndarray:
-        front = np.broadcast_shapes(*(array.shape[:lead] for array in arrays))
-        return join([np.broadcast_to(a, (*front, *a.shape[lead:])) for a in arrays], lead)
+        fronts = {array.shape[:lead] for array in arrays}
+        if len(fronts) > 1:
+            front = np.broadcast_shapes(*fronts)
+            arrays = [np.broadcast_to(a, (*front, *a.shape[lead:])) for a in arrays]
+        return join(arrays, lead)
 
     if isinstance(values[0], Whole):
         parts = [as_whole(value) for value in values]
@@ -75,11 +74,10 @@ def together(values: Sequence[Value], join: Callable[[list[np.ndarray], int], np
     forms, frame, count = alike([as_form(value) for value in values])
     slopes = None
     if count:
-        slopes = leading(
-            [np.broadcast_to(padded(f, count), (count, *(
-                f.centre.shape if f.slopes is None else f.slopes.shape[1:]
-            ))) for f in forms], 2,
-        )  # fmt: skip
+        slopes = leading([
+            np.zeros((count, *f.centre.shape)) if f.slopes is None else padded(f, count)
+            for f in forms
+        ], 2)  # fmt: skip
     low = high = None
     if all(f.low is not None for f in forms) or not all(np.isfinite(f.radius).all() for f in forms):
         ends = [f.bounds() for f in forms]

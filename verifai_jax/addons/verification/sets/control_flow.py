@@ -6,15 +6,8 @@ from verifai_jax.addons.verification.sets.arrays import together
 from verifai_jax.addons.verification.sets.elementwise import of_rank, select
 from verifai_jax.addons.verification.sets.form import Form
 from verifai_jax.addons.verification.sets.frames import framed
-from verifai_jax.addons.verification.sets.interpreter import (
-    Equation,
-    Interpreter,
-    Program,
-    Value,
-    as_whole,
-    constant,
-    rule,
-)
+from verifai_jax.addons.verification.sets.interpreter import Equation, Interpreter, Program, rule
+from verifai_jax.addons.verification.sets.values import Value, as_whole, constant
 from verifai_jax.addons.verification.sets.whole import Whole
 from verifai_jax.core.compute.fingerprint import operands_of_scan
 
@@ -28,9 +21,9 @@ PASSES = 4096
 def _scan(t: Interpreter, step: Equation, inputs: list[Value]) -> list[Value]:
     params = step.params
     (consts, count), length = operands_of_scan(params), params["length"]
-    shared, carry, stacked = inputs[:consts], inputs[consts : consts + count], []
-    for value in inputs[consts + count :]:
-        stacked.append(value.unframed() if isinstance(value, Form) else value)
+    shared, carry = inputs[:consts], inputs[consts : consts + count]
+    rest = inputs[consts + count :]
+    stacked = [value.unframed() if isinstance(value, Form) else value for value in rest]
     # A loop within a step leaves the symbols of that step as they are.
     inner = any(isinstance(v, Form) and v.frame is not None for v in shared)
     frames = length >= LONG and not inner and t.features > 0

@@ -8,15 +8,8 @@ import numpy as np
 
 from verifai_jax.addons.verification.sets import functions, whole
 from verifai_jax.addons.verification.sets.form import Form, add, product, unknown
-from verifai_jax.addons.verification.sets.interpreter import (
-    Equation,
-    Interpreter,
-    Value,
-    as_form,
-    as_whole,
-    constant,
-    rule,
-)
+from verifai_jax.addons.verification.sets.interpreter import Equation, Interpreter, rule
+from verifai_jax.addons.verification.sets.values import Value, as_form, as_whole, constant
 from verifai_jax.addons.verification.sets.whole import Whole
 
 
@@ -25,15 +18,16 @@ def levelled(values: list[Any]) -> list[Any]:
 
     All parts of a set need it, since a later sum counts the slopes as often as they stand there.
     """
-    shapes = [value.shape for value in values]
-    if shapes.count(shapes[0]) == len(shapes):
+    shapes = {value.shape for value in values}
+    if len(shapes) == 1:
         return values
     shape = np.broadcast_shapes(*shapes)
 
     def widen(array: np.ndarray, leading: int) -> np.ndarray:
         front, missing = array.shape[:leading], len(shape) + leading - array.ndim
-        array = array.reshape(*front, *(1,) * missing, *array.shape[leading:])
-        return np.broadcast_to(array, (*front, *shape))
+        wide = np.empty((*front, *shape), array.dtype)
+        wide[...] = array.reshape(*front, *(1,) * missing, *array.shape[leading:])
+        return wide
 
     return [value if value.shape == shape else value.moved(widen) for value in values]
 

@@ -20,8 +20,9 @@ from jax.extend.core import Primitive
 from jaxtyping import Array, PyTree
 
 from verifai_jax.addons.verification.sets.form import SLACK, Form, add, joined, scaled
-from verifai_jax.addons.verification.sets.interpreter import Interpreter, Value, as_form, rule
+from verifai_jax.addons.verification.sets.interpreter import Interpreter, rule
 from verifai_jax.addons.verification.sets.series import Rates
+from verifai_jax.addons.verification.sets.values import Value, as_form
 
 ORDER = 4
 """Order of the polynomials: that of the Runge-Kutta method whose step they take."""
@@ -68,8 +69,7 @@ def _flow(t: Interpreter, step: Any, inputs: list[Value]) -> list[Value]:
     # The signals of a step and its end are asked for one after the other.
     key = text, length, *map(id, inputs[:shared]), id(time), *map(id, state)
     if t.latest is None or t.latest[0] != key:
-        step_of = _Step(t, rates, inputs[:shared])
-        t.latest = key, inputs, step_of(time, state, length)
+        t.latest = key, inputs, _Step(t, rates, inputs[:shared])(time, state, length)
     return list(t.latest[2])
 
 

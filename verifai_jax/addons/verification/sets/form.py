@@ -17,7 +17,7 @@ Algorithms 37 (2004); S. Rump, INTLAB, 1999.
 """
 
 from collections.abc import Callable, Sequence
-from functools import cache
+from functools import cache, partial
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -28,6 +28,12 @@ from verifai_jax.addons.verification.sets.layers import SLACK, Common, picked, s
 
 Reals = np.ndarray
 """Numbers of double precision, `[boxes, *shape]`; `[1, *shape]` if they are those of all boxes."""
+Ends = tuple[Reals, Reals]
+
+
+greatest = partial(np.maximum.reduce, axis=None, initial=-np.inf)
+least = partial(np.minimum.reduce, axis=None, initial=np.inf)
+"""The greatest and the least of numbers, or NaN if it is one of them; without any an infinity."""
 
 
 class Rounding(NamedTuple):
@@ -79,7 +85,7 @@ class Form:
         self.dtype, self.low, self.high = dtype, low, high
         self.frame = frame if slopes is not None else None
         self.common = common if slopes is not None else None
-        self._bounds: tuple[Reals, Reals] | None = None
+        self._bounds: Ends | None = None
         self._spread: Reals | None = None
 
     @classmethod
@@ -96,21 +102,24 @@ class Form:
         # What is below the smallest normal number may be taken for zero.
         low = np.where((low > 0) & (low < kind.smallest), 0.0, low)
         high = np.where((high < 0) & (high > -kind.smallest), 0.0, high)
-        bounded = np.isfinite(low) & np.isfinite(high)
-        centre = np.where(bounded, low / 2 + high / 2, 0.0)
-        radius = np.where(bounded, np.maximum(high - centre, centre - low), np.inf)
-        size = np.maximum(np.abs(low), np.abs(high))
-        radius = np.where((radius > 0) & bounded, radius + SLACK * size, radius)
+        centre, size = low / 2 + high / 2, np.maximum(np.abs(low), np.abs(high))
+        radius = np.maximum(high - centre, centre - low)
+        radius = np.where(radius > 0, radius + SLACK * size, radius)
+        if not greatest(size) < np.inf:
+            finite = np.isfinite(low) & np.isfinite(high)
+            centre, radius = np.where(finite, centre, 0.0), np.where(finite, radius, np.inf)
         return cls(centre, None, radius, size, dtype, low, high)
 
     @classmethod
     def leaf(cls, low: Reals, high: Reals, symbols: Reals, dtype: np.dtype) -> "Form":
         """Return numbers between ends; `symbols`, `[symbols, *shape]`, are 1 for those of each."""
         whole = cls.between(low, high, dtype)
-        slopes = symbols[:, None] * np.where(np.isfinite(whole.radius), whole.radius, 0.0)
-        own = np.any(symbols != 0, axis=0)[None] & np.isfinite(whole.radius)
-        radius = np.where(own, SLACK * whole.size, whole.radius)
-        return cls(whole.centre, slopes, radius, whole.size, dtype, whole.low, whole.high)
+        finite = np.isfinite(whole.radius)
+        slopes = symbols[:, None] * np.where(finite, whole.radius, 0.0)
+        radius = np.where((symbols != 0).any(0) & finite, SLACK * whole.size, whole.radius)
+        form = cls(whole.centre, slopes, radius, whole.size, dtype, whole.low, whole.high)
+        form._bounds = whole.low, whole.high
+        return form
 
     @property
     def shape(self) -> tuple[int, ...]:
@@ -124,11 +133,11 @@ class Form:
         if spread is None:
             spread = self.radius
             if self.slopes is not None:
-                spread = np.abs(self.slopes).sum(0) + spread
+                spread = np.add.reduce(np.abs(self.slopes), 0) + spread
             self._spread = spread
         return spread
 
-    def bounds(self) -> tuple[Reals, Reals]:
+    def bounds(self) -> Ends:
         """Return the ends of the set: the intersection of affine form and interval."""
         if self._bounds is None:
             if self.slopes is None and self.low is not None and self.high is not None:
@@ -149,12 +158,14 @@ class Form:
             numbers = np.arange(self.centre[0].size)
             moved = move(numbers.reshape(1, *self.shape), 1).ravel()
             common = picked(common, move(common.own, 1), moved, len(numbers))
-        return Form(
+        low, high = (end if end is None else move(end, 1) for end in (self.low, self.high))
+        form = Form(
             move(self.centre, 1), None if self.slopes is None else move(self.slopes, 2),
-            move(self.radius, 1), move(self.size, 1), self.dtype,
-            None if self.low is None else move(self.low, 1),
-            None if self.high is None else move(self.high, 1), self.frame, common,
+            move(self.radius, 1), move(self.size, 1), self.dtype, low, high, self.frame, common,
         )  # fmt: skip
+        if self._bounds is not None and self._bounds[0] is self.low:
+            form._bounds = low, high
+        return form
 
     def of_type(self, dtype: np.dtype) -> "Form":
         """Return the same numbers in another type that represents them exactly."""
@@ -182,8 +193,10 @@ class Form:
         return Form(self.centre, self.slopes[:count], radius, self.size, self.dtype, *ends)
 
 
-def overflown(low: Reals, high: Reals, highest: float) -> tuple[Reals, Reals]:
+def overflown(low: Reals, high: Reals, highest: float) -> Ends:
     """Return an interval that is unbounded if its numbers may overflow."""
+    if greatest(np.abs(low)) <= highest and greatest(np.abs(high)) <= highest:
+        return low, high
     low = np.where(np.isnan(low) | (low < -highest), -np.inf, low)
     high = np.where(np.isnan(high) | (high > highest), np.inf, high)
     # What is beyond it for certain is an infinity to the machine, and a number in real arithmetic.
@@ -198,21 +211,23 @@ def unknown(low: Reals, high: Reals) -> Reals:
 
 def rounded(
     centre: Reals, slopes: Reals | None, radius: Reals, size: Reals, dtype: np.dtype,
-    ends: tuple[Reals, Reals] | None = None, frame: Frame | None = None, units: float = 1.0,
-    exact: bool = False,
+    ends: Ends | None = None, frame: Frame | None = None, units: float = 1.0,
+    exact: bool = False, tiny: float = 1.0,
 ) -> Form:  # fmt: skip
     """Return the result of an operation, widened by its error in so many units of rounding.
 
-    So are the `ends` of its interval; what is `exact` is never rounded, such as a maximum.
+    So are the `ends` of its interval; `tiny` is its absolute error, in smallest normal numbers.
+    What is `exact` is never rounded, such as a maximum.
     """
     kind = rounding(dtype)
-    share, absolute = (SLACK, 0.0) if exact else (kind.unit * units, kind.smallest)
+    share, absolute = (SLACK, 0.0) if exact else (kind.unit * units, kind.smallest * tiny)
     radius = radius + (share * size + absolute)
     low, high = (None, None) if ends is None else ends
     if low is not None and high is not None and not exact:
-        low, high = widened(low, high, share, kind.smallest)
+        low, high = widened(low, high, share, kind.smallest, absolute if tiny > 1 else 0.0)
     form = Form(centre, slopes, radius, size, dtype, low, high, frame)
-    if not size.max(initial=0.0) + radius.max(initial=0.0) <= kind.highest / 2:
+    # The radius has a share of the size, so that what is far within reach is found by one number.
+    if not greatest(radius) <= kind.highest * SLACK / 4:
         # What may overflow, or is NaN, is unbounded.
         wild = ~(size + radius <= kind.highest)
         if low is not None and high is not None:
@@ -222,13 +237,12 @@ def rounded(
     return form
 
 
-def widened(low: Reals, high: Reals, share: float, smallest: float) -> tuple[Reals, Reals]:
-    """Return ends that are apart by a share of each more; what is tiny keeps its sign."""
-    if share:
-        low, high = low - share * np.abs(low), high + share * np.abs(high)
-    if np.abs(low).min(initial=1.0) < smallest:
+def widened(low: Reals, high: Reals, share: float, smallest: float, absolute: float = 0.0) -> Ends:
+    """Return ends apart by a share of each and a number more; what is tiny keeps its sign."""
+    low, high = low - (share * np.abs(low) + absolute), high + (share * np.abs(high) + absolute)
+    if least(np.abs(low)) < smallest:
         low = np.where(np.abs(low) < smallest, np.where(low < 0, -smallest, 0.0), low)
-    if np.abs(high).min(initial=1.0) < smallest:
+    if least(np.abs(high)) < smallest:
         high = np.where(np.abs(high) < smallest, np.where(high > 0, smallest, 0.0), high)
     return low, high
 
@@ -268,7 +282,7 @@ def joint_slopes(a: Form, b: Form, first: Reals | float, second: Reals | float) 
     if a.slopes is None:
         return None if b.slopes is None else b.slopes * second
     if b.slopes is None:
-        return a.slopes * first
+        return a.slopes if isinstance(first, float) and first == 1.0 else a.slopes * first
     count = max(len(a.slopes), len(b.slopes))
     return padded(a, count) * first + padded(b, count) * second
 
@@ -294,36 +308,38 @@ def add(a: Form, b: Form, sign: float = 1.0) -> Form:
             return form
     ends = None
     if a.low is not None and b.low is not None:
-        (low, high), (first, last) = a.bounds(), b.bounds()
-        if sign < 0:
-            first, last = -last, -first
-        ends = _sum_end(low, first, a.dtype, -1), _sum_end(high, last, a.dtype, 1)
+        first, last = b.bounds()
+        ends = _sum_ends(a.bounds(), (first, last) if sign > 0 else (-last, -first), a.dtype)
         if a.slopes is None and b.slopes is None:
             return spanned(*ends, a.dtype, 0)
         ends = overflown(*ends, rounding(a.dtype).highest)
-    (a, b), frame, _ = alike([a, b])
+    if a.frame != b.frame:
+        (a, b), *_ = alike([a, b])
     slopes = joint_slopes(a, b, 1.0, sign)
     centre = a.centre + b.centre if sign > 0 else a.centre - b.centre
-    form = rounded(centre, slopes, a.radius + b.radius, a.size + b.size, a.dtype, None, frame)
+    radius, size, frame = a.radius + b.radius, a.size + b.size, a.frame or b.frame
+    form = rounded(centre, slopes, radius, size, a.dtype, None, frame)
     form.low, form.high = ends or (None, None)
     form.common = summed(form.radius, [(a, 1.0), (b, sign)])
     return form
 
 
-def _sum_end(one: Reals, other: Reals, dtype: np.dtype, side: int) -> Reals:
-    """Return the end of a sum of intervals, widened by rounding only where there is any."""
-    kind = rounding(dtype)
+def _sum_ends(a: Ends, b: Ends, dtype: np.dtype) -> Ends:
+    """Return the ends of a sum of intervals, widened by rounding only where there is any."""
+    kind, (one, other) = rounding(dtype), (np.array([-low, high]) for low, high in (a, b))
     end = one + other
     back = end - one
     # Knuth's error of the sum: it is zero where the sum is exact.
-    exact = (one - (end - back)) + (other - back) == 0
+    exact = one - (end - back) == back - other
     if dtype.itemsize < 8:
-        exact &= end.astype(dtype).astype(np.float64) == end
-    small = (end != 0) & (np.abs(end) < kind.smallest)
-    widened = np.where(exact & ~small, end, end + side * (kind.unit * np.abs(end) + kind.smallest))
+        exact &= end.astype(dtype) == end
+    size = np.abs(end)
+    if least(size) < kind.smallest:
+        exact &= (size == 0) | (size >= kind.smallest)
+    end = np.where(exact, end, end + (kind.unit * size + kind.smallest))
     # A sum of numbers of one sign has that sign, or is zero.
-    signed = (one * side <= 0) & (other * side <= 0)
-    return np.where(signed, side * np.minimum(side * widened, 0.0), widened)
+    end = np.where(np.maximum(one, other) <= 0, np.minimum(end, 0.0), end)
+    return -end[0], end[1]
 
 
 def negative(a: Form) -> Form:
@@ -331,7 +347,7 @@ def negative(a: Form) -> Form:
     slopes = None if a.slopes is None else -a.slopes
     low = None if a.high is None else -a.high
     high = None if a.low is None else -a.low
-    common = summed(a.radius, [(a, -1.0)])
+    common = a.common and summed(a.radius, [(a, -1.0)])
     return Form(-a.centre, slopes, a.radius, a.size, a.dtype, low, high, a.frame, common)
 
 
@@ -343,11 +359,12 @@ def is_point(a: Form) -> bool:
 def scaled(a: Form, by: Reals) -> Form:
     """Return `a` times exact finite numbers."""
     slopes = None if a.slopes is None else a.slopes * by
-    size, scale = a.size * np.abs(by), np.abs(by)
-    ends = None
+    scale, ends = np.abs(by), None
+    size = a.size * scale
     if a.low is not None and a.high is not None:
-        one, other = a.low * by, a.high * by
-        ends = np.minimum(one, other), np.maximum(one, other)
+        ends = a.low * by, a.high * by
+        if not (by >= 0).all():
+            ends = np.minimum(*ends), np.maximum(*ends)
     # Times 0, 1, 2, 4 ... nothing is rounded.
     exact = bool(((np.frexp(scale)[0] == 0.5) & (scale >= 1) | (scale == 0)).all())
     if slopes is None and ends is not None and np.isfinite(size).all():
@@ -355,16 +372,16 @@ def scaled(a: Form, by: Reals) -> Form:
     form = rounded(
         a.centre * by, slopes, a.radius * scale, size, a.dtype, ends, a.frame, exact=exact
     )
-    form.common = summed(form.radius, [(a, by)])
+    form.common = a.common and summed(form.radius, [(a, by)])
     return form
 
 
-def interval_product(low: Reals, high: Reals, first: Reals, last: Reals) -> tuple[Reals, Reals]:
+def interval_product(low: Reals, high: Reals, first: Reals, last: Reals) -> Ends:
     """Return the product of two intervals; unbounded if zero may meet infinity."""
     ends = low * first, low * last, high * first, high * last
     lowest = np.minimum(np.minimum(ends[0], ends[1]), np.minimum(ends[2], ends[3]))
     highest = np.maximum(np.maximum(ends[0], ends[1]), np.maximum(ends[2], ends[3]))
-    if np.isfinite(lowest).all() and np.isfinite(highest).all():
+    if least(lowest) > -np.inf and greatest(highest) < np.inf:
         return lowest, highest
     bad = np.isnan(lowest)
     # An interval with zero inside and one without an end: none of the four products is NaN.

@@ -17,7 +17,7 @@ import numpy as np
 
 from verifai_jax.addons.verification.sets.arrays import together
 from verifai_jax.addons.verification.sets.form import SLACK, Form, Frame, padded
-from verifai_jax.addons.verification.sets.interpreter import as_form
+from verifai_jax.addons.verification.sets.values import as_form
 from verifai_jax.addons.verification.sets.whole import Whole
 
 WIDEST = 24

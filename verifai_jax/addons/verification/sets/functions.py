@@ -7,26 +7,14 @@ causes only a quadratic error, which the widening of results covers.
 """
 
 from collections.abc import Callable, Sequence
+from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
 from scipy import special
 
-from verifai_jax.addons.verification.sets.form import (
-    SLACK,
-    Form,
-    Reals,
-    add,
-    chosen,
-    is_point,
-    joined,
-    negative,
-    product,
-    rounded,
-    rounding,
-    scaled,
-    unknown,
-)
+from verifai_jax.addons.verification.sets import form as affine
+from verifai_jax.addons.verification.sets.form import SLACK, Form, Reals, rounded, rounding
 from verifai_jax.addons.verification.sets.layers import summed
 
 Criticals = Callable[[Reals, Reals, Reals], Sequence[Reals]]
@@ -49,7 +37,7 @@ class Function(NamedTuple):
     - `domain`: the interval outside of which it is NaN.
     - `units`, `tiny`: its error in units of rounding, and of the smallest normal number.
     - `range`: an interval that contains all results, including rounding.
-    - `rises`: whether its greatest values are at the ends of intervals.
+    - `rises`: whether it rises, so that its extremes are at the ends of intervals.
     """
 
     value: Callable[[Reals], Reals]
@@ -62,46 +50,49 @@ class Function(NamedTuple):
 
     def __call__(self, x: Form) -> Form:
         """Return the set of its values on a set."""
-        (low, high), (first, last) = x.bounds(), self.domain
-        outside, points = unknown(low, high) | (low > high), [low, high]
+        (low, high), (first, last), spread = x.bounds(), self.domain, x.spread
+        wide, points = high - low, [low, high]
+        # Nothing is an exception where all is within the domain, and as wide as some number.
+        plain = affine.least(wide) > 0 and affine.greatest(spread) < np.inf
         if np.isfinite(first) or np.isfinite(last):
-            outside |= (low < first) | (high > last)
-            points = [np.clip(low, first, last), np.clip(high, first, last)]
+            plain = plain and affine.least(low) >= first and affine.greatest(high) <= last
+            points = points if plain else [np.clip(low, first, last), np.clip(high, first, last)]
         values = [self.value(point) for point in points]
-        slope = (values[1] - values[0]) / (points[1] - points[0])
-        slope = np.where(np.isfinite(slope), slope, 0.0)
-        extremes = [] if self.rises else self._points(np.zeros_like(low), *points)
-        lowest, highest = _extremes([*values, *(self.value(point) for point in extremes)])
+        slope = (values[1] - values[0]) / (wide if plain else points[1] - points[0])
+        plain = plain and bool(np.isfinite(np.add.reduce(slope, axis=None)))
+        if not plain:
+            outside = affine.unknown(low, high) | (low > high) | (low < first) | (high > last)
+            slope = np.where(np.isfinite(slope), slope, 0.0)
+        lowest, highest = values
+        if not self.rises:
+            turns = self._points(np.float64(0), *points)
+            lowest, highest = _extremes([*values, *(self.value(point) for point in turns)])
         inner = self._points(slope, *points)
         points, values = points + inner, values + [self.value(point) for point in inner]
         below, above = _extremes([v - slope * p for v, p in zip(values, points, strict=True)])
-        size = np.maximum(np.abs(lowest), np.abs(highest))
-        offset, error, radius = below / 2 + above / 2, above / 2 - below / 2, x.radius
-        usable = np.isfinite(offset) & np.isfinite(x.spread) & ~outside
-        if not usable.all():
-            slope, offset, radius = (np.where(usable, a, 0.0) for a in (slope, offset, radius))
-            error, size = np.where(usable, error, np.inf), np.where(outside, np.inf, size)
-            lowest = np.where(outside, -np.inf, lowest)
-            highest = np.where(outside, np.inf, highest)
+        size = highest if self.range[0] >= 0 else np.maximum(np.abs(lowest), np.abs(highest))
+        offset, error, radius = (below + above) / 2, (above - below) / 2, x.radius
+        if not plain:
+            usable = np.isfinite(offset) & np.isfinite(spread) & ~outside
+            kept, error = (slope, offset, radius, spread), np.where(usable, error, np.inf)
+            slope, offset, radius, spread = (np.where(usable, a, 0.0) for a in kept)
         # Numbers of double precision between which the slope and the offset are rounded.
-        error = error + 4 * SLACK * (np.abs(offset) + np.abs(slope) * (x.size + np.abs(x.centre)))
-        ends, radius = (lowest, highest), np.abs(slope) * radius + error
-        if self.units:
-            tiny = self.tiny * rounding(x.dtype).smallest
-            ends, radius = (ends[0] - tiny, ends[1] + tiny), radius + tiny
+        steep = np.abs(slope)
+        margin = np.abs(offset) + steep * (spread + np.abs(x.centre))
         slopes = None if x.slopes is None else x.slopes * slope
         form = rounded(
-            slope * x.centre + offset, slopes, radius, size, x.dtype, ends, x.frame, self.units
-        )
-        if self.range != (-np.inf, np.inf) and form.low is not None and form.high is not None:
-            form.low = np.where(outside, -np.inf, np.clip(form.low, *self.range))
-            form.high = np.where(outside, np.inf, np.clip(form.high, *self.range))
-        form.common = summed(form.radius, [(x, slope)])
-        return form
+            slope * x.centre + offset, slopes, steep * radius + error + 4 * SLACK * margin, size,
+            x.dtype, (lowest, highest), x.frame, self.units, not self.units, 1 + self.tiny,
+        )  # fmt: skip
+        if self.units and form.low is not None and form.high is not None:
+            lowest, highest = self.range
+            form.low, form.high = np.maximum(form.low, lowest), np.minimum(form.high, highest)
+        form.common = x.common and summed(form.radius, [(x, slope)])
+        return form if plain else _but(form, ~outside)
 
     def _points(self, slope: Reals, low: Reals, high: Reals) -> list[Reals]:
-        inner = self.criticals(slope, low, high)
-        return [np.clip(np.where(np.isnan(x), low, x), low, high) for x in inner]
+        # Of a number and NaN `fmax` is the number.
+        return [np.minimum(np.fmax(x, low), high) for x in self.criticals(slope, low, high)]
 
 
 def _extremes(values: Sequence[Reals]) -> tuple[Reals, Reals]:
@@ -121,11 +112,11 @@ def _single(at: Callable[[Reals], Reals]) -> Criticals:
 
 
 def _periodic(at: Callable[[Reals], Reals], period: float) -> Criticals:
-    """Return the points of both signs in all periods that an interval of one period may touch."""
+    """Return the points of both signs that an interval of one period may touch."""
 
     def criticals(slope: Reals, low: Reals, high: Reals) -> Sequence[Reals]:
-        base, turn = at(slope), np.round((low / 2 + high / 2) / period)
-        return [s * base + period * (turn + k) for s in (1.0, -1.0) for k in (-1.0, 0.0, 1.0)]
+        base, middle = at(slope), low / 2 + high / 2
+        return [each + period * np.round((middle - each) / period) for each in (base, -base)]
 
     return criticals
 
@@ -140,7 +131,7 @@ def _sine(value: Callable[[Reals], Reals], criticals: Criticals) -> Callable[[Fo
         if not np.any(wide):
             return form
         end = np.where(np.isfinite(low) & np.isfinite(high), 1.0, np.inf)
-        return chosen([~wide, wide], [form, Form.between(-end, end, x.dtype)])
+        return affine.chosen([~wide, wide], [form, Form.between(-end, end, x.dtype)])
 
     return enclosed
 
@@ -150,7 +141,7 @@ def _whole(value: Callable[[Reals], Reals]) -> Callable[[Form], Form]:
 
     def enclosed(x: Form) -> Form:
         low, high = x.bounds()
-        nothing = unknown(low, high)
+        nothing = affine.unknown(low, high)
         ends = np.where(nothing, low, value(low)), np.where(nothing, high, value(high))
         return Form.between(*ends, x.dtype)
 
@@ -186,6 +177,7 @@ _RSQRT = Function(
 )
 
 
+@cache
 def _of_power(n: int) -> Function:
     criticals = _even(lambda slope: np.abs(slope / n) ** (1 / (n - 1)))
     even = _POSITIVE if n % 2 == 0 else (-np.inf, np.inf)
@@ -227,7 +219,8 @@ FUNCTIONS: dict[str, Callable[[Form], Form]] = {
         x - np.pi / 2 for x in _periodic(np.arccos, 2 * np.pi)(a, low + np.pi / 2, high + np.pi / 2)
     ]),
     "tan": _tangent,
-    "floor": _whole(np.floor), "ceil": _whole(np.ceil), "sign": _whole(np.sign), "neg": negative,
+    "floor": _whole(np.floor), "ceil": _whole(np.ceil), "sign": _whole(np.sign),
+    "neg": affine.negative,
 }  # fmt: skip
 """Functions of one number, by the name of JAX's primitive."""
 
@@ -253,16 +246,16 @@ def integer_power(x: Form, n: int) -> Form:
         return Form.constant(np.ones(x.shape), x.dtype)
     if n < 0:
         return _reciprocal(integer_power(x, -n))
-    return x if n == 1 else _of_power(n)(x)
+    return x.of_type(x.dtype) if n == 1 else _of_power(n)(x)
 
 
 def quotient(a: Form, b: Form) -> Form:
     """Return `a / b`; unbounded if `b` may be zero."""
-    if is_point(b) and np.all((b.centre != 0) & np.isfinite(b.centre)):
+    if affine.is_point(b) and np.all((b.centre != 0) & np.isfinite(b.centre)):
         inverse = 1 / b.centre
         if np.isfinite(inverse).all():
-            return _widened(scaled(a, inverse), 3.0)
-    return _widened(product(a, _reciprocal(b)), 3.0)
+            return _widened(affine.scaled(a, inverse), 3.0)
+    return _widened(affine.product(a, _reciprocal(b)), 3.0)
 
 
 def _widened(x: Form, units: float) -> Form:
@@ -279,33 +272,35 @@ def _widened(x: Form, units: float) -> Form:
 def greater(a: Form, b: Form) -> Form:
     """Return the maximum: `b + max(a - b, 0)`, which preserves common dependencies."""
     for one, other in ((a, b), (b, a)):
-        if is_point(other) and one.slopes is not None and np.isfinite(other.centre).all():
+        if affine.is_point(other) and one.slopes is not None and np.isfinite(other.centre).all():
             return _above(other.centre)(one)
     (low, high), (first, last) = a.bounds(), b.bounds()
-    nothing = unknown(low, high) | unknown(first, last)
+    nothing = affine.unknown(low, high) | affine.unknown(first, last)
     ours, theirs = (low >= last) & ~nothing, (first >= high) & ~nothing
     lowest, top = np.maximum(low, first), np.maximum(high, last)
     ends = np.where(nothing, -np.inf, lowest), np.where(nothing, np.inf, top)
     if a.slopes is None and b.slopes is None:
         return Form.between(*ends, a.dtype)
-    ramp = add(b, _RAMP(difference(a, b)))
+    ramp = affine.add(b, _RAMP(difference(a, b)))
     size = np.maximum(np.abs(ends[0]), np.abs(ends[1]))
     both = rounded(
         ramp.centre, ramp.slopes, ramp.radius, np.broadcast_to(size, ramp.size.shape),
         a.dtype, ends, ramp.frame, exact=True,
     )  # fmt: skip
-    return chosen([ours, theirs, ~(ours | theirs)], [a, b, both])
+    return affine.chosen([ours, theirs, ~(ours | theirs)], [a, b, both])
 
 
 def lesser(a: Form, b: Form) -> Form:
     """Return the minimum."""
-    return negative(greater(negative(a), negative(b)))
+    return affine.negative(greater(affine.negative(a), affine.negative(b)))
 
 
 def difference(a: Form, b: Form) -> Form:
     """Return the exact difference `a - b`, which decides a comparison."""
     a, b = a.of_type(np.dtype(np.float64)), b.of_type(np.dtype(np.float64))
-    return _but(add(a, b, -1.0), ~(unknown(*a.bounds()) | unknown(*b.bounds())))
+    return _but(
+        affine.add(a, b, -1.0), ~(affine.unknown(*a.bounds()) | affine.unknown(*b.bounds()))
+    )
 
 
 def remainder(a: Form, b: Form) -> Form:
@@ -327,26 +322,26 @@ def remainder(a: Form, b: Form) -> Form:
         return wide
     count = np.where(same, ends[0], 0.0)
     times = Form.between(count, count, a.dtype)
-    exact = add(a, product(times, b), -1.0)
+    exact = affine.add(a, affine.product(times, b), -1.0)
     exact.low = exact.high = None
-    return chosen([same, ~same], [exact, wide])
+    return affine.chosen([same, ~same], [exact, wide])
 
 
 def power(a: Form, b: Form) -> Form:
     """Return `a ** b` for positive numbers, or for an integer exponent."""
-    if is_point(b) and b.centre.size and (b.centre == b.centre.flat[0]).all():
+    if affine.is_point(b) and b.centre.size and (b.centre == b.centre.flat[0]).all():
         exponent = float(b.centre.flat[0])
         if exponent.is_integer() and abs(exponent) <= 64:
             return _widened(integer_power(a, int(exponent)), UNITS)
         if exponent == 0.5:
             return _widened(FUNCTIONS["sqrt"](a), UNITS)
-    return _but(FUNCTIONS["exp"](product(b, FUNCTIONS["log"](a))), a.bounds()[0] > 0)
+    return _but(FUNCTIONS["exp"](affine.product(b, FUNCTIONS["log"](a))), a.bounds()[0] > 0)
 
 
 def angle(y: Form, x: Form) -> Form:
     """Return the angle of a point `(x, y)`; the full circle if it may cross the negative x axis."""
     (low, high), (left, right) = y.bounds(), x.bounds()
-    nothing = unknown(low, high) | unknown(left, right)
+    nothing = affine.unknown(low, high) | affine.unknown(left, right)
     right_half, above, below = left > 0, low > 0, high < 0
     masks = [right_half, ~right_half & above, ~right_half & ~above & below]
     rest = ~(right_half | above | below)
@@ -361,11 +356,11 @@ def angle(y: Form, x: Form) -> Form:
 
     def turned(by: float, ratio: Form) -> Form:
         ends = np.full(ratio.centre.shape, by)
-        return add(Form.between(ends, ends, y.dtype), FUNCTIONS["atan"](ratio))
+        return affine.add(Form.between(ends, ends, y.dtype), FUNCTIONS["atan"](ratio))
 
-    ratio = negative(quotient(x, y))
+    ratio = affine.negative(quotient(x, y))
     cases = turned(0.0, quotient(y, x)), turned(np.pi / 2, ratio), turned(-np.pi / 2, ratio)
-    return _widened(chosen([*masks, rest], [*cases, circle]), UNITS)
+    return _widened(affine.chosen([*masks, rest], [*cases, circle]), UNITS)
 
 
 def selected(truth: np.ndarray, maybe: np.ndarray, no: Form, yes: Form) -> Form:
@@ -375,6 +370,6 @@ def selected(truth: np.ndarray, maybe: np.ndarray, no: Form, yes: Form) -> Form:
             return yes
         if not np.any(truth):
             return no
-        return chosen([truth, ~truth], [yes, no])
-    both = joined(no, yes)
-    return chosen([truth & ~maybe, maybe, ~truth & ~maybe], [yes, both, no])
+        return affine.chosen([truth, ~truth], [yes, no])
+    both = affine.joined(no, yes)
+    return affine.chosen([truth & ~maybe, maybe, ~truth & ~maybe], [yes, both, no])

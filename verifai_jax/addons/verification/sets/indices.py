@@ -16,15 +16,8 @@ from verifai_jax.addons.verification.sets import whole
 from verifai_jax.addons.verification.sets.arrays import together
 from verifai_jax.addons.verification.sets.elementwise import select
 from verifai_jax.addons.verification.sets.form import Form, add
-from verifai_jax.addons.verification.sets.interpreter import (
-    Equation,
-    Interpreter,
-    Value,
-    as_form,
-    as_whole,
-    constant,
-    rule,
-)
+from verifai_jax.addons.verification.sets.interpreter import Equation, Interpreter, rule
+from verifai_jax.addons.verification.sets.values import Value, as_form, as_whole, constant
 from verifai_jax.addons.verification.sets.whole import Whole
 
 WINDOWS = 1024

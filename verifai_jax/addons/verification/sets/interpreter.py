@@ -8,17 +8,16 @@ of JAX's primitives.
 
 from collections.abc import Callable, Sequence
 from typing import Any, TypeAlias
+from weakref import WeakKeyDictionary
 
 import jax.numpy as jnp
 import numpy as np
-from jax.typing import ArrayLike
 
-from verifai_jax.addons.verification.sets.form import Form
+from verifai_jax.addons.verification.sets.values import MissingRule, Value, constant
 from verifai_jax.addons.verification.sets.whole import Whole
 from verifai_jax.core.compute.jaxprs import called, run_through
 from verifai_jax.core.user_code.user_errors import source_line
 
-Value: TypeAlias = Form | Whole
 Params: TypeAlias = dict[str, Any]
 Equation: TypeAlias = Any
 """A step of a program, `jax.core.JaxprEqn`."""
@@ -30,10 +29,8 @@ RULES: dict[str, Rule] = {}
 Shortcut: TypeAlias = Callable[["Interpreter", Program, list[Value]], list[Value] | None]
 SHORTCUTS: dict[str, Shortcut] = {}
 """What functions do with sets as a whole, by the name of their call; None to go inside."""
-
-
-class MissingRule(NotImplementedError):
-    """An error for an operation of a program that has no rule for sets."""
+_CONSTANTS: WeakKeyDictionary[Program, tuple[list[Value], dict[int, Value]]] = WeakKeyDictionary()
+"""The constants of programs as sets, and the numbers in them by identity: those of all batches."""
 
 
 def rule(*names: str) -> Callable[[Rule], Rule]:
@@ -51,7 +48,9 @@ class Interpreter:
 
     def __init__(self, boxes: int, features: int) -> None:
         self.boxes, self.features = boxes, features
-        self._literals: dict[int, tuple[Any, Value]] = {}
+        # Once 32 MB are freed, which nobody touched, the C library keeps what arrays leave, and
+        # does not spend a third of the time on new pages of zeros.
+        np.empty(2**22 - 2**12)
         self.latest: tuple[Any, ...] | None = None
         """The last step of a differential equation: what it was made of, and its results."""
 
@@ -63,20 +62,20 @@ class Interpreter:
         with np.errstate(all="ignore"):
             return self.closed(program, inputs)
 
-    def literal(self, each: Any) -> Value:
-        """Return a number in a program, which loops read again and again."""
-        found = self._literals.get(id(each))
-        if found is None:
-            # The number lives on, so that no other one gets the same identity.
-            found = self._literals[id(each)] = each, constant(each.val, each.aval.dtype)
-        return found[1]
-
     def closed(self, program: Program, inputs: Sequence[Value]) -> list[Value]:
         """Evaluate a program with its constants, or one without constants."""
         inner = getattr(program, "jaxpr", program)
-        pairs = zip(inner.constvars, getattr(program, "consts", ()), strict=True)
-        known = [constant(value, variable.aval.dtype) for variable, value in pairs]
-        return run_through(inner, known, inputs, self.literal, self.step)
+        if (found := _CONSTANTS.get(program)) is None:
+            pairs = zip(inner.constvars, getattr(program, "consts", ()), strict=True)
+            known = [constant(value, variable.aval.dtype) for variable, value in pairs]
+            found = _CONSTANTS[program] = known, {}
+
+        def literal(each: Any) -> Value:
+            if id(each) not in found[1]:
+                found[1][id(each)] = constant(each.val, each.aval.dtype)
+            return found[1][id(each)]
+
+        return run_through(inner, found[0], inputs, literal, self.step)
 
     def step(self, step: Equation, inputs: list[Value]) -> list[Value]:
         """Evaluate one operation."""
@@ -90,8 +89,9 @@ class Interpreter:
             return self.concrete(step, inputs)
         try:
             results = found(self, step, inputs)
-            for value, form in zip(results, (out.aval for out in step.outvars), strict=True):
-                if (value.dtype, value.shape) != (form.dtype, form.shape):
+            for value, out in zip(results, step.outvars, strict=True):
+                form = out.aval
+                if value.shape != form.shape or value.dtype != form.dtype:
                     raise NotImplementedError(f"a result of type {form.str_short()}")
             return results
         except MissingRule:
@@ -112,29 +112,6 @@ class Interpreter:
         return [constant(r, f) for r, f in zip(results, forms, strict=True)]
 
 
-def constant(value: ArrayLike, dtype: np.dtype) -> Value:
-    """Return a constant of a program as a set."""
-    if jnp.issubdtype(dtype, jnp.floating):
-        return Form.constant(np.asarray(value), np.dtype(dtype))
-    if (jnp.issubdtype(dtype, jnp.integer) and dtype != jnp.uint64) or dtype == jnp.bool_:
-        return Whole.constant(np.asarray(value), np.dtype(dtype))
-    raise MissingRule(f"sets do not support numbers of type {dtype}")
-
-
 def _where(step: Equation) -> str:
     line = source_line(step.source_info.traceback)
     return f" ({line})" if line else ""
-
-
-def as_form(value: Value) -> Form:
-    """Return a value that is a real number; others raise `NotImplementedError`."""
-    if not isinstance(value, Form):
-        raise NotImplementedError("whole numbers where only real ones are supported")
-    return value
-
-
-def as_whole(value: Value) -> Whole:
-    """Return a whole number or a truth value; others raise `NotImplementedError`."""
-    if not isinstance(value, Whole):
-        raise NotImplementedError("real numbers where only whole ones are supported")
-    return value

@@ -1,21 +1,12 @@
 """Sorting, on sets: each position has the hull of the elements that may stand there."""
 
-import itertools
-from collections.abc import Sequence
-
 import numpy as np
 
 from verifai_jax.addons.verification.sets import functions
 from verifai_jax.addons.verification.sets.arrays import together
 from verifai_jax.addons.verification.sets.form import Form, chosen, negative, rounding, unknown
-from verifai_jax.addons.verification.sets.interpreter import (
-    Equation,
-    Interpreter,
-    Value,
-    as_form,
-    constant,
-    rule,
-)
+from verifai_jax.addons.verification.sets.interpreter import Equation, Interpreter, rule
+from verifai_jax.addons.verification.sets.values import Value, as_form, constant
 from verifai_jax.addons.verification.sets.whole import Whole
 
 LONGEST = 256
@@ -118,13 +109,10 @@ def _by_pairs(key: Value, placed: Value, nothing: np.ndarray) -> Value:
     form, count = placed, key.shape[-1]
     if key.slopes is not None and 1 < count <= SHORT:
         rows = [key.moved(lambda array, lead, i=i: array[..., i]) for i in range(count)]
-        for _ in range(count):
-            for start in (0, 1):
-                for i in range(start, count - 1, 2):
-                    a, b = as_form(rows[i]), as_form(rows[i + 1])
-                    rows[i : i + 2] = [functions.lesser(a, b), functions.greater(a, b)]
-            if _ordered(rows):
-                break
+        for phase in range(count):
+            for i in range(phase % 2, count - 1, 2):
+                a, b = as_form(rows[i]), as_form(rows[i + 1])
+                rows[i : i + 2] = [functions.lesser(a, b), functions.greater(a, b)]
         form = together(rows, lambda arrays, lead: np.stack(arrays, -1))
     form = as_form(form).moved(lambda array, lead: array)
     first, final = form.bounds()
@@ -137,9 +125,3 @@ def _by_pairs(key: Value, placed: Value, nothing: np.ndarray) -> Value:
     form._bounds = None
     form.forget(np.broadcast_to(nothing[..., None], np.broadcast_shapes(shape, form.radius.shape)))
     return form
-
-
-def _ordered(rows: Sequence[Value]) -> bool:
-    """Return whether numbers are in order in all boxes."""
-    ends = [_ends(row) for row in rows]
-    return all(np.all(a[1] <= b[0]) for a, b in itertools.pairwise(ends))

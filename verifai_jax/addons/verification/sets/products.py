@@ -10,8 +10,9 @@ import numpy as np
 
 from verifai_jax.addons.verification.sets.arrays import add_up, times_each
 from verifai_jax.addons.verification.sets.form import Form, is_point, rounded
-from verifai_jax.addons.verification.sets.interpreter import Interpreter, Value, constant, rule
+from verifai_jax.addons.verification.sets.interpreter import Interpreter, rule
 from verifai_jax.addons.verification.sets.layers import SLACK, refined, through_layer
+from verifai_jax.addons.verification.sets.values import Value, constant
 from verifai_jax.addons.verification.sets.whole import Whole
 from verifai_jax.core.compute.precision import in_precision
 
@@ -40,14 +41,11 @@ def _contracted(
         names.append("".join(known.get(i) or next(letters) for i in range(len(value.shape))))
     free = ["".join(c for c in name if c not in joint[0] + joint[1]) for name in names]
     result = "".join(joint[0]) + free[0] + free[1]
-    sizes = {c: n for name, v in zip(names, (a, b), strict=True)
-             for c, n in zip(name, v.shape, strict=True)}  # fmt: skip
-    terms = math.prod(sizes[c] for c in joint[1])
     for form, other, (own, its) in ((a, b, names), (b, a, names[::-1])):
         if isinstance(form, Whole) or isinstance(other, Whole):
             continue
         if is_point(other) and np.isfinite(other.centre).all():
-            return _times(form, other.centre[0], f"...{own},{its}->...{result}", dtype, terms)
+            return _times(form, other.centre[0], own, its, result, dtype)
     axes = result + "".join(joint[1])
 
     def spread(name: str, array: np.ndarray, lead: int) -> np.ndarray:
@@ -65,9 +63,25 @@ def _contracted(
     return add_up(times_each(a, b), range(len(result), len(axes)))
 
 
-def _times(a: Form, numbers: np.ndarray, names: str, dtype: np.dtype, terms: int) -> Form:
-    """Return sums of so many products of a form and exact numbers, as einsum names them."""
-    times = functools.partial(np.einsum, names, optimize=["einsum_path", (0, 1)])
+def _times(
+    a: Form, numbers: np.ndarray, own: str, its: str, result: str, dtype: np.dtype
+) -> Form:  # fmt: skip
+    """Return sums of products of a form and exact numbers, whose axes have names, as in einsum."""
+    sizes = dict(zip(own + its, a.shape + numbers.shape, strict=True))
+    terms, matrix = math.prod(sizes[c] for c in {*own + its} - {*result}), None
+    if {*own}.isdisjoint(result):
+        # A vector, whose sums are those of a matrix at once.
+        matrix = numbers.transpose([its.index(c) for c in own + result])
+        numbers = matrix = matrix.reshape(math.prod(a.shape), -1)
+
+    def times(arrays: np.ndarray, numbers: np.ndarray) -> np.ndarray:
+        if matrix is None:
+            names = f"...{own},{its}->...{result}"
+            return np.einsum(names, arrays, numbers, optimize=["einsum_path", (0, 1)])
+        lead = arrays.shape[: arrays.ndim - len(own)]
+        sums = arrays.reshape(math.prod(lead), -1) @ numbers
+        return sums.reshape(*lead, *(sizes[c] for c in result))
+
     shape = np.broadcast_shapes(a.centre.shape, a.radius.shape, a.size.shape)
     centre, radius, size = (np.broadcast_to(x, shape) for x in (a.centre, a.radius, a.size))
     gross, size = times(np.stack([radius, size]), np.abs(numbers))
@@ -78,8 +92,9 @@ def _times(a: Form, numbers: np.ndarray, names: str, dtype: np.dtype, terms: int
     linear = times(np.concatenate(parts), numbers)
     sums = rounded(linear[-1], linear[:-1], gross, size, dtype, None, a.frame, units=terms + 1.0)
     if a.radius.sum() > WORTH * a.spread.sum():
-        one = np.eye(math.prod(a.shape))
-        matrix = times(one.reshape(len(one), *a.shape), numbers).reshape(len(one), -1)
+        if matrix is None:
+            one = np.eye(math.prod(a.shape))
+            matrix = times(one.reshape(len(one), *a.shape), numbers).reshape(len(one), -1)
         # Their rounding, and that of factors that go back through the matrix.
         own = sums.radius - gross * (1 - (terms + 1) * SLACK)
         sums.common = through_layer(matrix, a, own)

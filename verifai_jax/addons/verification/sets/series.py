@@ -20,25 +20,10 @@ from jax import Array
 from jax.typing import ArrayLike
 
 from verifai_jax.addons.verification.sets.elementwise import levelled
-from verifai_jax.addons.verification.sets.form import (
-    Form,
-    add,
-    interval_product,
-    negative,
-    product,
-    rounding,
-    scaled,
-    spanned,
-)
+from verifai_jax.addons.verification.sets.form import Form, add, negative, product, scaled
 from verifai_jax.addons.verification.sets.functions import FUNCTIONS, quotient
-from verifai_jax.addons.verification.sets.interpreter import (
-    Equation,
-    Interpreter,
-    MissingRule,
-    Program,
-    Value,
-    constant,
-)
+from verifai_jax.addons.verification.sets.interpreter import Equation, Interpreter, Program
+from verifai_jax.addons.verification.sets.values import MissingRule, Value, constant
 from verifai_jax.core.compute.jaxprs import called, run_through
 from verifai_jax.core.user_code.user_errors import source_line
 
@@ -260,32 +245,10 @@ class Rates:
 def _dotted(first: Sequence[Any], second: Sequence[Any]) -> Form | None:
     """Return the sum of products of two rows, in which None is zero."""
     pairs = [levelled([a, b]) for a, b in zip(first, second, strict=True) if a and b]
-    if len(pairs) > 1 and _are_intervals([form for pair in pairs for form in pair]):
-        a, b = (_stacked([pair[i] for pair in pairs]) for i in (0, 1))
-        return _total(np.stack(interval_product(a[0], a[1], b[0], b[1])), pairs[0][0])
     return _sum([product(a, b, narrow=False) for a, b in pairs])
 
 
 def _sum(terms: Sequence[Any]) -> Form | None:
     """Return the sum of a row."""
     forms = [term for term in terms if term is not None]
-    if len(forms) > 1 and _are_intervals(forms):
-        return _total(_stacked(levelled(forms)), forms[0])
     return functools.reduce(lambda a, b: add(*levelled([a, b])), forms) if forms else None
-
-
-def _are_intervals(forms: Sequence[Form]) -> bool:
-    return all(form.slopes is None and form.low is not None for form in forms)
-
-
-def _stacked(forms: Sequence[Any]) -> Any:
-    """Return the ends of intervals, a row for each."""
-    shape = np.broadcast_shapes(*(form.centre.shape for form in forms))
-    ends = [np.broadcast_to(end, shape) for form in forms for end in form.bounds()]
-    return np.stack([np.stack(ends[::2]), np.stack(ends[1::2])])
-
-
-def _total(ends: np.ndarray, like: Form) -> Form:
-    """Return the sum of rows of intervals, whose rounding is relative to each of them."""
-    margin = 2 * (len(ends[0]) + 2) * rounding(like.dtype).unit * np.abs(ends)
-    return spanned((ends - margin)[0].sum(0), (ends + margin)[1].sum(0), like.dtype)

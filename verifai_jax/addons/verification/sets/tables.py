@@ -14,13 +14,8 @@ import numpy as np
 
 from verifai_jax.addons.verification.sets.form import Form, Reals, is_point, rounding, unknown
 from verifai_jax.addons.verification.sets.functions import FUNCTIONS, Function
-from verifai_jax.addons.verification.sets.interpreter import (
-    SHORTCUTS,
-    Interpreter,
-    Program,
-    Value,
-    as_form,
-)
+from verifai_jax.addons.verification.sets.interpreter import SHORTCUTS, Interpreter, Program
+from verifai_jax.addons.verification.sets.values import Value, as_form
 from verifai_jax.addons.verification.sets.whole import Whole
 from verifai_jax.core.compute.jaxprs import called
 from verifai_jax.systems.ode import sin_cos
@@ -50,9 +45,8 @@ def _interpolation(t: Interpreter, program: Program, inputs: list[Value]) -> lis
     kind = rounding(x.dtype)
     gaps = np.diff(edges)
     # Closer points than these JAX takes for equal, with a jump between them.
-    if len(edges) < 2 or len(edges) != len(heights) or not (gaps > 1e-6 * (1 + np.abs(
-        edges[1:]
-    ))).all() or not _is(program, jnp.interp):  # fmt: skip
+    apart = len(edges) > 1 and (gaps > 1e-6 * (1 + np.abs(edges[1:]))).all()
+    if not apart or len(edges) != len(heights) or not _is(program, jnp.interp):
         return None
     scale = np.abs(heights).max()
 
