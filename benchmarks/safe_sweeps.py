@@ -11,6 +11,10 @@ configurations. The sides are
   checkpoints that passes a test, and the last policy of each training is certified;
 - `halton`: `vj.sweep` with its defaults: Halton points, and all trainings go to their end;
 - `learning`: the search of `ours`, and all trainings go to their end;
+- `halving`: successive halving of Halton points, of which the safest two thirds go on at each of
+  the seven checkpoints, and with the test of `ours`;
+- `population`: population-based training from the same points, at the same checkpoints with the
+  same test; the safest quarter takes the places of the worst;
 - `rejax`: Optuna's TPE proposes for the best nominal return, rejax trains with hyper-parameters as
   arguments of one program, and each policy is simulated in one program at independent samples, as
   many as show it to be safe if none fails or one in four hundred does, with Clopper-Pearson bounds
@@ -20,7 +24,8 @@ configurations. The sides are
 Times are of this process's processors. Each side runs once before, with four configurations and
 other seeds, so that programs are compiled; what that took is printed apart. `first` is the
 processor time until the first configuration was trained that is safe in the end, on average over
-the order of the configurations, with the certificates of all up to there.
+the order of the configurations, with the certificates of all up to there. Where trainings end at a
+test, `passed` is the time until the first one passed that is safe in the end, as it was.
 """
 
 import argparse
@@ -116,6 +121,7 @@ class Outcome:
     seconds: dict[str, float]
     policies: list[Any]
     first: float
+    passed: float = math.nan
     nominal: float = math.nan
 
     def with_return(self, case: Case) -> "Outcome":
@@ -127,6 +133,15 @@ class Outcome:
 
 NARROW = CrossEntropy(min_elite=4, widening=1.0)
 EARLY = vj.Halving(reduction=1, until_safe=True)
+THIRDS = vj.Halving(reduction=1.5, by="safety", until_safe=True)
+SIDES: dict[str, tuple[Any, vj.Halving | None, int]] = {
+    "ours": (NARROW, EARLY, 7),
+    "halton": ("halton", None, 0),
+    "learning": (NARROW, None, 0),
+    "halving": ("halton", THIRDS, 7),
+    "population": (vj.Population(by="safety"), EARLY, 7),
+}
+"""Search, halving, and checkpoints before the end of each side of ours."""
 STAGES = {
     "training": (TrainingRuns, "train"),
     "returns": (RunningSweep, "_measure_returns"),
@@ -135,6 +150,8 @@ STAGES = {
     "certifying": (RunningSweep, "_certify"),
 }
 spent: dict[str, float] = collections.defaultdict(float)
+passed: dict[int, float] = {}
+"""When each configuration of our sweep passed its test, in processor seconds."""
 
 
 def count_time(stage: str) -> None:
@@ -149,6 +166,9 @@ def count_time(stage: str) -> None:
             return method(*arguments, **options)
         finally:
             spent[stage] += time.process_time() - began
+            for number, each in enumerate(arguments[0].configurations if stage == "tests" else ()):
+                if each.passed:
+                    passed.setdefault(number, time.process_time())
 
     setattr(owner, name, timed)
 
@@ -158,17 +178,20 @@ def our_side(
 ) -> Outcome:
     """Sweep with this package."""
     spent.clear()
+    passed.clear()
     before = time.process_time()
     result = vj.sweep(
         study, search, configurations=configurations, seed=seed, halving=halving,
-        batch=None if search == "halton" else max(1, configurations // 2),
+        batch=max(1, configurations // 2) if search is NARROW else None,
     )  # fmt: skip
     total = time.process_time() - before
     seconds = {**spent, "other": total - sum(spent.values())}
     table = result.table
     last = table.loc[table.groupby("configuration")["steps"].idxmax()]
     safe = last["verdict"].str.startswith("safe").tolist()
-    return Outcome(safe, seconds, [result.policy(i) for i in last.index], until_first(safe, total))
+    when = [passed[n] - before for n in last["configuration"][safe] if n in passed]
+    policies = [result.policy(i) for i in last.index]
+    return Outcome(safe, seconds, policies, until_first(safe, total), min(when, default=math.nan))
 
 
 def until_first(safe: list[bool], total: float) -> float:
@@ -321,7 +344,7 @@ def main() -> None:
     """Print what each side finds in an hour of a processor."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("cases", nargs="+", choices=list(CASES))
-    sides = ["ours", "halton", "learning", "rejax"]
+    sides = [*SIDES, "rejax"]
     parser.add_argument("--sides", nargs="+", choices=sides, default=sides)
     parser.add_argument("--configurations", type=int, default=32)
     parser.add_argument("--seeds", type=int, nargs="+", default=[0])
@@ -329,7 +352,6 @@ def main() -> None:
     chosen = parser.parse_args()
     for stage in STAGES:
         count_time(stage)
-    own = {"ours": (NARROW, EARLY), "halton": ("halton", None), "learning": (NARROW, None)}
     for name in chosen.cases:
         case = CASES[name]
         print(f"{name}: {chosen.configurations} configurations of {case.steps:,} steps at most")
@@ -341,8 +363,8 @@ def main() -> None:
                     print(f"  {side}: left out, {error}")
                     continue
             else:
-                search, halving = own[side]
-                study = case.study(0 if halving is None else 7)
+                search, halving, checkpoints = SIDES[side]
+                study = case.study(checkpoints)
                 run = functools.partial(our_side, study, search=search, halving=halving)
             before = time.process_time()
             run(4, 999)
@@ -365,11 +387,13 @@ def show(name: str, outcomes: list[Outcome]) -> None:
     total = sum(seconds.values())
     parts = ", ".join(f"{took:.1f} s {stage}" for stage, took in seconds.items())
     first = float(np.mean([one.first for one in outcomes]))
+    when = [one.passed for one in outcomes if not math.isnan(one.passed)]
+    earliest = f" (passed {np.mean(when):.2f} s, {len(when)} runs)" if when else ""
     known = [one.nominal for one in outcomes if one.safe and not math.isnan(one.nominal)]
     nominal = float(np.mean(known)) if known else math.nan
     print(
         f"    {name:9} {safe} safe in {total:.1f} CPU s ({parts}): {3600 * safe / total:,.0f} an "
-        f"hour; first after {first:.1f} s; nominal return of the safe ones {nominal:.1f}",
+        f"hour; first after {first:.1f} s{earliest}; nominal return of the safe ones {nominal:.1f}",
         flush=True,
     )
 

@@ -90,6 +90,7 @@ if TYPE_CHECKING:
     from verifai_jax.addons.training.loggers import TensorBoardLogger as TensorBoardLogger
     from verifai_jax.addons.training.sweeps import Halving as Halving
     from verifai_jax.addons.training.sweeps import OptunaSampler as OptunaSampler
+    from verifai_jax.addons.training.sweeps import Population as Population
     from verifai_jax.addons.training.sweeps import Study as Study
     from verifai_jax.addons.training.sweeps import StudyError as StudyError
     from verifai_jax.addons.training.sweeps import Sweep as Sweep

@@ -8,13 +8,13 @@ import pytest
 from verifai_jax.addons.rl import Discrete
 from verifai_jax.addons.rl.experience import (
     advance,
-    observation_size,
     progress,
+    sizes,
     start_episodes,
     step_keys,
 )
 from verifai_jax.addons.rl.observations import (
-    ObservationStatistics,
+    Statistics,
     mean_and_scale,
     normalise,
     update,
@@ -96,19 +96,19 @@ def test_no_episode_ended():
 
 
 def test_size_of_an_observation():
-    sizes = []
+    found = []
 
     def look(key):
-        sizes.append(observation_size(Count(), start_episodes(Count(), key, 2)))
+        found.append(sizes(Count(), start_episodes(Count(), key, 2)))
 
     jax.eval_shape(look, jax.random.key(0))
-    assert sizes == [3]
+    assert found == [(3, 2)]
 
 
 @pytest.mark.thorough
 def test_statistics_of_observations_merge():
     rows = np.random.default_rng(0).normal(3.0, 2.0, (3, 4, 5, 2)).astype(np.float32)
-    statistics = ObservationStatistics.initial(2)
+    statistics = Statistics.initial(2)
     np.testing.assert_array_equal(mean_and_scale(statistics), [[0, 0], [1, 1]])
     for batch in rows:
         statistics = update(statistics, jnp.asarray(batch))

@@ -8,7 +8,7 @@ from checked_types import unchecked
 
 from envs.cartpole_task import CartPoleTask
 from verifai_jax.addons.rl import PPO, Continuous, Discrete, Task, evaluate, train
-from verifai_jax.addons.rl.observations import ObservationStatistics, update
+from verifai_jax.addons.rl.observations import Statistics, update
 
 
 @dataclass(frozen=True)
@@ -127,7 +127,7 @@ def test_episodes_are_cut_off_and_counted():
 
 def test_statistics_of_observations_merge():
     rows = np.random.default_rng(0).normal(3.0, 2.0, (3, 4, 5, 2)).astype(np.float32)
-    statistics = ObservationStatistics.initial(2)
+    statistics = Statistics.initial(2)
     for batch in rows:
         statistics = update(statistics, jnp.asarray(batch))
     np.testing.assert_allclose(statistics.mean, rows.reshape(-1, 2).mean(axis=0), rtol=1e-5)

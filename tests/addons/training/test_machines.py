@@ -84,7 +84,7 @@ def test_an_accelerator_trains_many_at_a_time():
 
 CODE = """
 import json, sys, zlib
-sys.path[:0] = ["tests/core", "tests/addons/training/sweeps"]
+sys.path[:0] = ["tests/addons/training", "tests/addons/training/sweeps"]
 import jax, numpy as np
 import verifai_jax as vj
 from test_machines import LINE

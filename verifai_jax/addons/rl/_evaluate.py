@@ -1,15 +1,11 @@
 """Returns of policies on a task, with their most likely actions and without exploration.
 
-    evaluate(task, policy, seed=0, episodes=100).mean()  # the returns of one policy
-    mean_returns(task, policies, seed=0)                 # one number a policy
-
-An episode ends when the task terminates it, or at its time limit. The same seed gives all policies
-the same episodes. Policies of one structure share a program of fixed width, so a mean return does
-not depend on which other policies are measured.
+The same seed gives all policies the same episodes, which end when the task terminates them, or at
+its time limit. Policies of one structure share a program of fixed width, so a mean return does not
+depend on which other policies are measured.
 """
 
-from collections.abc import Callable, Hashable, Iterator, Sequence
-from functools import partial
+from collections.abc import Hashable, Iterator, Sequence
 
 import jax
 import jax.numpy as jnp
@@ -51,20 +47,6 @@ def evaluate(
     return np.asarray(_episode_returns(StaticTask(task), episodes, numbers, policy, key))
 
 
-def mean_returns(
-    task: Task, policies: Sequence[Policy], *, seed: int = 0, episodes: int = EPISODES
-) -> Float[np.ndarray, " policies"]:
-    """Measure the mean return of each policy's most likely actions, over the same episodes for all.
-
-    **Arguments:** as in `evaluate`.
-    **Returns:** `[policies]`.
-    """
-    means = np.full(len(policies), np.nan)
-    for numbers, values in batched_mean_returns(task, policies, seed=seed, episodes=episodes):
-        means[numbers] = values
-    return means
-
-
 def batched_mean_returns(
     task: Task, policies: Sequence[PyTree], *, seed: int = 0, episodes: int = EPISODES
 ) -> Iterator[tuple[list[int], Float[np.ndarray, " batch"]]]:
@@ -95,10 +77,7 @@ def _episode_returns(
     static_task: StaticTask, episodes: int, numbers: list[Array], policy: Policy,
     key: Key[Array, ""],
 ) -> Float[Array, " episodes"]:  # fmt: skip
-    task = static_task.with_numbers(numbers)
-    starts, step_keys = _starts(task, episodes, key)
-    step = jax.vmap(_step_of(task), in_axes=(None, 0, 0))
-    return _returns(task, starts, step_keys, partial(step, policy))
+    return _returns(static_task.with_numbers(numbers), episodes, policy, key, None)
 
 
 @jit_each(3)
@@ -109,43 +88,29 @@ def _mean_returns(
     def on_device(
         numbers: list[Array], policies: PyTree, key: Key[Array, ""]
     ) -> Float[Array, " some"]:
-        task = static_task.with_numbers(numbers)
-        starts, step_keys = _starts(task, episodes, key)
-        count = jax.tree.leaves(policies)[0].shape[0]
-        starts = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (count, *leaf.shape)), starts)
-        step = jax.vmap(jax.vmap(_step_of(task), in_axes=(None, 0, 0)), in_axes=(0, 0, None))
-        return jnp.mean(_returns(task, starts, step_keys, partial(step, policies)), axis=1)
+        task, count = static_task.with_numbers(numbers), jax.tree.leaves(policies)[0].shape[0]
+        return jnp.mean(_returns(task, episodes, policies, key, count), axis=1)
 
-    spread = spread_over_devices(on_device, (False, True, False), devices)
-    return spread(numbers, policies, key)
-
-
-def _starts(
-    task: Task, episodes: int, key: Key[Array, ""]
-) -> tuple[Totals, Key[Array, " episodes"]]:
-    """Start the episodes, and draw the keys of their steps."""
-    reset_keys, step_keys = jnp.moveaxis(
-        jax.vmap(jax.random.split)(jax.random.split(key, episodes)), 1, 0
-    )
-    starts = (jax.vmap(task.reset)(reset_keys), jnp.zeros(episodes), jnp.zeros(episodes, bool))
-    return starts, step_keys
-
-
-def _step_of(task: Task) -> Callable[[PyTree, Totals, Key[Array, ""]], Totals]:
-    def step(policy: PyTree, episode: Totals, key: Key[Array, ""]) -> Totals:
-        state, total, over = episode
-        after, reward, terminated = task.step(key, state, policy.act(task.observe(state)))
-        total = total + jnp.where(over, 0.0, reward)
-        return after, total, over | terminated
-
-    return step
+    return spread_over_devices(on_device, (False, True, False), devices)(numbers, policies, key)
 
 
 def _returns(
-    task: Task, starts: Totals, step_keys: Key[Array, " episodes"],
-    step_all: Callable[[Totals, Key[Array, " episodes"]], Totals],
-) -> Float[Array, "*policies episodes"]:  # fmt: skip
-    """Step all episodes until the last one is over."""
+    task: Task, episodes: int, policies: PyTree, key: Key[Array, ""], count: int | None
+) -> Float[Array, "*policies episodes"]:
+    """Step all episodes of one policy, or of `count` stacked ones, until the last one is over."""
+    keys = jax.vmap(jax.random.split)(jax.random.split(key, episodes))
+    reset_keys, step_keys = jnp.moveaxis(keys, 1, 0)
+    starts = (jax.vmap(task.reset)(reset_keys), jnp.zeros(episodes), jnp.zeros(episodes, bool))
+
+    def one(policy: PyTree, episode: Totals, key: Key[Array, ""]) -> Totals:
+        state, total, over = episode
+        after, reward, terminated = task.step(key, state, policy.act(task.observe(state)))
+        return after, total + jnp.where(over, 0.0, reward), over | terminated
+
+    step = jax.vmap(one, in_axes=(None, 0, 0))
+    if count is not None:
+        starts = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (count, *leaf.shape)), starts)
+        step = jax.vmap(step, in_axes=(0, 0, None))
 
     def goes_on(loop: tuple[Int[Array, ""], Totals]) -> Bool[Array, ""]:
         time, (_, _, over) = loop
@@ -154,6 +119,6 @@ def _returns(
     def forward(loop: tuple[Int[Array, ""], Totals]) -> tuple[Int[Array, ""], Totals]:
         time, episodes = loop
         keys = jax.vmap(lambda key: jax.random.fold_in(key, time))(step_keys)
-        return time + 1, step_all(episodes, keys)
+        return time + 1, step(policies, episodes, keys)
 
     return jax.lax.while_loop(goes_on, forward, (jnp.int32(0), starts))[1][1]

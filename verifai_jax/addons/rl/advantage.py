@@ -27,12 +27,10 @@ def advantages(
     """Estimate the advantage of each action; advantage plus `value` is the critic's target.
 
     **Arguments:**
-    - `reward`: the reward of each step.
     - `value`: the value of the state in which the action was taken.
     - `next_value`: the value of the state that the step led to, *before* any reset.
     - `ends`: the steps that ended an episode.
-    - `discount`, `gae_lambda`: the discount of future rewards, and the weight of longer
-      look-aheads, in `[0, 1]`.
+    - `discount`, `gae_lambda`: as in `PPO`.
 
     Source: Schulman et al., High-dimensional continuous control using generalized advantage
     estimation (2016), eqs. 10 and 16.

@@ -1,10 +1,5 @@
 """The contract of a training algorithm: hyper-parameters with functions `init / step / policy`.
 
-    algorithm = PPO(learning_rate=1e-3, hidden=(32, 32))
-    state = algorithm.init(task, key, updates=200)
-    state, progress = algorithm.step(task, state)
-    policy = algorithm.policy(task, state)
-
 An algorithm is a frozen dataclass that JAX knows as a pytree: hyper-parameters that change no shape
 are its leaves, so one compiled program serves all their values. Hyper-parameters that change a
 shape are static fields (`static_field`); each combination of them is compiled once.
@@ -89,18 +84,27 @@ def static_field(default: T) -> T:
     return dataclasses.field(default=default, metadata={"static": True})
 
 
-def check_values(
-    algorithm: object, names: Iterable[str], holds: Callable[[Any], bool], wanted: str
-) -> None:
-    """Refuse the first of the named hyper-parameters for which `holds` is false.
+_CONDITIONS: dict[str, Callable[[Any], bool]] = {
+    "positive": lambda value: float(value) > 0,
+    "at least 0": lambda value: float(value) >= 0,
+    "at least 1": lambda value: float(value) >= 1,
+    "between 0 and 1": lambda value: 0 <= float(value) <= 1,
+    "above 0 and at most 1": lambda value: 0 < float(value) <= 1,
+    "at least 0 and below 1": lambda value: 0 <= float(value) < 1,
+}
+"""Conditions on hyper-parameters, by the words that follow "must be"."""
 
-    **Arguments:**
-    - `algorithm`: the object with the hyper-parameters.
-    - `names`: fields to check.
-    - `holds(value) -> bool`: the condition on each value.
-    - `wanted`: the condition in words that follow "must be".
+
+def check_values(
+    algorithm: object, names: Iterable[str], wanted: str, holds: Callable[[Any], bool] | None = None
+) -> None:
+    """Refuse the first of the named hyper-parameters for which a condition is false.
+
+    - `wanted`: the condition in words that follow "must be", one of `_CONDITIONS` without `holds`.
+
     **Raises:** `ValueError`: "PPO's clip must be positive; got -1".
     """
+    holds = _CONDITIONS[wanted] if holds is None else holds
     for name in names:
         value, good = getattr(algorithm, name), False
         with contextlib.suppress(TypeError, ValueError):  # A text where a number belongs.
@@ -122,15 +126,14 @@ class Vectorised:
 
     def check_shapes(self, *counts: str) -> None:
         """Refuse numbers below 1 (those named too), minibatches that do not divide, and widths."""
-        numbers = ("environments", "horizon", *counts)
-        check_values(self, numbers, lambda value: value >= 1, "at least 1")
+        check_values(self, ("environments", "horizon", *counts), "at least 1")
         steps, rest = self.steps_per_update, [n for n in counts if n == "minibatches"]
         wanted = f"a divisor of environments * horizon = {steps}"
-        check_values(self, rest, lambda value: steps % value == 0, wanted)
+        check_values(self, rest, wanted, lambda value: steps % value == 0)
         widths = [name for name in ("hidden", "value_hidden") if hasattr(self, name)]
-        check_values(self, widths, lambda value: all(w >= 1 for w in value), "positive widths")
+        check_values(self, widths, "positive widths", lambda value: all(w >= 1 for w in value))
         named = [name for name in ("activation",) if hasattr(self, name)]
-        check_values(self, named, lambda value: value in ACTIVATIONS, " or ".join(ACTIVATIONS))
+        check_values(self, named, " or ".join(ACTIVATIONS), lambda value: value in ACTIVATIONS)
 
 
 def check_fit(algorithm: Algorithm, task: Task) -> None:

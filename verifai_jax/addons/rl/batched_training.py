@@ -1,16 +1,13 @@
 """Training runs side by side: configurations of one structure share a compiled program.
 
-    training = BatchedTraining(
-        [Configuration(task, PPO(learning_rate=r), steps=50_000) for r in rates]
-    )
+    training = BatchedTraining([Configuration(task, PPO(learning_rate=r), 50_000) for r in rates])
     for number in training.advance({0: 10_000, 1: 10_000}):
         training.policy(number), training.curve(number)
 
 Hyper-parameters that change no shape are arguments of the program; the others divide the
 configurations into groups. On CPUs one training runs on each core, exactly as it would alone; on an
 accelerator many run under one `vmap`. The result depends on the configuration and its seed, not on
-the other runs: bit for bit on one machine without `vmap`, and up to float32 rounding in each update
-with it.
+the other runs: bit for bit on one machine without `vmap`, and up to float32 rounding with it.
 """
 
 import time
@@ -162,15 +159,22 @@ class BatchedTraining:
                 self._advance(structure, part, done, until)
                 yield from part
 
-    def change_task(self, number: int, task: Task) -> None:
-        """Continue a run with other numbers in its task; nothing is compiled again.
+    def change(self, number: int, changed: Configuration) -> None:
+        """Continue a run with other numbers in its task and algorithm; nothing is compiled again.
 
-        **Raises:** `ValueError` for a task of another structure.
+        **Raises:** `ValueError` for a task or an algorithm of another structure.
         """
-        changed = replace(self.configurations[number], task=task)
         if _structure_of(changed) != self._structures[number]:
-            raise ValueError("a run can go on only with a task of the same structure and shapes")
+            raise ValueError("a run can go on only with numbers of the same structure and shapes")
         self.configurations[number] = changed
+
+    def fork(self, number: int) -> int:
+        """Add a run that goes on where this one is; return its number."""
+        self.configurations.append(self.configurations[number])
+        self._structures.append(self._structures[number])
+        if number in self._lanes:
+            self._lanes[len(self._structures) - 1] = replace(self._lanes[number])
+        return len(self._structures) - 1
 
     def policy(self, number: int) -> Policy:
         """Return the present policy of a run, on the host, without exploration."""
@@ -257,12 +261,8 @@ class BatchedTraining:
             for index, lane in enumerate(lanes)
         ):
             return first
-        selected = _Batch(
-            *_select_lanes(
-                tuple(tuple(lane.batch) for lane in lanes),
-                np.array([lane.index for lane in lanes], np.int32),
-            )
-        )
+        indices = np.array([lane.index for lane in lanes], np.int32)
+        selected = _Batch(*_select_lanes(tuple(tuple(lane.batch) for lane in lanes), indices))
         if len(devices) > 1:
             # Where the program expects them; it would be compiled again for another place.
             return jax.device_put(selected, split_sharding(devices))

@@ -1,9 +1,7 @@
 """Environments side by side, each with a new episode as soon as its last one ends.
 
-    episodes = start_episodes(task, key, environments=8)
     keys = step_keys(key, horizon=128, environments=8)
     episodes, transition = advance(task, episodes, actions, keys[0])
-    progress(transitions)                      # the episodes that ended in an update
 
 A transition keeps the observation after its step and *before* the reset. The value of an episode
 that the time limit truncated is estimated from this observation.
@@ -18,14 +16,12 @@ from jaxtyping import Array, Bool, Float, Int, Key, Shaped
 from verifai_jax.addons.rl.advantage import Ends
 from verifai_jax.addons.rl.algorithm import Progress
 from verifai_jax.addons.rl.task.task import State, Task
+from verifai_jax.systems.actions import Discrete
 
 
 class Episodes(NamedTuple):
-    """The present episode of each environment.
-
-    - `state`: states of the task with a leading axis `[environments]`.
-    - `age`: number of steps in the episode so far.
-    - `total`: sum of rewards in the episode so far.
+    """The present episode of each environment: the `state` of the task, with a leading axis
+    `[environments]`; the number of its steps so far, `age`; the sum of its rewards so far, `total`.
     """
 
     state: State
@@ -34,12 +30,9 @@ class Episodes(NamedTuple):
 
 
 class Transition(NamedTuple):
-    """One or several steps of each environment.
-
-    - `reward`: the reward of the step.
-    - `next_observation`: the observation of the state that the step led to, before any reset.
-    - `ends`: the episodes that the step ended.
-    - `total`: the episode's return including this step.
+    """One or several steps of each environment: their `reward`; `next_observation`, that of the
+    state that the step led to, before any reset; the `ends` of episodes; their return `total` with
+    this step.
     """
 
     reward: Float[Array, "*steps"]
@@ -71,9 +64,10 @@ def step_keys(key: Key[Array, ""], horizon: int, environments: int) -> Key[Array
     return jax.random.split(key, (horizon, environments, 2))
 
 
-def observation_size(task: Task, episodes: Episodes) -> int:
-    """Return the number of entries in an observation."""
-    return jax.eval_shape(jax.vmap(task.observe), episodes.state).shape[-1]
+def sizes(task: Task, episodes: Episodes) -> tuple[int, int]:
+    """Return the number of entries in an observation, and of outputs that an action needs."""
+    outputs = task.action.n if isinstance(task.action, Discrete) else task.action.size
+    return jax.eval_shape(jax.vmap(task.observe), episodes.state).shape[-1], outputs
 
 
 def advance(

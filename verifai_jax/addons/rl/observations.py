@@ -1,6 +1,6 @@
 """Running mean and variance of observations, for networks that want inputs of unit scale.
 
-statistics = update(ObservationStatistics.initial(size), observations)
+statistics = update(Statistics.initial(size), observations)
 mean, scale = mean_and_scale(statistics)
 """
 
@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 
-class ObservationStatistics(NamedTuple):
+class Statistics(NamedTuple):
     """Statistics of the observations so far.
 
     - `count`: number of observations.
@@ -22,15 +22,17 @@ class ObservationStatistics(NamedTuple):
     variance: Float[Array, " k"]
 
     @classmethod
-    def initial(cls, size: int) -> "ObservationStatistics":
+    def initial(cls, size: int) -> "Statistics":
         """Return mean 0 and variance 1 as initial statistics of observations of `size` numbers."""
         return cls(jnp.zeros(()), jnp.zeros(size), jnp.ones(size))
 
 
 def update(
-    statistics: ObservationStatistics, observation: Float[Array, "*batch k"]
-) -> ObservationStatistics:
-    """Merge the statistics of a batch: Chan, Golub and LeVeque (1979), eqs. 2.1."""
+    statistics: Statistics, observation: Float[Array, "*batch k"], enabled: bool = True
+) -> Statistics:
+    """Merge the statistics of a batch: Chan, Golub and LeVeque (1979), eqs. 2.1; if `enabled`."""
+    if not enabled:
+        return statistics
     rows = observation.reshape(-1, observation.shape[-1])
     count = jnp.float32(rows.shape[0])
     mean, variance = jnp.mean(rows, axis=0), jnp.var(rows, axis=0)
@@ -38,18 +40,18 @@ def update(
     shift = mean - statistics.mean
     squares = statistics.variance * statistics.count + variance * count
     squares = squares + shift**2 * statistics.count * count / total
-    return ObservationStatistics(total, statistics.mean + shift * count / total, squares / total)
+    return Statistics(total, statistics.mean + shift * count / total, squares / total)
 
 
 def mean_and_scale(
-    statistics: ObservationStatistics,
+    statistics: Statistics,
 ) -> tuple[Float[Array, " k"], Float[Array, " k"]]:
     """Return the number to subtract from an observation, and the number to divide by."""
     return statistics.mean, jnp.sqrt(statistics.variance + 1e-8)
 
 
 def normalise(
-    statistics: ObservationStatistics, observation: Float[Array, "*batch k"], enabled: bool = True
+    statistics: Statistics, observation: Float[Array, "*batch k"], enabled: bool = True
 ) -> Float[Array, "*batch k"]:
     """Return the observation normalised by its running statistics; unchanged if not `enabled`."""
     if not enabled:

@@ -1,21 +1,43 @@
 """Learning from one stretch of experience: a few passes over it in shuffled minibatches.
 
+optimizer, rate = adam(max_gradient=0.5), annealed(1e-3, done, updates, enabled=True)
 weights, moments = minibatch_epochs(loss, (weights, moments), batch, key, optimizer, rate, 4, 8)
 """
 
 from collections.abc import Callable
-from typing import TypeVar
+from typing import Any, TypeAlias, TypeVar
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, Key, PyTree
 
 from verifai_jax.addons.rl.algorithm import Number
-from verifai_jax.addons.rl.optimizer import Optimizer
 from verifai_jax.addons.rl.policy import ACTIVATIONS, Layers
 
+Optimizer: TypeAlias = Any
+"""An `optax.GradientTransformation`, whose types know no weights in classes."""
 Weights = TypeVar("Weights")
 Batch = TypeVar("Batch")
+EPSILON = 1e-5
+"""Adam's constant against division by zero, as PPO and its successors set it."""
+
+
+def adam(max_gradient: Number | None = None) -> Optimizer:
+    """Make Adam with rate 1, with gradients clipped to the norm `max_gradient` if it is given."""
+    import optax
+
+    if max_gradient is None:
+        return optax.scale_by_adam(eps=EPSILON)
+    return optax.chain(optax.clip_by_global_norm(max_gradient), optax.scale_by_adam(eps=EPSILON))
+
+
+def annealed(rate: Number, done: Int[Array, ""], updates: Int[Array, ""], enabled: bool) -> Number:
+    """Return the learning rate after `done` of `updates` updates.
+
+    It falls linearly from `rate` to 0 if `enabled`, and otherwise stays `rate`.
+    """
+    left = 1.0 - done * (1.0 / updates) if enabled else 1.0
+    return rate * left
 
 
 def minibatch_epochs(
@@ -28,8 +50,6 @@ def minibatch_epochs(
     - `loss(weights, minibatch) -> number`: the loss.
     - `start`: the initial weights and optimizer state.
     - `batch`: a pytree of arrays with two leading axes, such as environments and time.
-    - `key`: a random key for the order of minibatches.
-    - `optimizer`, `rate`: the optimizer, and the learning rate.
     - `epochs`, `minibatches`: number of passes over the batch, and of minibatches in a pass.
     **Returns:** the weights, and the optimizer's state.
     """
@@ -40,10 +60,8 @@ def minibatch_epochs(
         carry: tuple[Weights, PyTree], part: Batch
     ) -> tuple[tuple[Weights, PyTree], None]:
         weights, moments = carry
-        gradient = jax.grad(loss)(weights, part)
-        direction, moments = optimizer.update(gradient, moments)
-        weights = jax.tree.map(lambda w, d: w - rate * d, weights, direction)
-        return (weights, moments), None
+        direction, moments = optimizer.update(jax.grad(loss)(weights, part), moments)
+        return (jax.tree.map(lambda w, d: w - rate * d, weights, direction), moments), None
 
     def epoch(
         carry: tuple[Weights, PyTree], key: Key[Array, ""]

@@ -37,10 +37,7 @@ Layers = tuple[Layer, ...]
 """Weights `[inputs, outputs]` and biases `[outputs]` of each layer, first layer first."""
 ACTIVATIONS: dict[str, Callable[[ArrayLike], Array]] = {"tanh": jnp.tanh, "relu": jax.nn.relu}
 """Functions between the layers, by name. All are 0 at 0."""
-_KINDS: dict[str, type[Discrete] | type[Continuous]] = {
-    "discrete": Discrete,
-    "continuous": Continuous,
-}
+_KINDS: dict[str, type[Action]] = {"discrete": Discrete, "continuous": Continuous}
 
 
 class PolicyFileError(ValueError):
@@ -204,13 +201,11 @@ def save_policy(
     - `notes`: plain data for JSON, stored next to the arrays; `policy_notes` reads them.
     """
     kind = next(name for name, cls in _KINDS.items() if isinstance(policy.action, cls))
+    sources = sources_of(made=made_here()).to_json() if sources is None else dict(sources)
     about = {
-        "action": {"kind": kind, **dataclasses.asdict(policy.action)},
-        "activation": policy.activation,
-        "squash": policy.squash,
-        "notes": notes,
-        "sources": sources_of(made=made_here()).to_json() if sources is None else dict(sources),
-    }
+        "action": {"kind": kind, **dataclasses.asdict(policy.action)}, "notes": notes,
+        "activation": policy.activation, "squash": policy.squash, "sources": sources,
+    }  # fmt: skip
     arrays: dict[str, Any] = {"about": np.array(json.dumps(about))}
     for i, (weight, bias) in enumerate(policy.layers):
         arrays[f"weight{i}"], arrays[f"bias{i}"] = np.float32(weight), np.float32(bias)

@@ -1,9 +1,5 @@
 """Proximal policy optimisation: experience of many environments, a few clipped passes over it.
 
-    ppo = PPO(learning_rate=1e-3, hidden=(32, 32))
-    state = ppo.init(task, key, updates=200)
-    state, progress = ppo.step(task, state)
-
 Source: Schulman et al., Proximal policy optimization algorithms (2017).
 """
 
@@ -14,25 +10,12 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, Key, PyTree, Shaped
 
+from verifai_jax.addons.rl import experience
 from verifai_jax.addons.rl.advantage import advantages
 from verifai_jax.addons.rl.algorithm import Number, Progress, Vectorised, check_values, static_field
-from verifai_jax.addons.rl.experience import (
-    Episodes,
-    Transition,
-    advance,
-    observation_size,
-    progress,
-    start_episodes,
-    step_keys,
-)
-from verifai_jax.addons.rl.observations import (
-    ObservationStatistics,
-    mean_and_scale,
-    normalise,
-    update,
-)
-from verifai_jax.addons.rl.on_policy import minibatch_epochs, minibatch_network
-from verifai_jax.addons.rl.optimizer import adam, annealed
+from verifai_jax.addons.rl.experience import Episodes, Transition, advance, step_keys
+from verifai_jax.addons.rl.observations import Statistics, mean_and_scale, normalise, update
+from verifai_jax.addons.rl.on_policy import adam, annealed, minibatch_epochs, minibatch_network
 from verifai_jax.addons.rl.policy import Layers, Policy, network, new_layers, scale_to_range
 from verifai_jax.addons.rl.task.task import Task
 from verifai_jax.systems.actions import Action, Continuous, Discrete
@@ -75,25 +58,18 @@ class PPO(Vectorised):
     anneal: bool = static_field(True)
 
     def check(self) -> None:
-        """Refuse invalid hyper-parameters.
-
-        **Raises:** `ValueError`, naming the hyper-parameter and its value.
-        """
-        positive = ("learning_rate", "clip", "max_gradient")
-        check_values(self, positive, lambda value: float(value) > 0, "positive")
-        fractions = ("discount", "gae_lambda")
-        check_values(self, fractions, lambda value: 0 <= float(value) <= 1, "between 0 and 1")
-        weights = ("entropy", "value_weight")
-        check_values(self, weights, lambda value: float(value) >= 0, "at least 0")
+        """Refuse invalid hyper-parameters; see `Algorithm.check`."""
+        check_values(self, ("learning_rate", "clip", "max_gradient"), "positive")
+        check_values(self, ("discount", "gae_lambda"), "between 0 and 1")
+        check_values(self, ("entropy", "value_weight"), "at least 0")
         self.check_shapes("epochs", "minibatches")
 
     def init(self, task: Task, key: Key[Array, ""], updates: int | Int[Array, ""]) -> "PPOState":
         """Make the state before the first of `updates` updates."""
         policy_key, critic_key, reset_key, key = jax.random.split(key, 4)
-        episodes = start_episodes(task, reset_key, self.environments)
-        size = observation_size(task, episodes)
+        episodes = experience.start_episodes(task, reset_key, self.environments)
+        size, outputs = experience.sizes(task, episodes)
         discrete = isinstance(task.action, Discrete)
-        outputs = task.action.n if isinstance(task.action, Discrete) else task.action.size
         weights = Weights(
             # A nearly uniform first policy, and a critic that starts at unit scale.
             policy=new_layers(policy_key, (size, *self.hidden, outputs), gain=0.01),
@@ -102,7 +78,7 @@ class PPO(Vectorised):
         )
         return PPOState(
             weights=weights, moments=adam(self.max_gradient).init(weights),
-            statistics=ObservationStatistics.initial(size), episodes=episodes, key=key,
+            statistics=Statistics.initial(size), episodes=episodes, key=key,
             done=jnp.int32(0), updates=jnp.int32(updates),
         )  # fmt: skip
 
@@ -112,13 +88,11 @@ class PPO(Vectorised):
         **Returns:** the state after it, and the episodes that ended in it.
         """
         collect_key, learn_key, key = jax.random.split(state.key, 3)
-        episodes, experience = _collect(self, task, state, collect_key)
-        statistics = (
-            update(state.statistics, experience.observation) if self.normalise else state.statistics
-        )
-        weights, moments = _learn(self, task, state, experience, learn_key)
+        episodes, seen = _collect(self, task, state, collect_key)
+        statistics = update(state.statistics, seen.observation, self.normalise)
+        weights, moments = _learn(self, task, state, seen, learn_key)
         after = PPOState(weights, moments, statistics, episodes, key, state.done + 1, state.updates)
-        return after, progress(experience.transition)
+        return after, experience.progress(seen.transition)
 
     def policy(self, task: Task, state: "PPOState") -> Policy:
         """Return the policy learnt so far, without exploration."""
@@ -129,10 +103,8 @@ class PPO(Vectorised):
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True, eq=False)
 class Weights:
-    """The learnt numbers.
-
-    - `policy`, `critic`: layers of the two networks.
-    - `log_std`: `[size]`, logarithm of the deviation for exploration; None for discrete actions.
+    """The layers of the two networks, and `log_std` `[size]`, the logarithm of the deviation for
+    exploration; None for discrete actions.
     """
 
     # JAX rebuilds the class with stacked arrays and placeholders, which have other shapes.
@@ -143,18 +115,14 @@ class Weights:
 
 
 class PPOState(NamedTuple):
-    """The state between two updates.
-
-    - `weights`, `moments`: the learnt numbers, and the optimizer's state.
-    - `statistics`: the statistics of the observations so far.
-    - `episodes`: the present episode of each environment.
-    - `key`: the random key of the next update.
-    - `done`, `updates`: number of updates so far, and in all.
+    """The state between two updates: the learnt `weights` and the optimizer's `moments`;
+    `statistics` of the observations so far; the present `episodes`; the random `key` of the next
+    update; the number of updates `done`, and of all `updates`.
     """
 
     weights: Weights
     moments: PyTree
-    statistics: ObservationStatistics
+    statistics: Statistics
     episodes: Episodes
     key: Key[Array, ""]
     done: Int[Array, ""]
@@ -162,12 +130,9 @@ class PPOState(NamedTuple):
 
 
 class Experience(NamedTuple):
-    """Steps of the environments, `[horizon, environments]`.
-
-    - `observation`: the policy's input.
-    - `action`: an index, or a vector scaled to [-1, 1].
-    - `outputs`: the outputs of the policy's network.
-    - `transition`: the result of the action.
+    """Steps of the environments, `[horizon, environments]`: the `observation`; the `action`, an
+    index or a vector scaled to [-1, 1]; the `outputs` of the policy's network; the resulting
+    `transition`.
     """
 
     observation: Float[Array, "*steps k"]
@@ -177,13 +142,9 @@ class Experience(NamedTuple):
 
 
 class Minibatch(NamedTuple):
-    """Steps to learn from, with a leading axis `[rows]`.
-
-    - `observation`: the observation, normalised if the algorithm does so.
-    - `action`: as in `Experience`.
-    - `log_probability`: the log probability of the action under the policy that took it.
-    - `advantage`: the advantage of the action.
-    - `target`: the target of the critic.
+    """Steps to learn from, with a leading axis `[rows]`: the `observation`, normalised if the
+    algorithm does so; the `action` as in `Experience`, with its `log_probability` under the policy
+    that took it and its `advantage`; the `target` of the critic.
     """
 
     observation: Float[Array, "*rows k"]
@@ -225,26 +186,24 @@ def _collect(
 
 
 def _learn(
-    ppo: PPO, task: Task, state: PPOState, experience: Experience, key: Key[Array, ""]
+    ppo: PPO, task: Task, state: PPOState, seen: Experience, key: Key[Array, ""]
 ) -> tuple[Weights, PyTree]:
     """Take a few epochs of clipped policy and value steps on one stretch of experience."""
-    transition, action = experience.transition, task.action
-    observation = normalise(state.statistics, experience.observation, ppo.normalise)
+    transition, action = seen.transition, task.action
+    observation = normalise(state.statistics, seen.observation, ppo.normalise)
     next_observation = normalise(state.statistics, transition.next_observation, ppo.normalise)
     value, next_value = (
-        minibatch_network(state.weights.critic, seen.reshape(-1, seen.shape[-1])).reshape(
+        minibatch_network(state.weights.critic, each.reshape(-1, each.shape[-1])).reshape(
             transition.reward.shape
         )
-        for seen in (observation, next_observation)
+        for each in (observation, next_observation)
     )
     advantage = advantages(
         transition.reward, value, next_value, transition.ends, ppo.discount, ppo.gae_lambda
     )
     batch = Minibatch(
-        observation=observation, action=experience.action,
-        log_probability=_log_probability(
-            action, experience.outputs, state.weights.log_std, experience.action
-        ),
+        observation=observation, action=seen.action,
+        log_probability=_log_probability(action, seen.outputs, state.weights.log_std, seen.action),
         advantage=advantage, target=advantage + value,
     )  # fmt: skip
     return minibatch_epochs(

@@ -1,9 +1,5 @@
 """Parallelised Q network: Q(lambda) over many environments, with no replay and no target network.
 
-    pqn = PQN(learning_rate=1e-3, hidden=(32, 32))
-    state = pqn.init(task, key, updates=200)
-    state, progress = pqn.step(task, state)
-
 The policy's outputs are the values of the actions (times `reward_scale`).
 
 Source: Gallici et al., Simplifying deep temporal difference learning (2024), algorithm 1. Their
@@ -19,25 +15,12 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, Key, PyTree
 
+from verifai_jax.addons.rl import experience
 from verifai_jax.addons.rl.advantage import Ends
 from verifai_jax.addons.rl.algorithm import Number, Progress, Vectorised, check_values, static_field
-from verifai_jax.addons.rl.experience import (
-    Episodes,
-    Transition,
-    advance,
-    observation_size,
-    progress,
-    start_episodes,
-    step_keys,
-)
-from verifai_jax.addons.rl.observations import (
-    ObservationStatistics,
-    mean_and_scale,
-    normalise,
-    update,
-)
-from verifai_jax.addons.rl.on_policy import minibatch_epochs, minibatch_network
-from verifai_jax.addons.rl.optimizer import adam, annealed
+from verifai_jax.addons.rl.experience import Episodes, Transition, advance, step_keys
+from verifai_jax.addons.rl.observations import Statistics, mean_and_scale, normalise, update
+from verifai_jax.addons.rl.on_policy import adam, annealed, minibatch_epochs, minibatch_network
 from verifai_jax.addons.rl.policy import Layers, Policy, network, new_layers
 from verifai_jax.addons.rl.task.task import Task
 from verifai_jax.systems.actions import Discrete
@@ -85,26 +68,23 @@ class PQN(Vectorised):
     anneal: bool = static_field(True)
 
     def check(self) -> None:
-        """Refuse invalid hyper-parameters.
-
-        **Raises:** `ValueError`, naming the hyper-parameter and its value.
-        """
+        """Refuse invalid hyper-parameters; see `Algorithm.check`."""
         positive = ("learning_rate", "exploration", "reward_scale", "max_gradient")
-        check_values(self, positive, lambda value: float(value) > 0, "positive")
+        check_values(self, positive, "positive")
         fractions = ("discount", "q_lambda", "epsilon_start", "epsilon_end")
-        check_values(self, fractions, lambda value: 0 <= float(value) <= 1, "between 0 and 1")
-        check_values(self, ["hold"], lambda value: float(value) >= 1, "at least 1")
+        check_values(self, fractions, "between 0 and 1")
+        check_values(self, ["hold"], "at least 1")
         self.check_shapes("epochs", "minibatches")
 
     def init(self, task: Task, key: Key[Array, ""], updates: int | Int[Array, ""]) -> "PQNState":
         """Make the state before the first of `updates` updates."""
         weights_key, reset_key, key = jax.random.split(key, 3)
-        episodes = start_episodes(task, reset_key, self.environments)
-        size = observation_size(task, episodes)
-        layers = new_layers(weights_key, (size, *self.hidden, _count(task)), gain=0.01)
+        episodes = experience.start_episodes(task, reset_key, self.environments)
+        size, count = experience.sizes(task, episodes)
+        layers = new_layers(weights_key, (size, *self.hidden, count), gain=0.01)
         return PQNState(
             layers=layers, moments=adam(self.max_gradient).init(layers),
-            statistics=ObservationStatistics.initial(size), episodes=episodes,
+            statistics=Statistics.initial(size), episodes=episodes,
             held=jnp.full(self.environments, -1, jnp.int32), key=key, done=jnp.int32(0),
             updates=jnp.int32(updates),
         )  # fmt: skip
@@ -115,15 +95,13 @@ class PQN(Vectorised):
         **Returns:** the state after it, and the episodes that ended in it.
         """
         collect_key, learn_key, key = jax.random.split(state.key, 3)
-        episodes, held, experience = _collect(self, task, state, collect_key)
-        layers, moments = _learn(self, state, experience, learn_key)
-        statistics = (
-            update(state.statistics, experience.observation) if self.normalise else state.statistics
-        )
+        episodes, held, seen = _collect(self, task, state, collect_key)
+        layers, moments = _learn(self, state, seen, learn_key)
+        statistics = update(state.statistics, seen.observation, self.normalise)
         after = PQNState(
             layers, moments, statistics, episodes, held, key, state.done + 1, state.updates
         )
-        return after, progress(experience.transition)
+        return after, experience.progress(seen.transition)
 
     def policy(self, task: Task, state: "PQNState") -> Policy:
         """Return the policy learnt so far, without exploration."""
@@ -132,19 +110,15 @@ class PQN(Vectorised):
 
 
 class PQNState(NamedTuple):
-    """The state between two updates.
-
-    - `layers`, `moments`: the learnt network, and the optimizer's state.
-    - `statistics`: the statistics of the observations so far.
-    - `episodes`: the present episode of each environment.
-    - `held`: the random action that an environment is repeating; -1 if it is greedy.
-    - `key`: the random key of the next update.
-    - `done`, `updates`: number of updates so far, and in all.
+    """The state between two updates: the network's `layers` and the optimizer's `moments`;
+    `statistics` of the observations so far; the present `episodes`; `held`, the random action that
+    an environment is repeating, -1 if it is greedy; the random `key` of the next update; the number
+    of updates `done`, and of all `updates`.
     """
 
     layers: Layers
     moments: PyTree
-    statistics: ObservationStatistics
+    statistics: Statistics
     episodes: Episodes
     held: Int[Array, " environments"]
     key: Key[Array, ""]
@@ -153,12 +127,7 @@ class PQNState(NamedTuple):
 
 
 class Experience(NamedTuple):
-    """Steps of the environments, `[horizon, environments]`.
-
-    - `observation`: the policy's input.
-    - `action`: indices.
-    - `transition`: the result of the actions.
-    """
+    """Steps of the environments: observations, indices of actions, and what these led to."""
 
     observation: Float[Array, "horizon environments k"]
     action: Int[Array, "horizon environments"]
@@ -166,11 +135,8 @@ class Experience(NamedTuple):
 
 
 class Minibatch(NamedTuple):
-    """Steps to learn from.
-
-    - `observation`: the observation, normalised if the algorithm does so.
-    - `action`: indices.
-    - `target`: the target for the value of the action.
+    """Steps to learn from: observations, normalised if the algorithm does so, indices of actions,
+    and targets for the values of these.
     """
 
     observation: Float[Array, "*rows k"]
@@ -182,15 +148,13 @@ def q_lambda_targets(
     reward: Float[Array, "time *lanes"], next_value: Float[Array, "time *lanes"], ends: Ends,
     discount: Number, q_lambda: Number,
 ) -> Float[Array, "time *lanes"]:  # fmt: skip
-    """Compute targets for the values of the actions taken, for each lane.
+    """Compute targets for the values of the actions taken, `[time, *lanes]`.
 
     **Arguments:**
-    - `reward`: the reward of each step.
-    - `next_value`: the value of the best action in the state that the step led to, *before*
-      any reset.
-    - `ends`: the steps that ended an episode, `[time, *lanes]`.
-    - `discount`, `q_lambda`: the discount of future rewards, and the weight of longer look-aheads,
-      in `[0, 1]`.
+    - `next_value`: the value of the best action in the state that each step led to, *before* any
+      reset.
+    - `ends`: the steps that ended an episode.
+    - `discount`, `q_lambda`: as in `PQN`.
 
     Source: Gallici et al. (2024), section 4 (Peng's Q(lambda)); look-aheads end with the episode.
     """
@@ -215,9 +179,8 @@ def _collect(
     keep, start = exploration_chances(pqn, state.done, state.updates)
     # All random numbers of the update at once: in the loop each draw would cost a pass of its own.
     chances = jax.random.uniform(choice_key, (pqn.horizon, pqn.environments))
-    options = jax.random.randint(
-        action_key, (pqn.horizon, pqn.environments), 0, _count(task), jnp.int32
-    )
+    shape, count = (pqn.horizon, pqn.environments), state.layers[-1][1].shape[0]
+    options = jax.random.randint(action_key, shape, 0, count, jnp.int32)
 
     def step(
         carry: tuple[Episodes, Int[Array, " environments"]],
@@ -238,8 +201,8 @@ def _collect(
 
     keys = step_keys(step_key, pqn.horizon, pqn.environments)
     carry = (state.episodes, state.held)
-    (episodes, held), experience = jax.lax.scan(step, carry, (chances, options, keys))
-    return episodes, held, experience
+    (episodes, held), seen = jax.lax.scan(step, carry, (chances, options, keys))
+    return episodes, held, seen
 
 
 def exploration_chances(
@@ -268,11 +231,11 @@ def next_held(
 
 
 def _learn(
-    pqn: PQN, state: PQNState, experience: Experience, key: Key[Array, ""]
+    pqn: PQN, state: PQNState, seen: Experience, key: Key[Array, ""]
 ) -> tuple[Layers, PyTree]:
     """Take a few passes of regression towards the targets of one stretch of experience."""
-    transition = experience.transition
-    observation = normalise(state.statistics, experience.observation, pqn.normalise)
+    transition = seen.transition
+    observation = normalise(state.statistics, seen.observation, pqn.normalise)
     next_observation = normalise(state.statistics, transition.next_observation, pqn.normalise)
     next_values = network(state.layers, next_observation, pqn.activation)
     target = q_lambda_targets(
@@ -281,7 +244,7 @@ def _learn(
     )  # fmt: skip
     return minibatch_epochs(
         lambda layers, part: _loss(layers, pqn, part), (state.layers, state.moments),
-        Minibatch(observation, experience.action, target), key, adam(pqn.max_gradient),
+        Minibatch(observation, seen.action, target), key, adam(pqn.max_gradient),
         annealed(pqn.learning_rate, state.done, state.updates, pqn.anneal), pqn.epochs,
         pqn.minibatches,
     )  # fmt: skip
@@ -293,8 +256,3 @@ def _loss(layers: Layers, pqn: PQN, part: Minibatch) -> Float[Array, ""]:
     chosen = jnp.arange(values.shape[-1]) == part.action[:, None]
     value = jnp.sum(jnp.where(chosen, values, 0.0), axis=-1)
     return jnp.mean(jnp.square(value - part.target)) / 2
-
-
-def _count(task: Task) -> int:
-    assert isinstance(task.action, Discrete)
-    return task.action.n

@@ -1,9 +1,5 @@
 """Recent transitions in one array of fixed shape: a ring from which batches are drawn.
 
-    buffer = empty_buffer(capacity=50_000, size=3, actions=1)
-    buffer = add(buffer, transitions)          # over the oldest rows
-    batch = sample(buffer, key, 128, actions=1)
-
 One transition is one row of one array, so that adding is one write and sampling one gather. Both
 work in place inside a compiled loop; no step copies the buffer.
 """
@@ -16,12 +12,9 @@ from jaxtyping import Array, Bool, Float, Int, Key
 
 
 class ReplayBuffer(NamedTuple):
-    """A ring of transitions.
-
-    - `rows`: `[capacity, 2 * size + actions + 2]`. The widths of an observation and an action are
-      not stored; `unpack` receives the second.
-    - `index`: the row that will be written next.
-    - `filled`: the number of rows that hold a transition.
+    """A ring of transitions: `rows` `[capacity, 2 * size + actions + 2]`, where `unpack` is told
+    the number of actions; the `index` of the row to write next; the number of rows that are
+    `filled`.
     """
 
     rows: Float[Array, "capacity width"]
@@ -30,12 +23,8 @@ class ReplayBuffer(NamedTuple):
 
 
 class StoredTransitions(NamedTuple):
-    """Transitions from a buffer.
-
-    - `observation`, `action`: the policy's input and output.
-    - `reward`: the reward of the step.
-    - `next_observation`: the observation of the state that the step led to, before any reset.
-    - `terminated`: 1.0 if the episode ended for good, else 0.0.
+    """Transitions from a buffer: the policy's input and output, the reward, the observation of the
+    state that the step led to, before any reset, and 1.0 if the episode ended for good, else 0.0.
     """
 
     observation: Float[Array, "batch size"]
@@ -66,12 +55,7 @@ def add(buffer: ReplayBuffer, new: StoredTransitions) -> ReplayBuffer:
 def sample(
     buffer: ReplayBuffer, key: Key[Array, ""], count: int, actions: int
 ) -> StoredTransitions:
-    """Draw transitions uniformly with replacement; the buffer must not be empty.
-
-    **Arguments:**
-    - `count`: the number of transitions.
-    - `actions`: number of entries in an action.
-    """
+    """Draw `count` transitions uniformly with replacement; the buffer must not be empty."""
     indices = jax.random.randint(key, (count,), 0, buffer.filled)
     return unpack(buffer.rows[indices], actions)
 

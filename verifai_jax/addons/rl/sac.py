@@ -1,9 +1,5 @@
 """Soft actor-critic: a stochastic policy for continuous actions, trained for return and entropy.
 
-    sac = SAC(learning_rate=1e-3, hidden=(32, 32))
-    state = sac.init(task, key, updates=200)
-    state, progress = sac.step(task, state)
-
 The resulting policy is the mean action after tanh, without the noise.
 
 Source: Haarnoja et al., Soft actor-critic algorithms and applications (2018). Exploration with
@@ -18,29 +14,12 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, Key, PyTree
 
-from verifai_jax.addons.rl import experience
+from verifai_jax.addons.rl import experience, replay_buffer
 from verifai_jax.addons.rl.algorithm import Number, Progress, Vectorised, check_values, static_field
-from verifai_jax.addons.rl.observations import (
-    ObservationStatistics,
-    mean_and_scale,
-    normalise,
-    update,
-)
-from verifai_jax.addons.rl.optimizer import adam, annealed
-from verifai_jax.addons.rl.policy import (
-    Layers,
-    Policy,
-    network,
-    new_layers,
-    scale_to_range,
-)
-from verifai_jax.addons.rl.replay_buffer import (
-    ReplayBuffer,
-    StoredTransitions,
-    add,
-    empty_buffer,
-    sample,
-)
+from verifai_jax.addons.rl.observations import Statistics, mean_and_scale, normalise, update
+from verifai_jax.addons.rl.on_policy import adam, annealed
+from verifai_jax.addons.rl.policy import Layers, Policy, network, new_layers, scale_to_range
+from verifai_jax.addons.rl.replay_buffer import ReplayBuffer, StoredTransitions
 from verifai_jax.addons.rl.task.task import Task
 from verifai_jax.systems.actions import Continuous
 
@@ -100,29 +79,21 @@ class SAC(Vectorised):
     anneal: bool = static_field(False)
 
     def check(self) -> None:
-        """Refuse invalid hyper-parameters.
-
-        **Raises:** `ValueError`, naming the hyper-parameter and its value.
-        """
-        positive = ("learning_rate", "temperature", "reward_scale")
-        check_values(self, positive, lambda value: float(value) > 0, "positive")
-        check_values(self, ["discount"], lambda value: 0 <= float(value) <= 1, "between 0 and 1")
-        check_values(
-            self, ["target_rate"], lambda value: 0 < float(value) <= 1, "above 0 and at most 1"
-        )
-        check_values(
-            self, ["correlation"], lambda value: 0 <= float(value) < 1, "at least 0 and below 1"
-        )
-        check_values(self, ["warmup"], lambda value: int(value) >= 0, "at least 0")
+        """Refuse invalid hyper-parameters; see `Algorithm.check`."""
+        check_values(self, ("learning_rate", "temperature", "reward_scale"), "positive")
+        check_values(self, ["discount"], "between 0 and 1")
+        check_values(self, ["target_rate"], "above 0 and at most 1")
+        check_values(self, ["correlation"], "at least 0 and below 1")
+        check_values(self, ["warmup"], "at least 0")
         self.check_shapes("learnings", "batch", "capacity")
         wanted = f"a multiple of environments = {self.environments}"
-        check_values(self, ["capacity"], lambda value: value % self.environments == 0, wanted)
+        check_values(self, ["capacity"], wanted, lambda value: value % self.environments == 0)
 
     def init(self, task: Task, key: Key[Array, ""], updates: int | Int[Array, ""]) -> "SACState":
         """Make the state before the first of `updates` updates."""
         policy_key, critic_key, reset_key, noise_key, key = jax.random.split(key, 5)
         episodes = experience.start_episodes(task, reset_key, self.environments)
-        size, actions = experience.observation_size(task, episodes), _count(task)
+        size, actions = experience.sizes(task, episodes)
 
         def critic(key: Key[Array, ""]) -> Layers:
             return new_layers(key, (size + actions, *self.value_hidden, 1), gain=1.0)
@@ -135,10 +106,10 @@ class SAC(Vectorised):
         )
         return SACState(
             weights=weights, slow=weights.critics, moments=adam().init(weights),
-            statistics=ObservationStatistics.initial(size), episodes=episodes,
+            statistics=Statistics.initial(size), episodes=episodes,
             noise=jax.random.normal(noise_key, (self.environments, actions)),
-            buffer=empty_buffer(self.capacity, size, actions), key=key, done=jnp.int32(0),
-            updates=jnp.int32(updates),
+            buffer=replay_buffer.empty_buffer(self.capacity, size, actions), key=key,
+            done=jnp.int32(0), updates=jnp.int32(updates),
         )  # fmt: skip
 
     def step(self, task: Task, state: "SACState") -> tuple["SACState", Progress]:
@@ -150,17 +121,9 @@ class SAC(Vectorised):
         rate = jnp.asarray(annealed(self.learning_rate, state.done, state.updates, self.anneal))
 
         def one_step(
-            carry: "SACState",
-            numbered: tuple[
-                Int[Array, ""],
-                tuple[
-                    Float[Array, "environments actions"],
-                    Key[Array, "environments 2"],
-                    Key[Array, ""],
-                ],
-            ],
+            carry: "SACState", drawn: tuple[Int[Array, ""], Array, Key[Array, "..."], Array]
         ) -> tuple["SACState", tuple[experience.Transition, Float[Array, "environments k"]]]:
-            number, (noise, keys, learn_key) = numbered
+            number, noise, keys, learn_key = drawn
             carry, transition, observation = act(self, task, carry, noise, keys)
             taken = (state.done * self.horizon + number + 1) * self.environments
             carry = jax.lax.cond(
@@ -169,16 +132,12 @@ class SAC(Vectorised):
             return carry, (transition, observation)
 
         noise_key, step_key = jax.random.split(act_key)
-        drawn = (
-            # All random numbers of the update at once: in the loop each draw would cost its own.
-            jax.random.normal(noise_key, (self.horizon, *state.noise.shape)),
-            experience.step_keys(step_key, self.horizon, self.environments),
-            jax.random.split(learn_key, self.horizon),
-        )
-        after, (transition, observation) = jax.lax.scan(
-            one_step, state, (jnp.arange(self.horizon), drawn)
-        )
-        statistics = update(state.statistics, observation) if self.normalise else state.statistics
+        # All random numbers of the update at once: in the loop each draw would cost its own.
+        noise = jax.random.normal(noise_key, (self.horizon, *state.noise.shape))
+        keys = experience.step_keys(step_key, self.horizon, self.environments)
+        drawn = jnp.arange(self.horizon), noise, keys, jax.random.split(learn_key, self.horizon)
+        after, (transition, observation) = jax.lax.scan(one_step, state, drawn)
+        statistics = update(state.statistics, observation, self.normalise)
         after = after._replace(statistics=statistics, key=key, done=state.done + 1)
         return after, experience.progress(transition)
 
@@ -186,7 +145,7 @@ class SAC(Vectorised):
         """Return the policy learnt so far, without exploration."""
         mean, scale = mean_and_scale(state.statistics) if self.normalise else (None, None)
         *layers, (weight, bias) = state.weights.policy
-        actions = _count(task)
+        actions = state.noise.shape[1]
         means = (*layers, (weight[:, :actions], bias[:actions]))
         return Policy(means, mean, scale, None, task.action, self.activation, squash=True)
 
@@ -194,11 +153,9 @@ class SAC(Vectorised):
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True, eq=False)
 class Weights:
-    """The learnt numbers.
-
-    - `policy`: layers of the network whose outputs are means, then logarithms of deviations.
-    - `critics`: layers of two critics; their leaves have a leading axis of 2.
-    - `log_temperature`: logarithm of the weight of entropy against reward.
+    """The learnt numbers: layers of the policy, whose outputs are means and then logarithms of
+    deviations; of two critics, whose leaves have a leading axis of 2; and the logarithm of the
+    temperature.
     """
 
     # JAX rebuilds the class with stacked arrays and placeholders, which have other shapes.
@@ -209,22 +166,17 @@ class Weights:
 
 
 class SACState(NamedTuple):
-    """The state between two updates.
-
-    - `weights`, `moments`: the learnt numbers, and the optimizer's state.
-    - `slow`: the critics from which targets are computed.
-    - `statistics`: the statistics of the observations so far.
-    - `episodes`: the present episode of each environment.
-    - `noise`: the noise of the next actions, in units of the policy's deviation.
-    - `buffer`: the stored transitions.
-    - `key`: the random key of the next update.
-    - `done`, `updates`: number of updates so far, and in all.
+    """The state between two updates: `weights` and `moments` of the optimizer; `slow`, the critics
+    from which targets are computed; `statistics` of the observations so far; the present
+    `episodes`; the `noise` of the next actions, in units of the policy's deviation; the `buffer` of
+    transitions; the random `key` of the next update; the number of updates `done`, and of all
+    `updates`.
     """
 
     weights: Weights
     slow: Layers
     moments: PyTree
-    statistics: ObservationStatistics
+    statistics: Statistics
     episodes: experience.Episodes
     noise: Float[Array, "environments actions"]
     buffer: ReplayBuffer
@@ -269,7 +221,7 @@ def act(
     # A new episode begins with noise of its own.
     rho = jnp.where(transition.over, 0.0, sac.correlation)[:, None]
     after = state._replace(
-        episodes=episodes, buffer=add(state.buffer, new),
+        episodes=episodes, buffer=replay_buffer.add(state.buffer, new),
         noise=rho * state.noise + jnp.sqrt(1 - rho**2) * noise,
     )  # fmt: skip
     return after, transition, observation
@@ -277,15 +229,14 @@ def act(
 
 def _learn(sac: SAC, state: SACState, rate: Float[Array, ""], key: Key[Array, ""]) -> SACState:
     """Take `learnings` steps of Adam, each on a batch of its own."""
-    actions = state.noise.shape[1]
-    optimizer = adam()
+    actions, optimizer = state.noise.shape[1], adam()
 
     def one_step(
         carry: tuple[Weights, Layers, PyTree], key: Key[Array, ""]
     ) -> tuple[tuple[Weights, Layers, PyTree], None]:
         weights, slow, moments = carry
         batch_key, noise_key = jax.random.split(key)
-        batch = sample(state.buffer, batch_key, sac.batch, actions)
+        batch = replay_buffer.sample(state.buffer, batch_key, sac.batch, actions)
         batch = batch._replace(
             observation=normalise(state.statistics, batch.observation, sac.normalise),
             next_observation=normalise(state.statistics, batch.next_observation, sac.normalise),
@@ -341,8 +292,3 @@ def _values(
 ) -> Float[Array, "2 batch"]:  # fmt: skip
     both = jnp.concatenate([observation, action], axis=-1)
     return jax.vmap(lambda layers: network(layers, both, sac.activation)[:, 0])(critics)
-
-
-def _count(task: Task) -> int:
-    assert isinstance(task.action, Continuous)
-    return task.action.size

@@ -1,8 +1,6 @@
 """Ready callbacks: they write numbers of a computation to a CSV file, or for TensorBoard.
 
-    falsify(problem, callbacks=[CSVLogger("progress.csv"), TensorBoardLogger("logs/balance")])
-
-Both append, so a resumed computation continues its file.
+falsify(problem, callbacks=[CSVLogger("progress.csv"), TensorBoardLogger("logs/balance")])
 """
 
 import csv

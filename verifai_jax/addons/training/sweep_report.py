@@ -15,12 +15,10 @@ from verifai_jax.core.messages.text import format_percent
 from verifai_jax.features.english import number
 
 FILES = (
-    ("sweep.json", "the record of the sweep"),
-    ("table.parquet", "the table"),
-    ("failing.parquet", "the counterexamples"),
-    ("curves.npz", "the learning curves"),
+    ("sweep.json", "the record of the sweep"), ("table.parquet", "the table"),
+    ("failing.parquet", "the counterexamples"), ("curves.npz", "the learning curves"),
     ("policies/*.npz", "a policy"),
-)
+)  # fmt: skip
 """Files of a sweep, and what they are."""
 TOGETHER = (
     "The intervals of all policies hold together, at any time, for independent samples of the "
@@ -73,13 +71,9 @@ def sweep_page(sweep: Sweep, about: About, problem: object = None) -> Page:
     if sweep.folder is not None:
         command = report_command(sweep.folder, about.units, about.reasons)
         repeat.append(preformatted(command))
+    kind, holds = "evidence report on a sweep", "holds" if len(safe) else "open"
     return result_page(
-        sweep.name,
-        "evidence report on a sweep",
-        headline,
-        "holds" if len(safe) else "open",
-        claims,
-        model,
+        sweep.name, kind, headline, holds, claims, model,
         files=[] if sweep.folder is None else folder_inputs(sweep.folder, FILES),
         answers=[
             ("What was varied?", ", ".join(sweep.hyperparameters), "asked"),
@@ -105,4 +99,4 @@ def sweep_page(sweep: Sweep, about: About, problem: object = None) -> Page:
             TOGETHER,
         ],
         reproduce=[*repeat, paragraph(f"The sweep was made with verifai_jax {record.version}.")],
-    )
+    )  # fmt: skip

@@ -1,13 +1,16 @@
 """The sentences of a summary follow from the table: what helps, what does not, what is unknown."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pandas as pd
 import pytest
 
-from verifai_jax.addons.training.augmentation.outcome import Outcome
+import verifai_jax as vj
+from verifai_jax.addons.training.augmentation.result import Augmentation
 from verifai_jax.addons.training.augmentation.summary import findings, summarize
+from verifai_jax.addons.training.augmentation.task import SupervisedTask
 
 OPTIONS = {
     "initial": 100,
@@ -41,7 +44,9 @@ def outcome(errors, why=None, wrong=30, complete=True):
     table = pd.DataFrame({"violated": violated, "status": "ok"})
     arms = tuple(arm for arm in errors if arm != "base")
     tables = dict.fromkeys(range(seeds), table)
-    return Outcome("toy", arms, pd.DataFrame(rows), tables, OPTIONS, 0.95, complete)
+    task, added = SupervisedTask("toy", {"x": vj.Box(0, 1)}, *[abs] * 5), pd.DataFrame()
+    made = (task, arms, pd.DataFrame(rows), added, tables, {}, OPTIONS, 0.95, complete, "0.1.0")
+    return Augmentation(*made)
 
 
 def test_what_helps_is_named_with_its_size():
@@ -130,5 +135,5 @@ def test_nothing_is_finite():
 def test_an_interrupted_study_says_so():
     found = outcome({"base": [0.2, 0.2], "none": [0.18, 0.2]}, complete=False)
     assert "NOT FINISHED: interrupted" in summarize(found)
-    empty = found._replace(table=pd.DataFrame())
+    empty = replace(found, table=pd.DataFrame())
     assert summarize(empty) == "toy: interrupted before a network was trained"

@@ -65,11 +65,11 @@ class Drift:
         return STEPS_PER_UPDATE
 
     def check(self):
-        check_values(self, ["rate", "limit"], lambda value: float(value) > 0, "positive")
+        check_values(self, ["rate", "limit"], "positive")
         below = f"less than limit = {self.limit}"
-        check_values(self, ["rate"], lambda value: float(value) < float(self.limit), below)
+        check_values(self, ["rate"], below, lambda value: float(value) < float(self.limit))
         wanted = f"a divisor of environments = {self.environments}"
-        check_values(self, ["parts"], lambda value: self.environments % value == 0, wanted)
+        check_values(self, ["parts"], wanted, lambda value: self.environments % value == 0)
 
     def init(self, task, key, updates):
         sizes = (2, *self.hidden, 1)

@@ -157,8 +157,8 @@ def test_what_an_algorithm_lacks_is_not_told_of_it(tmp_path):
     assert sweep.used["ppo"] == ("learning_rate", "width", "algorithm")
     ppo = sweep.table.index[sweep.table["algorithm"] == "ppo"][0]
     sac = sweep.table.index[sweep.table["algorithm"] == "sac"][0]
-    assert "discount" not in format_hyperparameters(sweep.findings, dict(sweep.table.loc[ppo]))
-    assert "discount" in format_hyperparameters(sweep.findings, dict(sweep.table.loc[sac]))
+    assert "discount" not in format_hyperparameters(sweep, dict(sweep.table.loc[ppo]))
+    assert "discount" in format_hyperparameters(sweep, dict(sweep.table.loc[sac]))
     assert load_sweep(sweep.save(tmp_path)).used == sweep.used
 
 

@@ -49,6 +49,7 @@ def test_a_whole_sweep(tmp_path):
         p=0.01,
         certification=vj.Certification(samples=64),
         seed=0,
+        only_safe=True,
     )
     assert found.table["verdict"].tolist() == [c.verdict for c in certificates.rows]
     assert found.table["failures"].tolist() == [

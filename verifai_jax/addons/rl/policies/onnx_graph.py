@@ -57,14 +57,10 @@ _DOMAINS = "", "ai.onnx"
 class Graph:
     """The function of a graph: `(weights, observation, memory) -> (outputs, memory)`.
 
-    Graphs with equal content are equal, so policies that only differ in weights share a program.
-
-    - `nodes`: the nodes in the order of computation.
-    - `constants`: arrays that are not weights: shapes, indices, flags.
-    - `inputs`: names of the observations, with their shapes.
-    - `memory`: pairs of an input and the output that is its next value.
-    - `output`: name of the output.
-    - `types`: numbers of the types of inputs; without one it is real.
+    It has nodes in the order of computation; constant arrays that are not weights; the shapes of
+    observations by name; `memory`, pairs of an input and the output that is its next value; the
+    name of the output; types of inputs that are not real. Graphs with equal content are equal, so
+    policies that only differ in weights share a program.
     """
 
     nodes: tuple[Node, ...]

@@ -22,13 +22,10 @@ TYPES: dict[int, Any] = {
 
 @dataclass(frozen=True, eq=False)
 class Node:
-    """One operation of a graph.
-
-    - `operator`, `name`: operator and name in the file.
-    - `inputs`, `outputs`: names of values; an omitted input is empty.
-    - `attributes`: plain values, arrays, and subgraphs as `(nodes, outputs)`.
-    - `opset`: version of the operators.
-    - `wide`: whether its first output is declared as whole numbers of 64 bits.
+    """One operation of a graph: its operator and name in the file; the names of its inputs, empty
+    if omitted, and outputs; attributes, which are plain values, arrays, and subgraphs `(nodes,
+    outputs)`; the version of the operators; `wide`, whether its first output is declared as 64-bit
+    integers.
     """
 
     operator: str

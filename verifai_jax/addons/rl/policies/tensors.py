@@ -57,9 +57,7 @@ class Tensors(dict[str, np.ndarray]):
             self.used.update(found)
 
     def settle(self, remedy: str, level: int = logging.WARNING) -> None:
-        """Refuse unread tensors that an action may depend on, and name the others in the log.
-
-        - `level`: the level of the log.
+        """Refuse unread tensors that an action may depend on, and log the others at this level.
 
         **Raises:** `PolicyError` with their names and the remedy.
         """

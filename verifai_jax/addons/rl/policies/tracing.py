@@ -1,7 +1,5 @@
 """Pure functions of JAX as graphs of ONNX operators.
 
-    graph, weights, memory = traced(policy.compute, policy.weights, np.zeros(4), None)
-
 A function is traced, and each operation of JAX becomes operators of ONNX. This covers networks of
 flax and equinox, policies of Brax, scales, squashing and memory. The existing jax2onnx is not used,
 because it only translates models of certain libraries and pins their versions.
@@ -60,14 +58,12 @@ _TYPES = {"f": 1, "b": 9, "i": 6, "u": 12}
 def traced(
     function: Callable[..., Any], weights: PyTree, observation: PyTree, memory: PyTree
 ) -> Traced:
-    """Translate a function `(weights, observation, memory) -> (action, memory)` to ONNX.
+    """Translate a pure function `(weights, observation, memory) -> (action, memory)` to ONNX.
 
-    **Arguments:**
-    - `function`: a pure JAX function.
     - `weights`: a pytree of arrays, whose paths become their names.
-    - `observation`: an example observation; several arrays by name become several inputs.
+    - `observation`: an example; several arrays by name become several inputs.
     - `memory`: the memory at the start of an episode, a pytree; None for none.
-    **Returns:** the graph, all its arrays by name, and its initial memory.
+
     **Raises:** `PolicyError` for an operation that ONNX, or this translation, does not support.
     """
     named = observation if isinstance(observation, Mapping) else {"observation": observation}

@@ -33,11 +33,8 @@ Option = float | str
 
 @dataclass(frozen=True)
 class BraxTask:
-    """A task of a Brax environment, made by `brax_task`.
-
-    - `env`: the environment.
-    - `name`: the environment's name in error messages.
-    - `time_limit`: number of steps after which an episode is truncated.
+    """A task of a Brax environment, made by `brax_task`: the environment, its name in error
+    messages, and the number of steps after which an episode is truncated.
     """
 
     env: "Env"

@@ -32,12 +32,8 @@ if TYPE_CHECKING:
 @jax.tree_util.register_dataclass
 @dataclass(frozen=True, eq=False)
 class GymnaxTask:
-    """A task of a gymnax environment, made by `gymnax_task`.
-
-    - `params`: the environment's parameters; JAX may trace their numbers.
-    - `env`: the environment.
-    - `adapter`: converts the policy's actions to the environment's.
-    - `time_limit`: number of steps after which an episode is truncated.
+    """A task of a gymnax environment, made by `gymnax_task`: the environment, its parameters, whose
+    numbers JAX may trace, the converter of actions, and the number of steps of an episode.
     """
 
     params: PyTree

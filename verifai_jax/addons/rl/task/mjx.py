@@ -29,31 +29,21 @@ from verifai_jax.systems.actions import Action, Continuous
 from verifai_jax.systems.pytree_checks import outline
 
 MjModel: TypeAlias = Any
-"""A compiled model of MuJoCo (`mujoco.MjModel`), which is imported only where it is used."""
 MjxData: TypeAlias = Any
-"""Data of MJX (`mujoco.mjx.Data`), which is imported only where it is used."""
 MjxModel: TypeAlias = Any
-"""A model of MJX (`mujoco.mjx.Model`), which is imported only where it is used."""
+"""`mujoco.MjModel`, `mujoco.mjx.Data` and `Model`, which are imported only where they are used."""
 Reward = Callable[[MjxData, Array, MjxData], ArrayLike]
-"""`(before, action, after) -> number`"""
 Observe = Callable[[MjxData], ArrayLike]
-"""`data -> [k]`"""
 Initial = Callable[[Key[Array, ""], Array, Array], tuple[ArrayLike, ArrayLike]]
-"""`(key, qpos, qvel) -> (qpos, qvel)`"""
 Terminate = Callable[[MjxData], ArrayLike]
-"""`data -> bool`"""
 Control = Callable[[Array], ArrayLike]
-"""`action -> [nu]`"""
 Vary = Callable[[Key[Array, ""], MjxModel], Mapping[str, ArrayLike]]
-"""`(key, model) -> {field: array}`"""
 
 
 class MjxState(NamedTuple):
-    """The state of an episode.
-
-    - `qpos`, `qvel`, `act`: joints and activations, as in MuJoCo.
-    - `warmstart`: accelerations from which the constraint solver starts.
-    - `varied`: fields of the model that have their own values in this episode, by name.
+    """The state of an episode: joints and activations, as in MuJoCo; accelerations from which the
+    constraint solver starts; fields of the model that have their own values in this episode, by
+    name.
     """
 
     qpos: Float[Array, " nq"]

@@ -30,21 +30,14 @@ from verifai_jax.systems.pytree_checks import as_floating, outline
 
 Tree = TypeVar("Tree")
 Reward = Callable[..., ArrayLike]
-"""`(time, state, control, after, **weights) -> number`"""
 Control = Callable[[Array], PyTree]
-"""`action -> control`"""
 Observe = Callable[[PyTree], ArrayLike]
-"""`state -> [k]`"""
 DrawFeatures = Callable[[Key[Array, ""]], PyTree]
-"""`key -> features`"""
 
 
 class OdeState(NamedTuple):
-    """The state of an episode.
-
-    - `time`: seconds since its start.
-    - `state`: the state of the dynamics, any pytree of arrays.
-    - `features`: the features of this episode.
+    """The state of an episode: seconds since its start; the state of the dynamics, any pytree of
+    arrays; its features.
     """
 
     time: Float[Array, ""]

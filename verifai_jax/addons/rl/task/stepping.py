@@ -25,12 +25,10 @@ class ObservedState(NamedTuple):
 
 
 class ActionAdapter(NamedTuple):
-    """The policy's kind of action, and its conversion to the environment's: hashable.
+    """The policy's kind of action, and its conversion to the environment's of this shape and dtype.
 
-    - `action`: the kind of action of the policy.
-    - `shape`, `dtype`: shape and dtype of the environment's action.
-    - `low`, `high`: bounds of each entry; only given if they differ, and then the policy acts in
-      [-1, 1].
+    It is hashable. `low`, `high` are bounds of each entry, given if they differ: the policy then
+    acts in [-1, 1].
     """
 
     action: Action
@@ -97,9 +95,8 @@ def flat_observation(observation: object, name: str) -> Float[Array, " k"]:
 def match_types(state: PyTree, following: PyTree, name: str) -> PyTree:
     """Convert a state to the dtypes that a step returns, which may differ from the reset's.
 
-    **Arguments:**
     - `following`: the state after a step, or its shapes and dtypes.
-    - `name`: the environment's name, for the error message.
+
     **Raises:** `ValueError` for a step that returns a state of another structure.
     """
     if jax.tree.structure(state) != jax.tree.structure(following):

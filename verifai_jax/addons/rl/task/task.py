@@ -28,9 +28,6 @@ class Task(Protocol):
     - `time_limit`: number of steps after which an episode is truncated. Truncation does not end it:
       the last state still has a value. Only `terminated`, returned by `step`, ends an episode for
       good.
-    - `reset(key) -> state`: returns a first state, drawn with the random key.
-    - `step(key, state, action) -> (state, reward, terminated)`: takes one step of the environment.
-    - `observe(state) -> [k]`: returns the policy's observation.
 
     A task may also define `start(key, features) -> state`, the first state of an episode with given
     features of a problem, which `vj.harden` uses to train on counterexamples.
@@ -50,12 +47,7 @@ class Task(Protocol):
         ...
 
     def reset(self, key: Key[Array, ""]) -> State:
-        """Draw a first state.
-
-        **Arguments:**
-        - `key`: a random key for this episode's start only.
-        **Returns:** a state with the structure, shapes and dtypes that `step` returns.
-        """
+        """Draw a first state, with the structure, shapes and dtypes that `step` returns."""
         ...
 
     def step(
@@ -64,8 +56,6 @@ class Task(Protocol):
         """Take one step.
 
         **Arguments:**
-        - `key`: a random key for this step only.
-        - `state`: a state returned by `reset` or `step`.
         - `action`: an int32 scalar for a `Discrete` task, a float32 vector `[size]` for a
           `Continuous` one.
         **Returns:** the next state; the reward; whether the episode is over for good.

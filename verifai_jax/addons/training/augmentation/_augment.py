@@ -19,10 +19,11 @@ from typing import Any
 
 from verifai_jax._version import __version__
 from verifai_jax.addons.training.augmentation.arms import ARMS, check_arms
+from verifai_jax.addons.training.augmentation.examples import searched_problem
 from verifai_jax.addons.training.augmentation.result import Augmentation
-from verifai_jax.addons.training.augmentation.searched import searched_problem
 from verifai_jax.addons.training.augmentation.study import Plan, Study
 from verifai_jax.addons.training.augmentation.task import SupervisedTask
+from verifai_jax.addons.training.sweeps.fingerprint import describe_space
 from verifai_jax.core.compute.fingerprint import stable_text
 from verifai_jax.core.compute.precision import reproducible_settings
 from verifai_jax.core.display.progress import ProgressBar
@@ -31,7 +32,6 @@ from verifai_jax.core.messages.errors import suggests_options
 from verifai_jax.core.store.cache import locked_cache
 from verifai_jax.core.user_code.source_collection import sources_of
 from verifai_jax.falsification.validation import check_search
-from verifai_jax.features import FeatureSpace
 from verifai_jax.search import Search, named
 
 KIND = "augmentation"
@@ -92,12 +92,9 @@ def augment(
     chosen = _arms(task, arms)
     first, further = steps
     counts = {"initial": initial, "added": added, "the first of steps": first}
-    for name, value in {**counts, "the second of steps": further}.items():
-        check_count(name, value)
-    check_count("seeds", seeds)
-    check_count("seed", seed, 0)
-    check_count("test", test)
-    check_count("hard", hard, 0)
+    counts |= {"the second of steps": further, "seeds": seeds, "seed": seed, "test": test}
+    for name, value in {**counts, "hard": hard}.items():
+        check_count(name, value, 0 if name in ("seed", "hard") else 1)
     check_fraction("confidence", confidence)
     budget = 10 * added if budget is None else check_count("budget", budget)
     search = named(search) if isinstance(search, str) else search
@@ -136,8 +133,8 @@ def _fingerprint(task: SupervisedTask, plan: Plan) -> dict[str, Any]:
     functions = ("render", "label", "train", "predict", "wrongness", "transform")
     return {
         "task": task.name,
-        "space": _features(task.space),
-        "training_space": None if task.training_space is None else _features(task.training_space),
+        "space": describe_space(task.space),
+        "training_space": task.training_space and describe_space(task.training_space),
         "constrained": [
             space is not None and space.where is not None
             for space in (task.space, task.training_space)
@@ -148,10 +145,6 @@ def _fingerprint(task: SupervisedTask, plan: Plan) -> dict[str, Any]:
         "options": {f.name: stable_text(getattr(plan, f.name)) for f in fields(plan)},
         "version": __version__,
     }
-
-
-def _features(space: FeatureSpace) -> dict[str, str]:
-    return {name: stable_text(domain) for name, domain in space.domains.items()}
 
 
 def _name(function: Any) -> str | None:

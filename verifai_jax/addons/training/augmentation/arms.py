@@ -28,14 +28,9 @@ GENERATED = 20
 
 @dataclass(frozen=True, eq=False)
 class Base:
-    """A trained network, and all data from which an arm may choose.
-
-    - `task`, `workshop`: the task, and its compiled functions.
-    - `weights`: the weights of the network.
-    - `initial`: the examples on which it was trained.
-    - `table`: the error table of the search: features, `rho`, `violated`, `status`.
-    - `added`: number of inputs to add.
-    - `key`: the key of random choices.
+    """A trained network, and all data from which an arm may choose: the task and its compiled
+    functions; the `weights`; the `initial` examples on which they were trained; the error `table`
+    of the search; the number of inputs to add; the key of random choices.
     """
 
     task: SupervisedTask
@@ -60,12 +55,9 @@ class Base:
 
 @dataclass(frozen=True, eq=False)
 class Addition:
-    """Features of the inputs that an arm adds.
-
-    - `rows`: a DataFrame with the columns of the space; of the originals for transformed inputs.
-    - `rendered`: number of inputs rendered for the choice, including the chosen ones.
-    - `why`: the reason if there are fewer than requested; otherwise empty.
-    - `transformed`: True for inputs of the initial set that are to be transformed.
+    """Features of the inputs that an arm adds, or of the originals for `transformed` inputs of the
+    initial set; the number of inputs rendered for the choice; the reason `why` there are fewer than
+    requested.
     """
 
     rows: pd.DataFrame
@@ -123,21 +115,12 @@ def table_closest(base: Base) -> Addition:
 
 def table_pca(base: Base) -> Addition:
     """Add new inputs along the principal components of the counterexamples."""
-    generate = _pca_generator(base)
-    if isinstance(generate, str):
-        return _nothing(base, generate)
-    rows = generate(base.key, base.added)
-    return Addition(rows, len(base.table) + len(rows))
+    return _generated(base, _pca_generator(base))
 
 
 def rules_(base: Base) -> Addition:
     """Add new inputs, drawn from the prior inside the rules of the table."""
-    generate = _rules_generator(base)
-    if isinstance(generate, str):
-        return _nothing(base, generate)
-    rows = generate(base.key, base.added)
-    few = "" if len(rows) == base.added else "the rules cover too little of the space"
-    return Addition(rows, len(base.table) + len(rows), few)
+    return _generated(base, _rules_generator(base), "the rules cover too little of the space")
 
 
 def pca_kept(base: Base) -> Addition:
@@ -215,6 +198,14 @@ def _rules_generator(base: Base) -> Generator | str:
         return pd.concat(parts, ignore_index=True).iloc[:count]
 
     return generate
+
+
+def _generated(base: Base, generate: Generator | str, few: str = "") -> Addition:
+    if isinstance(generate, str):
+        return _nothing(base, generate)
+    rows = generate(base.key, base.added)
+    few = few if len(rows) < base.added else ""
+    return Addition(rows, len(base.table) + len(rows), few)
 
 
 def _kept(base: Base, generate: Generator | str) -> Addition:

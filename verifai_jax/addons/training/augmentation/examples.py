@@ -1,9 +1,7 @@
 """Labelled inputs of a task: drawn, rendered, and judged by a network, in blocks of one shape.
 
-    workshop = Workshop(task)
     rows = workshop.draw(task.space, key, 200)          # features: a DataFrame
-    examples = workshop.render(rows)                    # inputs and labels
-    workshop.judge(weights, examples).wrongness         # [n]
+    workshop.judge(weights, workshop.render(rows)).wrongness    # [n]
 
 Blocks have one shape for any number of rows, and weights are arguments, so each function compiles
 once for all networks.
@@ -19,12 +17,42 @@ import numpy as np
 import pandas as pd
 from jaxtyping import Array, Bool, Float, Key, PyTree
 
-from verifai_jax.addons.training.augmentation.task import SupervisedTask, TaskError, Weights
+from verifai_jax.addons.training.augmentation.task import (
+    MARGIN,
+    Features,
+    SupervisedTask,
+    TaskError,
+    Weights,
+)
+from verifai_jax.core.compute.keys import run_keys
 from verifai_jax.core.user_code.user_errors import explain_user_error
+from verifai_jax.core.values.trace import Trace
 from verifai_jax.features import FeatureSpace
+from verifai_jax.problem.problem import Problem
+from verifai_jax.search import Search
+from verifai_jax.systems.base import System
 
 BLOCK = 128
 """Rows that one call of a compiled function works on."""
+INITIAL, TRAINING, FURTHER, SEARCH, CHOICE, TEST, MEASURES = range(7)
+"""Purposes of random numbers in one repetition."""
+INDEPENDENT = 2**31 - 1
+"""Number of the repetition of the independent network, higher than that of any seed."""
+
+
+def purpose_key(seed: int, number: int, purpose: int) -> Key[Array, ""]:
+    """Return the random key for a purpose, which is the same for all arms of a repetition.
+
+    **Arguments:**
+    - `purpose`: one of the constants of this file.
+    """
+    repetition = jax.random.fold_in(run_keys(seed)[0], number)
+    return jax.random.fold_in(repetition, purpose)
+
+
+def choice_key(seed: int, number: int) -> Key[Array, ""]:
+    """Return the random key with which arms choose and transform inputs."""
+    return purpose_key(seed, number, CHOICE)
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,11 +88,9 @@ class Examples:
 
 @dataclass(frozen=True, eq=False)
 class Judgement:
-    """A judgement of a network's predictions.
-
-    - `wrongness` `[n]`: positive for a wrong prediction.
-    - `present`, `detected` `[n]`: whether there is something to find, and whether it was found;
-      None if the task does not define them.
+    """A judgement of a network's predictions `[n]`: `wrongness` is positive for a wrong one;
+    whether there is something to find, and whether it was found, are None if the task does not
+    define them.
     """
 
     wrongness: Float[np.ndarray, " n"]
@@ -233,3 +259,30 @@ def in_blocks(function: Any, tree: PyTree, n: int) -> PyTree:
         found = function(jax.tree.map(block, tree))
         parts.append(jax.tree.map(lambda leaf, count=count: np.asarray(leaf)[:count], found))
     return jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
+
+
+def searched_problem(
+    task: SupervisedTask, weights: Weights | None, search: Search, workshop: Workshop | None
+) -> Problem:
+    """Return the problem in which a search looks for inputs on which a network errs.
+
+    Without gradients one program serves the networks of all seeds, with their weights as arguments;
+    with gradients each network has its own program.
+    """
+    if workshop is None or (search.wants.derivatives and not task.black_box):
+        return task.problem(weights)
+    return Problem(task.name, task.space, _Judged(workshop, weights), f"{MARGIN} >= 0")
+
+
+class _Judged(System):
+    """A network as a system of batches, judged by compiled functions that all networks share."""
+
+    black_box = True
+
+    def __init__(self, workshop: Workshop, weights: Weights) -> None:
+        self.workshop, self.weights = workshop, weights
+
+    def simulate_batch(self, features: Features, keys: Key[Array, " n"]) -> Trace:
+        rows = pd.DataFrame(self.workshop.task.space.rows(features))
+        wrongness = self.workshop.judge(self.weights, self.workshop.render(rows)).wrongness
+        return Trace({MARGIN: -np.asarray(wrongness, np.float32)[:, None]}, dt=1.0)

@@ -1,9 +1,7 @@
 """The result of an augmentation: each arm against the others, over seeds.
 
-result.table                            a row for each arm and seed
-result.compare("error", "none")         paired differences with intervals
-print(result)                           what helps, in words
-result.plot("arms.png"); result.montage("added.png", "counterexamples")
+result.compare("error", "none")         paired differences with intervals print(result)
+what helps, in words
 """
 
 from collections.abc import Mapping
@@ -14,12 +12,11 @@ from typing import Any
 
 import pandas as pd
 
-from verifai_jax.addons.training.augmentation.examples import Examples, Workshop, transformed
-from verifai_jax.addons.training.augmentation.keys import choice_key
-from verifai_jax.addons.training.augmentation.outcome import Outcome
-from verifai_jax.addons.training.augmentation.summary import summarize
+from verifai_jax.addons.training.augmentation import examples as labelled
+from verifai_jax.addons.training.augmentation.examples import Examples, Workshop
+from verifai_jax.addons.training.augmentation.summary import BASE, TRAINED, summarize
 from verifai_jax.addons.training.augmentation.task import SupervisedTask, Weights
-from verifai_jax.addons.training.paired import PairedDifference
+from verifai_jax.addons.training.paired import PairedDifference, paired_difference
 from verifai_jax.core.compute.precision import reproducible_settings
 from verifai_jax.core.display.figure import Figure
 from verifai_jax.core.display.lazy import lazy_import
@@ -66,17 +63,11 @@ class Augmentation(InNotebook):
     complete: bool
     version: str
 
-    @cached_property
-    def _outcome(self) -> Outcome:
-        return Outcome(
-            self.task.name, self.arms, self.table, self.error_tables, self.options, self.confidence,
-            self.complete,
-        )  # fmt: skip
-
     @property
     def metrics(self) -> tuple[str, ...]:
         """Names of the columns that measure a network."""
-        return self._outcome.metrics
+        columns = [str(name) for name in self.table.columns]
+        return tuple(columns[columns.index("rendered") + 1 : columns.index("why")])
 
     def compare(
         self, metric: str = "error", reference: str = "none"
@@ -95,17 +86,26 @@ class Augmentation(InNotebook):
         **Raises:** `UnknownNameError` for an arm or a metric that the table does not have.
         """
         check_names("metric", [metric], self.metrics)
-        check_names("arm", [reference], self._outcome.rows)
-        return self._outcome.compare(metric, reference)
+        arms = [str(arm) for arm in self.table["arm"].unique()]
+        check_names("arm", [reference], arms)
+        values: Any = self.table.pivot(index="seed", columns="arm", values=metric).astype(float)
+        return {
+            arm: paired_difference(values[arm], values[reference], self.confidence)
+            for arm in arms
+            if arm not in (reference, BASE)
+        }
 
     @property
     def means(self) -> pd.DataFrame:
         """Means over the seeds whose predictions are finite, a row for each arm."""
-        return self._outcome.means
+        groups: Any = self.table.loc[self.table["status"] == TRAINED].groupby("arm")
+        rows = self.table["arm"].unique()
+        found = groups[["added", "wrong_added", "rendered", *self.metrics]].mean().reindex(rows)
+        return found.assign(seeds=groups.size().reindex(rows, fill_value=0))
 
     def summary(self) -> str:
         """Write which arms help and which do not; every number comes from the table."""
-        return summarize(self._outcome)
+        return summarize(self)
 
     @reproducible_settings()
     def examples(self, arm: str, seed: int = 0) -> Examples:
@@ -125,7 +125,8 @@ class Augmentation(InNotebook):
         rows: Any = added.loc[(added["arm"] == arm) & (added["seed"] == seed)]
         examples = self._workshop.render(rows)
         if arm == "standard":
-            return transformed(self.task, examples, choice_key(self.options["seed"], seed))
+            key = labelled.choice_key(self.options["seed"], seed)
+            return labelled.transformed(self.task, examples, key)
         return examples
 
     @cached_property

@@ -1,10 +1,7 @@
 """The work of an augmentation: seeds, their networks, and the stored results.
 
-    study = Study(task, plan, cache, bar)
-    study.run(0, ("none", "counterexamples"))               # one seed; what is finished is read
-    study.result(arms, 0.95, complete=True)
-
-A cache keeps tables and weights as arrays of numbers and texts.
+study.run(0, ("none", "counterexamples"))               # one seed; what is finished is read
+study.result(arms, 0.95, complete=True)
 """
 
 import json
@@ -17,20 +14,15 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 import pandas as pd
+from jax.tree_util import PyTreeDef, default_registry
 from jaxtyping import Array, Float, Key
 
 from verifai_jax._version import __version__
-from verifai_jax.addons.training.augmentation import keys
+from verifai_jax.addons.training.augmentation import examples as labelled
 from verifai_jax.addons.training.augmentation.arms import ARMS, FROM_TABLE, Addition, Base
-from verifai_jax.addons.training.augmentation.examples import (
-    Examples,
-    Judgement,
-    Workshop,
-    transformed,
-)
-from verifai_jax.addons.training.augmentation.outcome import BASE, NOT_FINITE, TRAINED
+from verifai_jax.addons.training.augmentation.examples import Examples, Judgement, Workshop
 from verifai_jax.addons.training.augmentation.result import Augmentation
-from verifai_jax.addons.training.augmentation.searched import searched_problem
+from verifai_jax.addons.training.augmentation.summary import BASE, NOT_FINITE, TRAINED
 from verifai_jax.addons.training.augmentation.task import SupervisedTask, TaskError, Weights
 from verifai_jax.core.display.progress import ProgressBar
 from verifai_jax.core.messages.errors import end_if_interrupted
@@ -133,7 +125,7 @@ class Study:
         """Examples on which an independently trained network errs."""
 
         def compute() -> Arrays:
-            return encode_frame(_hard_rows(Seed(self, keys.INDEPENDENT), self.plan.hard))
+            return encode_frame(_hard_rows(Seed(self, labelled.INDEPENDENT), self.plan.hard))
 
         return self.workshop.render(decode_frame(self.cache.remember("hard", compute)))
 
@@ -172,21 +164,21 @@ class Seed:
 
     def key(self, purpose: int) -> Key[Array, ""]:
         """Return the random key for a purpose, which is the same for all arms."""
-        return keys.purpose_key(self.plan.seed, self.number, purpose)
+        return labelled.purpose_key(self.plan.seed, self.number, purpose)
 
     @cached_property
     def initial(self) -> Examples:
         """The initial set."""
         space = self.task.training_space or self.task.space
         return self.workshop.render(
-            self.workshop.draw(space, self.key(keys.INITIAL), self.plan.initial)
+            self.workshop.draw(space, self.key(labelled.INITIAL), self.plan.initial)
         )
 
     @cached_property
     def test(self) -> Examples:
         """The uniform test."""
         return self.workshop.render(
-            self.workshop.draw(self.task.space, self.key(keys.TEST), self.plan.test)
+            self.workshop.draw(self.task.space, self.key(labelled.TEST), self.plan.test)
         )
 
     @cached_property
@@ -195,7 +187,7 @@ class Seed:
         known = self.study.weights.get((BASE, self.number))
         if known is not None:
             return known
-        weights = self.study.train(self.initial, None, self.plan.steps, self.key(keys.TRAINING))
+        weights = self.study.train(self.initial, None, self.plan.steps, self.key(labelled.TRAINING))
         one = self.initial.take(slice(0, 1))
         self.task.check_network(weights, one.inputs, one.labels)
         return weights
@@ -205,12 +197,10 @@ class Seed:
         """The error table: features, `rho`, `violated`, `status`."""
 
         def compute() -> Arrays:
-            problem = searched_problem(self.task, self.base, self.plan.search, self.workshop)
-            seed = int(jax.random.bits(self.key(keys.SEARCH)) >> 1)
-            run = falsify(
-                problem, self.plan.search, self.plan.budget,
-                seed=seed, confirm=False, progress=False,
-            )  # fmt: skip
+            search, workshop = self.plan.search, self.workshop
+            problem = labelled.searched_problem(self.task, self.base, search, workshop)
+            seed, budget = int(jax.random.bits(self.key(labelled.SEARCH)) >> 1), self.plan.budget
+            run = falsify(problem, search, budget, seed=seed, confirm=False, progress=False)
             end_if_interrupted(run.stopped)
             names = [*self.task.space.columns, "rho", "violated", "status"]
             return encode_frame(run.table.all.loc[:, names].reset_index(drop=True))
@@ -219,7 +209,7 @@ class Seed:
 
     def base_entry(self) -> "Finished":
         """Train and measure the base."""
-        numbers = self.study.measure(self.base, self.test, self.key(keys.MEASURES))
+        numbers = self.study.measure(self.base, self.test, self.key(labelled.MEASURES))
         addition = Addition(_no_rows(self.task))
         return self._finished(numbers, addition, np.zeros(0), self.base)
 
@@ -232,18 +222,18 @@ class Seed:
         base = Base(
             task=self.task, workshop=self.workshop, weights=self.base, initial=self.initial,
             table=self.table if arm in FROM_TABLE else nothing, added=self.plan.added,
-            key=self.key(keys.CHOICE),
+            key=self.key(labelled.CHOICE),
         )  # fmt: skip
         addition = ARMS[arm](base)
         examples = self.workshop.render(addition.rows)
         if addition.transformed:
-            examples = transformed(self.task, examples, base.key)
+            examples = labelled.transformed(self.task, examples, base.key)
         judged = self.workshop.judge(self.base, examples)
         union = self.initial.join(examples)
         weights = self.study.train(
-            union, self.base, self.plan.further_steps, self.key(keys.FURTHER)
+            union, self.base, self.plan.further_steps, self.key(labelled.FURTHER)
         )
-        numbers = self.study.measure(weights, self.test, self.key(keys.MEASURES))
+        numbers = self.study.measure(weights, self.test, self.key(labelled.MEASURES))
         addition = replace(addition, rows=examples.rows)
         return self._finished(numbers, addition, judged.wrongness, weights)
 
@@ -289,7 +279,7 @@ def _presence(judged: Judgement) -> dict[str, float]:
 def _hard_rows(seed: Seed, count: int) -> pd.DataFrame:
     """Draw features on which the base network of a seed errs, `count` at most."""
     workshop, task = seed.workshop, seed.task
-    parts, found, key = [_no_rows(task)], 0, seed.key(keys.TEST)
+    parts, found, key = [_no_rows(task)], 0, seed.key(labelled.TEST)
     for _ in range(_PER_HARD):
         key, now = jax.random.split(key)
         rows = workshop.draw(task.space, now, count)
@@ -304,7 +294,8 @@ def _hard_rows(seed: Seed, count: int) -> pd.DataFrame:
 _ORDER = "columns"
 """Array with the names of a table's columns, in their order."""
 _STRUCTURE = "structure"
-"""Array with the structure of weights, as JSON."""
+"""Array with the structure of weights, as a protocol buffer."""
+_ARRAYS = jax.Array | np.ndarray | np.generic
 
 
 def encode_frame(frame: pd.DataFrame) -> Arrays:
@@ -333,42 +324,19 @@ def decode_frame(arrays: Mapping[str, np.ndarray]) -> pd.DataFrame:
 
 def encode_weights(weights: Weights) -> Arrays | None:
     """Encode weights; None unless they are arrays in dictionaries, lists and tuples."""
-    leaves: list[np.ndarray] = []
-    try:
-        structure = json.dumps(_structure(weights, leaves))
-    except TypeError:
+    leaves, structure = jax.tree.flatten(weights)
+    arrays = [np.asarray(each) for each in leaves if isinstance(each, _ARRAYS)]
+    if len(arrays) < len(leaves) or any(array.dtype.kind not in "biuf" for array in arrays):
         return None
-    return {_STRUCTURE: np.array(structure), **{str(i): leaf for i, leaf in enumerate(leaves)}}
+    try:
+        stored = np.frombuffer(structure.serialize_using_proto(), np.uint8)
+    except ValueError:
+        return None
+    return {_STRUCTURE: stored, **{str(i): array for i, array in enumerate(arrays)}}
 
 
 def decode_weights(arrays: Mapping[str, np.ndarray]) -> Weights:
     """Decode weights; arrays become arrays of JAX."""
-    return _restored(json.loads(str(arrays[_STRUCTURE])), arrays)
-
-
-def _structure(tree: Any, leaves: list[np.ndarray]) -> Any:
-    if type(tree) is dict:
-        if not all(isinstance(name, str) for name in tree):
-            raise TypeError("names of weights must be texts")
-        return {"dict": {name: _structure(tree[name], leaves) for name in tree}}
-    if type(tree) in (list, tuple):
-        return {type(tree).__name__: [_structure(part, leaves) for part in tree]}
-    if tree is None:
-        return {"none": None}
-    if isinstance(tree, jax.Array | np.ndarray | np.generic):
-        leaf = np.asarray(tree)
-        if leaf.dtype.kind not in "biuf":
-            raise TypeError(f"weights of type {leaf.dtype}")
-        leaves.append(leaf)
-        return {"leaf": len(leaves) - 1}
-    raise TypeError(f"weights in a {type(tree).__name__}")
-
-
-def _restored(structure: Any, arrays: Mapping[str, np.ndarray]) -> Any:
-    ((kind, value),) = structure.items()
-    if kind == "dict":
-        return {name: _restored(part, arrays) for name, part in value.items()}
-    if kind in ("list", "tuple"):
-        parts = [_restored(part, arrays) for part in value]
-        return parts if kind == "list" else tuple(parts)
-    return None if kind == "none" else jax.numpy.asarray(arrays[str(value)])
+    structure = PyTreeDef.deserialize_using_proto(default_registry, arrays[_STRUCTURE].tobytes())
+    leaves = [jax.numpy.asarray(arrays[str(i)]) for i in range(structure.num_leaves)]
+    return jax.tree.unflatten(structure, leaves)

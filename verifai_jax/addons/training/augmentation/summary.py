@@ -1,58 +1,60 @@
 """The summary of an augmentation: helpful and useless arms, with confidence.
 
-rings: 10 arms, 5 seeds, 40 inputs added to 200, ...
-  base         errs on 11.8 % of new inputs
-  arm               error  against none (95 % t interval)
-  counterexamples   8.1 %  -3 points (-4.1 to -1.9)
+arm               error  against none (95 % t interval) counterexamples   8.1 %  -3 points (-4.1 to
+-1.9)
 """
 
 import math
+from typing import Any, TypeAlias
 
 import numpy as np
 import pandas as pd
 
-from verifai_jax.addons.training.augmentation.outcome import BASE, SHARES, TRAINED, Outcome
 from verifai_jax.addons.training.paired import PairedDifference
 from verifai_jax.core.messages.text import counted, format_percent, one_line
 
+Augmentation: TypeAlias = Any
+"""An `Augmentation`, whose file imports this one."""
+BASE = "base"
+"""Name of the base network among the arms of a table."""
+TRAINED, NOT_FINITE = "trained", "not finite"
+"""Status of a network."""
+SHARES = ("error", "precision", "recall", "hard_error")
+"""Metrics that are shares of a test."""
 REFERENCES = ("none", "random")
 """Arms that all others are compared with."""
 
 
-def summarize(outcome: Outcome) -> str:
+def summarize(result: Augmentation) -> str:
     """Write the summary of an augmentation; every number comes from its tables."""
-    table, options = outcome.table, outcome.options
+    table, options = result.table, result.options
     if not len(table):
-        return f"{outcome.name}: interrupted before a network was trained"
+        return f"{result.task.name}: interrupted before a network was trained"
     seeds = len(set(table["seed"]))
     lines = [
-        f"{outcome.name}: {counted(len(outcome.arms), 'arm')}, {counted(seeds, 'seed')}; "
+        f"{result.task.name}: {counted(len(result.arms), 'arm')}, {counted(seeds, 'seed')}; "
         f"{options['added']:,} inputs to be added to {options['initial']:,}, then "
         f"{options['further_steps']:,} further training steps in every arm"
     ]
-    if not outcome.complete:
+    if not result.complete:
         lines.append("  NOT FINISHED: interrupted; the finished networks are here")
-    lines += _base_lines(outcome)
-    lines += _table_lines(outcome)
-    lines += _fewer_lines(outcome)
-    lines += _not_finite_lines(outcome)
-    lines += [f"  {line}" for line in findings(outcome)]
+    lines += _base_lines(result)
+    lines += _table_lines(result)
+    lines += _fewer_lines(result)
+    lines += _not_finite_lines(result)
+    lines += [f"  {line}" for line in findings(result)]
     return "\n".join(lines)
 
 
-def findings(outcome: Outcome, metric: str = "error") -> list[str]:
+def findings(result: Augmentation, metric: str = "error") -> list[str]:
     """Write which arms lower a metric (lower is better), and which raise it.
 
     An arm counts as better or worse if its interval of paired differences excludes zero.
-
-    **Arguments:**
-    - `outcome`: the numbers.
-    - `metric`: name of the metric.
     """
-    references = [arm for arm in REFERENCES if arm in outcome.arms]
+    references = [arm for arm in REFERENCES if arm in result.arms]
     sentences = []
     for reference in references:
-        differences = _differences(outcome, metric, reference)
+        differences = _differences(result, metric, reference)
         known = {arm: d for arm, d in differences.items() if math.isfinite(d.low)}
         if not known:
             continue
@@ -70,20 +72,20 @@ def findings(outcome: Outcome, metric: str = "error") -> list[str]:
             sentences.append(f"Higher {label} than {reference}, beyond chance: {each}.")
     if not sentences and references:
         pairs = max(
-            (d.pairs for r in references for d in _differences(outcome, metric, r).values()),
+            (d.pairs for r in references for d in _differences(result, metric, r).values()),
             default=0,
         )
         if pairs == 1:
             sentences.append("One seed gives no interval: these differences may be chance.")
-    sentences += _gain(outcome, metric)
+    sentences += _gain(result, metric)
     return sentences
 
 
-def _gain(outcome: Outcome, metric: str) -> list[str]:
+def _gain(result: Augmentation, metric: str) -> list[str]:
     """Compare the gains of counterexamples and random inputs, if the former is significant."""
-    if not {"none", "random", "counterexamples"} <= {*outcome.arms}:
+    if not {"none", "random", "counterexamples"} <= {*result.arms}:
         return []
-    differences = _differences(outcome, metric, "none")
+    differences = _differences(result, metric, "none")
     found = [differences.get(arm) for arm in ("counterexamples", "random")]
     if any(d is None or not d.mean < 0 for d in found) or not (found[0] and found[0].negative):
         return []
@@ -94,22 +96,22 @@ def _gain(outcome: Outcome, metric: str) -> list[str]:
     ]
 
 
-def _base_lines(outcome: Outcome) -> list[str]:
-    table = outcome.table
+def _base_lines(result: Augmentation) -> list[str]:
+    table = result.table
     base = table.loc[(table["arm"] == BASE) & (table["status"] == TRAINED)]
     lines = []
     if len(base):
         error = base["error"].to_numpy(np.float64)
         spread = "" if len(error) == 1 else f" ({_span(error)} over seeds)"
         lines.append(f"  base         errs on {format_percent(error.mean())} of new inputs{spread}")
-    if outcome.error_tables:
-        rows = [len(t) for t in outcome.error_tables.values()]
-        wrong = [_counterexamples(t) for t in outcome.error_tables.values()]
+    if result.error_tables:
+        rows = [len(t) for t in result.error_tables.values()]
+        wrong = [_counterexamples(t) for t in result.error_tables.values()]
         low, high = min(wrong), max(wrong)
         count = f"{low:,}" if low == high else f"{low:,} to {high:,}"
         lines.append(
             f"  error table  {count} counterexample{'s' * (high != 1)} in {max(rows):,} inputs of "
-            f"{outcome.options['search']}"
+            f"{result.options['search']}"
         )
         if high == 0:
             lines.append(
@@ -117,7 +119,7 @@ def _base_lines(outcome: Outcome) -> list[str]:
                 "table add nothing"
             )
     if "hard_error" in table:
-        size = outcome.options["hard"]
+        size = result.options["hard"]
         text = f"{size:,} inputs on which an independent network errs"
         if not size:
             text = "no input was found on which an independent network errs"
@@ -125,19 +127,19 @@ def _base_lines(outcome: Outcome) -> list[str]:
     return lines
 
 
-def _table_lines(outcome: Outcome) -> list[str]:
+def _table_lines(result: Augmentation) -> list[str]:
     """Write the table of arms: means, and differences against none and random."""
-    means = outcome.means
-    references = [arm for arm in REFERENCES if arm in outcome.arms]
-    sure = f"{100 * outcome.confidence:zg} % t interval"
-    head = ["arm", "added", *(_label(m) for m in outcome.metrics)]
+    means = result.means
+    references = [arm for arm in REFERENCES if arm in result.arms]
+    sure = f"{100 * result.confidence:zg} % t interval"
+    head = ["arm", "added", *(_label(m) for m in result.metrics)]
     head += [f"error against {reference} ({sure})" for reference in references]
-    differences = {r: _differences(outcome, "error", r) for r in references}
+    differences = {r: _differences(result, "error", r) for r in references}
     rows = [head]
     for arm in means.index:
         mean = means.loc[arm]
         row = [str(arm), "-" if np.isnan(mean["added"]) else f"{mean['added']:z,.0f}"]
-        row += [_value(metric, float(mean[metric])) for metric in outcome.metrics]
+        row += [_value(metric, float(mean[metric])) for metric in result.metrics]
         row += [_difference(differences[r].get(str(arm))) for r in references]
         rows.append(row)
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
@@ -147,23 +149,23 @@ def _table_lines(outcome: Outcome) -> list[str]:
     ]
 
 
-def _fewer_lines(outcome: Outcome) -> list[str]:
+def _fewer_lines(result: Augmentation) -> list[str]:
     """Say which arms added fewer inputs than asked for, and why."""
     lines = []
-    for arm in outcome.arms:
-        rows = outcome.table.loc[(outcome.table["arm"] == arm) & (outcome.table["why"] != "")]
+    for arm in result.arms:
+        rows = result.table.loc[(result.table["arm"] == arm) & (result.table["why"] != "")]
         rows = rows.loc[rows["status"] == TRAINED]
         if len(rows):
             first = rows.iloc[0]
             lines.append(
-                f"  {arm} added fewer than {outcome.options['added']:,} in "
+                f"  {arm} added fewer than {result.options['added']:,} in "
                 f"{counted(len(rows), 'seed')}; seed {first['seed']}: {one_line(str(first['why']))}"
             )
     return lines
 
 
-def _not_finite_lines(outcome: Outcome) -> list[str]:
-    lost = outcome.table.loc[outcome.table["status"] != TRAINED]
+def _not_finite_lines(result: Augmentation) -> list[str]:
+    lost = result.table.loc[result.table["status"] != TRAINED]
     if not len(lost):
         return []
     counts = ", ".join(f"{n} of {arm}" for arm, n in lost["arm"].value_counts(sort=False).items())
@@ -173,8 +175,8 @@ def _not_finite_lines(outcome: Outcome) -> list[str]:
     ]
 
 
-def _differences(outcome: Outcome, metric: str, reference: str) -> dict[str, PairedDifference]:
-    return outcome.compare(metric, reference) if reference in outcome.rows else {}
+def _differences(result: Augmentation, metric: str, reference: str) -> dict[str, PairedDifference]:
+    return result.compare(metric, reference) if reference in {*result.table["arm"]} else {}
 
 
 def _difference(difference: PairedDifference | None) -> str:

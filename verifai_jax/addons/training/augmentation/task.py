@@ -130,9 +130,7 @@ class SupervisedTask:
             if not callable(function):
                 raise TaskError(f"{part} of task {name!r} must be a function; got {function!r}")
         if (present is None) != (detected is None):
-            given, missing = (
-                ("present", "detected") if detected is None else ("detected", "present")
-            )
+            given, missing = ("present", "detected")[:: 1 if detected is None else -1]
             raise TaskError(
                 f"task {name!r} has {given} and no {missing}; precision and recall need both"
             )
@@ -153,11 +151,8 @@ class SupervisedTask:
         **Arguments:**
         - `weights`: the weights of the network.
         """
-        if self.black_box:
-            system: Any = _HostNetwork(self, weights)
-        else:
-            system = _Network(self, weights)
-        return Problem(self.name, self.space, system, f"{MARGIN} >= 0")
+        kind = _HostNetwork if self.black_box else _Network
+        return Problem(self.name, self.space, kind(self, weights), f"{MARGIN} >= 0")
 
     @truncate_silently()
     def check(self) -> None:
@@ -217,16 +212,11 @@ class _Network(System):
     """A network as a system: renders, predicts, and shows the margin."""
 
     def __init__(self, task: SupervisedTask, weights: Weights) -> None:
-        self.task, self.weights = task, weights
-        self.lanes = task.lanes
-        self.dt = 1.0
-        self.exact_step = True
+        self.task, self.weights, self.lanes = task, weights, task.lanes
+        self.dt, self.exact_step = 1.0, True
 
     def __call__(self, features: Features, key: Any = None) -> Trace:
-        inputs = jax.tree.map(lambda leaf: jnp.asarray(leaf)[None], self.task.render(features))
-        prediction = jax.tree.map(lambda leaf: leaf[0], self.task.predict(self.weights, inputs))
-        wrongness = self.task.wrongness(prediction, self.task.label(features))
-        return Trace({MARGIN: -jnp.reshape(jnp.asarray(wrongness, float), 1)}, dt=1.0)
+        return _margin(jnp, self.task, self.weights, features)
 
 
 class _HostNetwork(System):
@@ -238,11 +228,15 @@ class _HostNetwork(System):
         self.task, self.weights = task, weights
 
     def __call__(self, features: Features, key: Any = None) -> Trace:
-        inputs = jax.tree.map(lambda leaf: np.asarray(leaf)[None], self.task.render(features))
-        predictions = self.task.predict(self.weights, inputs)
-        prediction = jax.tree.map(lambda leaf: np.asarray(leaf)[0], predictions)
-        wrongness = self.task.wrongness(prediction, self.task.label(features))
-        return Trace({MARGIN: -np.reshape(np.asarray(wrongness, np.float64), 1)}, dt=1.0)
+        return _margin(np, self.task, self.weights, features)
+
+
+def _margin(numpy: Any, task: SupervisedTask, weights: Weights, features: Features) -> Trace:
+    inputs = jax.tree.map(lambda leaf: numpy.asarray(leaf)[None], task.render(features))
+    predictions = task.predict(weights, inputs)
+    prediction = jax.tree.map(lambda leaf: numpy.asarray(leaf)[0], predictions)
+    wrongness = numpy.asarray(task.wrongness(prediction, task.label(features)), float)
+    return Trace({MARGIN: -numpy.reshape(wrongness, 1)}, dt=1.0)
 
 
 def _as_space(part: str, space: object) -> FeatureSpace:

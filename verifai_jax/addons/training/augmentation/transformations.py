@@ -38,10 +38,8 @@ def combine(*transformations: Transformation) -> Transformation:
 
 
 def flip(share: float = 0.5) -> Transformation:
-    """Return a transformation that mirrors images left to right.
+    """Return the transformation that mirrors this share of the images left to right.
 
-    **Arguments:**
-    - `share`: the share of images that are mirrored.
     **Raises:** `ValueError` for a share out of range.
     """
     check_fraction("share", share, zero=True, one=True)
@@ -55,12 +53,10 @@ def flip(share: float = 0.5) -> Transformation:
 
 
 def shift(pixels: int) -> Transformation:
-    """Return a transformation that shifts images, each by its own number of pixels.
+    """Return a transformation that shifts each image by its own number of `pixels` at most.
 
     Pixels that enter at an edge repeat the edge.
 
-    **Arguments:**
-    - `pixels`: maximum shift in each direction.
     **Raises:** `ValueError` unless it is a positive integer.
     """
     check_count("pixels", pixels)
@@ -84,8 +80,6 @@ def shift(pixels: int) -> Transformation:
 def brightness(max_change: float) -> Transformation:
     """Return a transformation that multiplies images by a factor of `1 +- max_change` at most.
 
-    **Arguments:**
-    - `max_change`: maximum change of brightness, as a share.
     **Raises:** `ValueError` for a share out of range.
     """
     return _scaled(max_change, jnp.zeros_like)
@@ -94,8 +88,6 @@ def brightness(max_change: float) -> Transformation:
 def contrast(max_change: float) -> Transformation:
     """Return a transformation that scales images around their mean by `1 +- max_change` at most.
 
-    **Arguments:**
-    - `max_change`: maximum change of contrast, as a share.
     **Raises:** `ValueError` for a share out of range.
     """
 

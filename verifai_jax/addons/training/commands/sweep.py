@@ -31,7 +31,7 @@ _MAX_ROWS = 12
 @command()
 @click.argument("target", required=False)
 @option("--configurations", type=int, help="Maximum configurations  [default: 32]")
-@option("--search", help="Name of the search, or optuna:tpe  [default: halton]")
+@option("--search", help="Name of the search, population, or optuna:tpe  [default: halton]")
 @arguments.SET
 @option("--seed", type=int, help="Seed of the search and the samples  [default: 0]")
 @option("--samples", type=int, help="Minimum number of samples of each policy  [default: 512]")
@@ -39,20 +39,12 @@ _MAX_ROWS = 12
 @option("--budget", type=int, help="Simulations of the certification in all.")
 @option("--attack", help="Search that attacks each policy  [default: cross_entropy]")
 @option("--attack-simulations", type=int, help="Simulations of each attack  [default: 256]")
-@option(
-    "--halving",
-    "reduction",
-    type=float,
-    help="The share of configurations that continue is one in this many.",
-)
+@option("--halving", "reduction", type=float,
+        help="The share of configurations that continue is one in this many.")  # fmt: skip
 @option("--halving-by", "by", help="Criterion: return or safety  [default: return]")
 @option("--only", metavar="NAMES", help="Hyper-parameters to vary, comma-separated.")
-@option(
-    "--nominal",
-    multiple=True,
-    metavar="NAME=VALUE",
-    help="Value of a hyper-parameter that --only fixes.",
-)
+@option("--nominal", multiple=True, metavar="NAME=VALUE",
+        help="Value of a hyper-parameter that --only fixes.")  # fmt: skip
 @arguments.MAX_SECONDS
 @option("--cache", type=PATH, help="Folder of finished work  [default: the sweep's folder]")
 @option("--resume", type=PATH, help="Folder of a sweep to resume.")
@@ -77,9 +69,8 @@ def sweep(
         arguments.refuse_others(_RESUMES, "is fixed in the sweep that --resume goes on with")
         folder, cache = resume, resume if cache is None else cache
         before = _read_command(cache)
-        target = target or target_of_project(
-            before["target"], resume, kind="study", remedy="specs/FILE.py:NAME --resume ..."
-        )
+        how = {"kind": "study", "remedy": "specs/FILE.py:NAME --resume ..."}
+        target = target or target_of_project(before["target"], resume, **how)
         given, configurations = before["given"], configurations or before["configurations"]
         options, nominal = tuple(before["options"]), tuple(before["nominal"])
     if target is None:
@@ -87,10 +78,8 @@ def sweep(
     configurations = 32 if configurations is None else configurations
     study = load_target(target, Study)
     if given["only"] is not None:
-        study = study.only(
-            *arguments.split_names(given["only"]),
-            nominal=arguments.plain_values("--nominal", nominal),
-        )
+        only, others = given["only"], arguments.plain_values("--nominal", nominal)
+        study = study.only(*arguments.split_names(only), nominal=others)
     # Read by a later --resume.
     note = {
         "target": target, "configurations": configurations, "given": given,
@@ -148,7 +137,8 @@ def _resuming(
 
 def _keywords(given: Mapping[str, Any], options: tuple[str, ...]) -> dict[str, Any]:
     """Turn options of the command into keyword arguments of `sweep`."""
-    from verifai_jax import Certification, Halving
+    from verifai_jax import Certification, Halving, Population
+    from verifai_jax.core.messages.errors import check_names
     from verifai_jax.search import named
 
     names = ("samples", "confidence", "budget", "attack", "attack_simulations")
@@ -161,6 +151,9 @@ def _keywords(given: Mapping[str, Any], options: tuple[str, ...]) -> dict[str, A
         from verifai_jax import OptunaSampler
 
         keywords["search"] = OptunaSampler(search.removeprefix("optuna:"), values)
+    elif search == "population":
+        check_names("option of a population", values, vars(Population()))
+        keywords["search"] = Population(**values)
     else:
         keywords["search"] = named(search, **values)
     if given["reduction"] is not None:
@@ -182,11 +175,8 @@ def _read_command(folder: Path) -> dict[str, Any]:
             f"the sweep in {folder} was begun in Python, or its command is damaged: call "
             f"vj.sweep(study, ..., folder={str(folder)!r}) again"
         )
-    if (
-        not isinstance(note, dict)
-        or not {*_NOTED} <= note.keys()
-        or not isinstance(note["given"], dict)
-    ):
+    known = isinstance(note, dict) and {*_NOTED} <= note.keys()
+    if not known or not isinstance(note["given"], dict):
         raise CacheError(f"the sweep in {folder} is damaged in its note 'command'")
     return note
 

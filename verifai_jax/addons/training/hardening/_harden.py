@@ -11,7 +11,7 @@ randomization for transferring deep neural networks, IROS 2017 (the baseline).
 
 import inspect
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -25,18 +25,13 @@ from verifai_jax.addons.estimation.certification import Certificates, Certificat
 from verifai_jax.addons.estimation.comparison import Comparison, compare
 from verifai_jax.addons.estimation.simultaneous_interval import safe_at
 from verifai_jax.addons.rl import PPO, evaluate
-from verifai_jax.addons.training.hardening.arms import FunctionArms, TaskArms
+from verifai_jax.addons.training.hardening import mixture
+from verifai_jax.addons.training.hardening.arms import Arms
 from verifai_jax.addons.training.hardening.collecting import Collected, collect
-from verifai_jax.addons.training.hardening.further import FurtherTraining
-from verifai_jax.addons.training.hardening.mixture import (
-    CAPACITY,
-    HardeningError,
-    Mixture,
-    Start,
-    mixture_of,
-)
+from verifai_jax.addons.training.hardening.mixture import FurtherTraining, HardeningError, Mixture
 from verifai_jax.addons.training.hardening.result import BASELINE, HARDENED, Hardening
 from verifai_jax.addons.training.sweeps.fingerprint import fingerprint
+from verifai_jax.addons.training.sweeps.rows import columns_of
 from verifai_jax.addons.training.sweeps.study import Study
 from verifai_jax.addons.training.sweeps.trainer import FunctionTrainer, Trainer
 from verifai_jax.core.compute.fingerprint import stable_text
@@ -53,9 +48,6 @@ from verifai_jax.statistics.stopping import Stop
 
 ROUND, FINAL, COMPARED, ATTACK, RETURNS = range(5)
 """Numbers of the purposes for which random numbers are drawn."""
-CERTIFIED = ("failures", "simulations", "failure_rate", "failure_low", "failure_high", "verdict",
-             "attack_failures", "cost")  # fmt: skip
-"""Columns of the table that come from a certificate."""
 OWN_STEP, OWN_LIMIT = 0.25, 0.75
 """Step and limit by which the share of own episodes grows after a round that loses return."""
 TABLE, SHRUNK = 512, 4
@@ -83,11 +75,9 @@ class Plan:
     def options(self) -> dict[str, Any]:
         """Return all options by name, as plain data."""
         further, certified = dict(vars(self.further)), dict(vars(self.certification))
+        certified["attack"] = stable_text(certified["attack"])
         named = {"further_steps": further.pop("steps"), **further, **certified, **vars(self)}
-        named["attack"] = stable_text(certified["attack"])
-        return {
-            n: one for n, one in named.items() if n not in ("further", "certification", "start")
-        }
+        return {n: o for n, o in named.items() if n not in ("further", "certification", "start")}
 
     def seed_for(self, purpose: int, stage: int = 0) -> int:
         """Return the seed for a purpose; different purposes get different samples."""
@@ -159,7 +149,7 @@ def harden(
         options = {name: stable_text(each) for name, each in plan.options().items()}
         options["hyperparameters"] = stable_text(sorted(values.items()))
         cache.claim(fingerprint(made, options), untrained.sources(), even_if_changed)
-        result = Work(made, plan, values, untrained, how.start, cache).run(max_seconds)
+        result = Work(made, plan, values, untrained, cache).run(max_seconds)
     if folder is not None:
         with cache.writing(folder):
             result.save(folder)
@@ -174,27 +164,22 @@ class Work:
     plan: Plan
     values: Mapping[str, object]
     untrained: Problem
-    start: Start | None
     cache: Cache
 
     def __post_init__(self) -> None:
         study, plan, untrained = self.study, self.plan, self.untrained
         self.arms_named = (HARDENED, BASELINE) if plan.baseline else (HARDENED,)
-        stages = [
-            plan.steps + stage * (plan.further.steps or 0) for stage in range(plan.rounds + 1)
-        ]
-        trainer, space = study.trainer, untrained.space
-        self.task, self.stages = trainer.nominal, stages
-        known = study, self.values, stages, plan.seed, self.cache, self.arms_named
-        self.arms: TaskArms | FunctionArms
-        if isinstance(trainer, FunctionTrainer):
-            self.arms = FunctionArms(*known)
-        else:
+        each, rounds = plan.further.steps or 0, range(plan.rounds + 1)
+        self.stages = [plan.steps + stage * each for stage in rounds]
+        trainer, space, mixed = study.trainer, untrained.space, None
+        self.task = trainer.nominal
+        if not isinstance(trainer, FunctionTrainer):
             configured = trainer.configuration(self.values, plan.seed)
+            configured.check()
             self.task = configured.task if trainer.nominal is None else trainer.nominal
-            self.arms = TaskArms(
-                *known, configured, mixture_of(configured.task, untrained, self.start)
-            )
+            mixed = mixture.mixture_of(configured.task, untrained, plan.further.start)
+        known = study, self.values, self.stages, plan.seed, self.cache, self.arms_named
+        self.arms = Arms(*known, mixed)
         self.points, self.radii = np.zeros((0, space.dim), np.float32), np.zeros(0)
         self.own = dict.fromkeys(self.arms_named, plan.further.own)
         self.rows: list[dict[str, Any]] = []
@@ -223,21 +208,26 @@ class Work:
         """Train up to a stage, attack and certify, and measure returns."""
         plan, began = self.plan, time.perf_counter()
         policies = self.arms.policies(stage)
-        certificates = certify(
-            self.study.problem, policies, p=plan.p, certification=plan.certification,
-            seed=plan.seed_for(ROUND, stage), tie=plan.p, progress=False,
-            remember=self.cache.remember,
-        )  # fmt: skip
-        end_if_interrupted(certificates.stopped)
-        records = certificates.table.to_dict("records")
+        certificates = self._certify(policies, plan.certification, plan.seed_for(ROUND, stage))
         for number, (arm, policy) in enumerate(zip(self.arms_named, policies, strict=True)):
             self.policies[arm, stage] = policy
             self.returns[arm, stage] = self._returns(number, stage, policy)
-            one = {name: records[number][name] for name in CERTIFIED}
-            one["failures"] += records[number]["not_finite"]
-            mean = float(self.returns[arm, stage].mean())
-            row = {"round": stage, "arm": arm, "steps": self.stages[stage], **one, "return": mean}
-            self.rows.append({**row, "added": 0, "seconds": time.perf_counter() - began})
+            one, certificate = columns_of(certificates[number]), certificates[number]
+            del one["worst_robustness"]
+            row = {"round": stage, "arm": arm, "steps": self.stages[stage], **one}
+            row |= {"attack_failures": certificate.attack_failures, "cost": certificate.cost}
+            row |= {"return": float(self.returns[arm, stage].mean()), "added": 0}
+            self.rows.append({**row, "seconds": time.perf_counter() - began})
+        return certificates
+
+    def _certify(
+        self, policies: Sequence[Any], certification: Certification, seed: int
+    ) -> Certificates:
+        certificates = certify(
+            self.study.problem, policies, p=self.plan.p, certification=certification, seed=seed,
+            tie=self.plan.p, progress=False, remember=self.cache.remember,
+        )  # fmt: skip
+        end_if_interrupted(certificates.stopped)
         return certificates
 
     def _collect(self, stage: int, certificates: Certificates) -> None:
@@ -256,7 +246,7 @@ class Work:
         known: dict[str, Any] = self.cache.remember(f"collected/{stage}", compute)
         found = Collected(**known)
         self.points, self.radii = (
-            np.concatenate([one[found.kept], new])[-CAPACITY:]
+            np.concatenate([one[found.kept], new])[-mixture.CAPACITY :]
             for one, new in ((self.points, found.points), (self.radii, found.radii))
         )
         row = self.rows[-len(self.arms_named)]
@@ -277,8 +267,7 @@ class Work:
 
     def _returns(self, number: int, stage: int, policy: Any) -> np.ndarray:
         if self.task is None:
-            assert isinstance(self.arms, FunctionArms)
-            return np.array([self.arms.checkpoint(number, stage).training_return])
+            return np.array([self.arms.training_return(number, stage)])
         seed, episodes = self.plan.seed_for(RETURNS), self.plan.episodes
         return np.asarray(evaluate(self.task, policy, seed=seed, episodes=episodes), np.float64)
 
@@ -314,14 +303,8 @@ class Work:
                 chosen[HARDENED] = 0
         start = self.policies[HARDENED, 0]
         finalists = [start, *(self.policies[arm, at] for arm, at in chosen.items())]
-        final = certify(
-            self.study.problem, finalists, p=plan.p,
-            certification=replace(
-                sampled, samples=4 * sampled.samples, budget=None, attack_simulations=0
-            ),
-            seed=plan.seed_for(FINAL), tie=plan.p, progress=False, remember=self.cache.remember,
-        )  # fmt: skip
-        end_if_interrupted(final.stopped)
+        more = {"samples": 4 * sampled.samples, "budget": None, "attack_simulations": 0}
+        final = self._certify(finalists, replace(sampled, **more), plan.seed_for(FINAL))
         returns = {arm: self.returns[arm, at] for arm, at in chosen.items()}
         return Hardening(
             problem=self.untrained.name, table=pd.DataFrame(self.rows),
@@ -329,8 +312,7 @@ class Work:
             start=start, policy=finalists[1], policies=self.policies, chosen=chosen,
             certificates=final, comparison=comparison,
             returns={"start": self.returns[HARDENED, 0], **returns},
-            stopped=stopped, seconds=time.perf_counter() - began,
-            options=plan.options(),
+            stopped=stopped, seconds=time.perf_counter() - began, options=plan.options(),
             notes=tuple(notes), version=__version__,
         )  # fmt: skip
 

@@ -1,9 +1,5 @@
 """Failures of a stage's policy, as points for the next training to concentrate on.
 
-    found = collect(problem, failing, earlier, seed=3, added=64, table=512, shrunk=4)
-    found.points, found.sources                 # [n, d], and for each where it comes from
-    found.kept                                  # which earlier points stay
-
 Failures of the certificate and of its attack, earlier points and samples of the prior are simulated
 together. This table yields rules, and some of its failures are shrunk. Failing samples come first,
 because they represent typical failures. The attack finds the worst failures, which no policy may be
@@ -34,14 +30,10 @@ PRIOR = 4096
 
 
 class Collected(NamedTuple):
-    """Points of the unit cube to train around.
-
-    - `points`: `[n, d]`, the new points.
-    - `radii`: `[n]`, the radii of their neighbourhoods.
-    - `sources`: the origin of each point: `"sample"`, `"counterexample"`, `"shrunk"` or `"rule"`.
-    - `kept`: indices of the earlier points to keep: all that still fail, and an equal number of
-      others.
-    - `simulations`: number of simulations used to confirm and shrink.
+    """Points of the unit cube to train around: new `points` `[n, d]`, the `radii` of their
+    neighbourhoods, and their `sources` (`"sample"`, `"counterexample"`, `"shrunk"` or `"rule"`);
+    which of the earlier points to keep, all that still fail and an equal number of others; the
+    number of simulations.
     """
 
     points: Float[np.ndarray, "n d"]
@@ -55,12 +47,9 @@ def collect(
     problem: Problem, failing: pd.DataFrame, earlier: Float[np.ndarray, "m d"], *, seed: int,
     added: int, table: int, shrunk: int,
 ) -> Collected:  # fmt: skip
-    """Confirm failures and convert them to points to train around.
+    """Confirm failures, the worst first, and convert them to points to train around.
 
-    **Arguments:**
-    - `problem`: the problem of the policy.
-    - `failing`: failing rows, the worst first; `earlier`: points of earlier rounds.
-    - `seed`, `table`: the seed, and the number of samples from the prior.
+    - `earlier`: points of earlier rounds; `table`: the number of samples from the prior.
     - `added`: the maximum number of points.
     - `shrunk`: number of counterexamples to shrink, if the problem has nominal features.
     """

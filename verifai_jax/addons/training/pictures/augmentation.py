@@ -6,8 +6,8 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from verifai_jax.addons.training.augmentation.examples import Examples
-from verifai_jax.addons.training.augmentation.outcome import SHARES
 from verifai_jax.addons.training.augmentation.result import Augmentation
+from verifai_jax.addons.training.augmentation.summary import SHARES
 from verifai_jax.core.display.figure import Figure
 from verifai_jax.core.messages.checks import check_count
 from verifai_jax.pictures.style import BOUND, FAILING, SAFE, new_figure, show_or_save, tidy
@@ -17,12 +17,7 @@ def plot_arms(
     result: Augmentation, path: str | Path | None = None, metric: str = "error",
     reference: str = "none",
 ) -> Figure:  # fmt: skip
-    """Draw a metric of each arm and seed, and the paired difference of each arm and the reference.
-
-    **Arguments:**
-    - `metric`, `reference`: as in `Augmentation.compare`.
-    **Raises:** the errors of `Augmentation.compare`.
-    """
+    """Draw a metric of each arm and seed, and the paired differences; see `Augmentation.plot`."""
     differences = result.compare(metric, reference)
     arms = [str(arm) for arm in result.table["arm"].unique()]
     figure = new_figure(figsize=(9.0, 1.2 + 0.34 * len(arms)))
@@ -60,13 +55,7 @@ def plot_montage(
     result: Augmentation, path: str | Path | None = None, arm: str = "counterexamples",
     seed: int = 0, count: int = 24,
 ) -> Figure:  # fmt: skip
-    """Draw images that an arm added.
-
-    **Arguments:**
-    - `arm`, `seed`: the arm, and the seed of its training.
-    - `count`: maximum number of images.
-    **Raises:** `ValueError` for inputs that are not images, or an arm that added nothing.
-    """
+    """Draw images that an arm added; see `Augmentation.montage`."""
     check_count("count", count)
     examples = result.examples(arm, seed)
     if not len(examples):

@@ -10,6 +10,7 @@ from verifai_jax.addons.training.sweeps.exported import TrainedConfiguration as 
 from verifai_jax.addons.training.sweeps.exported import load_configuration as load_configuration
 from verifai_jax.addons.training.sweeps.halving import Halving as Halving
 from verifai_jax.addons.training.sweeps.optuna import OptunaSampler as OptunaSampler
+from verifai_jax.addons.training.sweeps.population import Population as Population
 from verifai_jax.addons.training.sweeps.record import SweepRecord as SweepRecord
 from verifai_jax.addons.training.sweeps.result import Sweep as Sweep
 from verifai_jax.addons.training.sweeps.result import load_sweep as load_sweep

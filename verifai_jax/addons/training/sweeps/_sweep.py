@@ -20,11 +20,12 @@ from verifai_jax.addons.training.sweeps.clock import Clock
 from verifai_jax.addons.training.sweeps.fingerprint import fingerprint
 from verifai_jax.addons.training.sweeps.halving import Halving
 from verifai_jax.addons.training.sweeps.optuna import OptunaSampler
+from verifai_jax.addons.training.sweeps.population import Population
 from verifai_jax.addons.training.sweeps.proposers import make_proposer
 from verifai_jax.addons.training.sweeps.result import Sweep
 from verifai_jax.addons.training.sweeps.running import RunningSweep
 from verifai_jax.addons.training.sweeps.study import Study, StudyError
-from verifai_jax.addons.training.sweeps.trainer import STEPS
+from verifai_jax.addons.training.sweeps.trainer import STEPS, FunctionTrainer
 from verifai_jax.core.messages.checks import check_count, options_of
 from verifai_jax.core.messages.errors import suggests_options
 from verifai_jax.core.store.cache import locked_cache
@@ -36,7 +37,8 @@ from verifai_jax.statistics.stopping import Stop
 
 @suggests_options
 def sweep(
-    study: Study, search: str | Search | OptunaSampler = "halton", configurations: int = 32, *,
+    study: Study, search: str | Search | OptunaSampler | Population = "halton",
+    configurations: int = 32, *,
     seed: int = 0, certification: Certification | None = None, halving: Halving | None = None,
     batch: int | None = None, episodes: int = EPISODES, stop: Stop | None = None,
     folder: str | Path | None = None, run_on: RunOn | None = None,
@@ -52,9 +54,10 @@ def sweep(
     - `study`: hyper-parameters, trainer and specification.
     - `search`: the search over the hyper-parameters: a name, a `Search`, `"optuna:tpe"`, or an
       `OptunaSampler`. A search that learns proposes in rounds and minimises the failure rate, then
-      the worst robustness, then the return.
-    - `configurations`: maximum number of configurations; each is trained with each of the study's
-      seeds.
+      the worst robustness, then the return. Or a `Population`, whose members change their
+      hyper-parameters while they train.
+    - `configurations`: maximum number of configurations, or of a population's members; each is
+      trained with each of the study's seeds.
     - `seed`: the seed of the search and of the samples; training seeds belong to the study.
     - `certification`: the attack on each policy and the samples of its certificate.
     - `halving`: how to stop all but the best configurations at each checkpoint.
@@ -84,6 +87,11 @@ def sweep(
     called = check_callbacks(callbacks)
     study.check()
     check_attack(study.untrained_problem(), certified.attack)
+    population = search if isinstance(search, Population) else None
+    if population is not None:
+        _check_population(study, halving, batch)
+        certified.check_budget(count_policies(study, configurations, None))
+        search, batch = population.search, configurations
     proposer = make_proposer(
         search, study.space, configurations=configurations, seed=seed, batch=batch
     )
@@ -95,7 +103,9 @@ def sweep(
         "attack_simulations": certified.attack_simulations,
         "halving": None if halving is None else _given(halving), "episodes": episodes,
     }  # fmt: skip
-    if proposer.learns:
+    if population is not None:
+        options["population"] = {**asdict(population), "search": proposer.to_json()}
+    if proposer.learns or population is not None:
         # Its proposals depend on both.
         options |= {"configurations": configurations, "batch": proposer.batch}
     with locked_cache(folder) as cache, Clock(study.name, seconds, progress) as clock:
@@ -106,7 +116,7 @@ def sweep(
         options["curve"] = None if study.curve_formula is None else str(study.curve_formula)
         running = RunningSweep(
             study, options, cache, clock, halving, certified, called, executor=executor,
-            sources=sources,
+            sources=sources, population=population,
         )  # fmt: skip
         return Sweep(running.run(proposer), study, reuse=cache.reuse())
 
@@ -158,14 +168,31 @@ def count_policies(study: Study, configurations: int, halving: Halving | None) -
 def _check_halving(study: Study, halving: object) -> Halving:
     if not isinstance(halving, Halving):
         raise TypeError(f"halving must be a Halving; got {halving!r}")
+    _check_checkpoints(study, "halving")
+    return halving
+
+
+def _check_checkpoints(study: Study, what: str) -> None:
     if STEPS in study.space.domains:
         raise StudyError(
-            "halving compares trainings of one length at their checkpoints; "
+            f"{what} compares trainings of one length at their checkpoints; "
             "take steps out of the space"
         )
     if not [at for at in study.checkpoints if at < study.trainer.steps]:
         raise StudyError(
-            "halving stops trainings at checkpoints; the study has none before the end at "
+            f"{what} stops trainings at checkpoints; the study has none before the end at "
             f"{study.trainer.steps} steps"
         )
-    return halving
+
+
+def _check_population(study: Study, halving: Halving | None, batch: int | None) -> None:
+    _check_checkpoints(study, "a population")
+    if isinstance(study.trainer, FunctionTrainer):
+        raise StudyError(
+            "a population goes on with other hyper-parameters, for which it needs a task and an "
+            f"algorithm; {study.trainer.name} is a training function"
+        )
+    if halving is not None and halving.reduction > 1:
+        raise ValueError(f"a population keeps its size: give reduction=1; got {halving.reduction}")
+    if batch is not None:
+        raise ValueError(f"a population is one round of all configurations; got batch={batch}")

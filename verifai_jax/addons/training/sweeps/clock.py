@@ -1,9 +1,7 @@
 """The clock of a sweep: seconds of each stage, the time limit, and a progress bar.
 
 with Clock("mine", max_seconds=600, show=None) as clock, clock.stage(TRAINING, 10, "steps"):
-    clock.advance(1)
     clock.check()                                   # raises OutOfTime
-clock.seconds["training"]
 """
 
 import contextlib
@@ -23,15 +21,11 @@ class OutOfTime(Exception):
 
 
 class Clock:
-    """Times the stages of a sweep, as a context manager.
+    """Times the stages of a sweep, as a context manager, and draws a bar (None: on a terminal).
 
     `seconds` are the seconds spent in each stage; compilation is not counted in training. `limit`
-    is the instant of `time.monotonic` at which the present stage is out of time.
-
-    **Arguments:**
-    - `name`: the name of the sweep, shown before the progress bar.
-    - `max_seconds`: time limit, after which `check` raises `OutOfTime`; None for no limit.
-    - `show`: whether to draw a bar; None draws one on a terminal and in a notebook.
+    is the instant of `time.monotonic` at which the present stage is out of time: `max_seconds`
+    after the beginning, or a share of them.
     """
 
     def __init__(self, name: str, max_seconds: float | None, show: bool | None) -> None:
@@ -50,11 +44,8 @@ class Clock:
 
     @contextlib.contextmanager
     def stage(self, name: str, total: float, unit: str, share: float = 1.0) -> Iterator[None]:
-        """Time the statements inside as a stage.
+        """Time the statements inside as a stage of so many units of work.
 
-        **Arguments:**
-        - `name`: the name of the stage.
-        - `total`: number of units of work in it, and `unit`, their name.
         - `share`: the share of `max_seconds` after which the stage is out of time.
         """
         began, compiling = time.monotonic(), self.seconds[COMPILING]

@@ -1,10 +1,7 @@
 """Formulas over training itself: the learning curve is a trace whose time is environment steps.
 
-    trace = curve_trace(steps, mean_return)             # signal `return`
-    formula = "eventually[0, 200000] (return >= 90 & always return >= 50)"
-    curve_robustness(formula, steps, mean_return)
-
-Bounds of the formula are environment steps from the beginning of the training.
+formula = "eventually[0, 200000] (return >= 90 & always return >= 50)"
+curve_robustness(formula, steps, mean_return)
 """
 
 from dataclasses import replace
@@ -44,15 +41,11 @@ def check_curve(formula: Formula | str) -> Formula:
 def curve_trace(
     steps: Int[np.ndarray, " updates"], mean_return: Float[np.ndarray, " updates"]
 ) -> Trace:
-    """Make a trace of a learning curve, with the signal `return`, from step 0 on.
+    """Make a trace of a learning curve, with the signal `return` over environment steps from 0 on.
 
-    An update in which no episode ended keeps the previous value. Before the first episode ends, its
-    value is used, since that episode began with the training.
+    An update in which no episode ended, of which the return is NaN, keeps the previous value.
+    Before the first episode ends, its value is used, since that episode began with the training.
 
-    **Arguments:**
-    - `steps`: environment steps taken by the end of each update.
-    - `mean_return`: the mean return of the episodes that ended in each update; NaN if none did.
-    **Returns:** the trace, whose time is environment steps.
     **Raises:** `ValueError` if no episode ended at all, or for steps that do not increase.
     """
     steps, known = np.asarray(steps, np.float64), np.asarray(mean_return, np.float64)

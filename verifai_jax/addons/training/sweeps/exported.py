@@ -1,9 +1,7 @@
 """A configuration of a sweep with its policy, in a folder that other programs can read.
 
-sweep.export("best")                            # best/configuration.json, best/policy.onnx
-best = load_configuration("best")
-best.hyperparameters, best.policy.act(observation), best.certificate["verdict"]
-best.train(study)                               # trained again, to the same bits
+best = load_configuration(sweep.export("best"))     # best/configuration.json, best/policy.onnx
+best.train(study)                                   # trained again, to the same bits
 """
 
 import logging
@@ -40,6 +38,8 @@ class TrainedConfiguration:
     - `seed`, `steps`: the training seed, and the environment steps of the policy.
     - `certificate`: `verdict`, `failures`, `simulations`, the ends of the interval, and the nominal
       return.
+    - `before`: for one of a population the earlier `[steps, hyperparameters]`: what it was trained
+      with, up to so many steps.
     - `weights`: the checksum of the policy's numbers.
     - `version`, `processor`: what determines the last digits of a training.
     - `policy`: the policy.
@@ -54,6 +54,7 @@ class TrainedConfiguration:
     version: str
     processor: str
     policy: TrainedPolicy = field(repr=False)
+    before: list[Any] = field(default_factory=list)
 
     def export(self, folder: str | Path) -> Path:
         """Write the configuration as JSON and its policy as ONNX; return the folder.
@@ -79,10 +80,14 @@ class TrainedConfiguration:
         if study.name != self.study:
             raise StudyError(f"the configuration is of {self.study!r}; got study {study.name!r}")
         runs = runs_of(study, Cache(), Clock(study.name, None, False))
-        number = runs.add(self.hyperparameters, self.seed)
+        lineage = [*(values for _, values in self.before), self.hyperparameters]
+        number = runs.add(lineage[0], self.seed)
         checkpoints = runs.runs[number].checkpoints
-        if self.steps not in checkpoints:
-            raise StudyError(f"its policy is that of {self.steps} steps; got {checkpoints}")
+        for at in (*(at for at, _ in self.before), self.steps):
+            if at not in checkpoints:
+                raise StudyError(f"its policy is that of {at} steps; got {checkpoints}")
+        for (at, _), values in zip(self.before, lineage[1:], strict=True):
+            number = runs.fork(number, checkpoints.index(at), values)
         runs.train([number], checkpoints.index(self.steps))
         trained = runs.checkpoint(number, checkpoints.index(self.steps))
         if trained is None:

@@ -1,8 +1,7 @@
 """Exact shares of a forest's variance that each input explains.
 
-A tree is constant on boxes, so integrals over the unit cube are sums over pairs of boxes: no
-samples are drawn. Source: Hutter, Hoos and Leyton-Brown, An efficient approach for assessing
-hyperparameter importance, ICML 2014, section 3 (fANOVA).
+A tree is constant on boxes, so integrals over the unit cube are sums over pairs of boxes. Source:
+Hutter, Hoos and Leyton-Brown, An efficient approach for assessing hyperparameter importance (2014).
 """
 
 from collections.abc import Sequence
@@ -18,11 +17,7 @@ _MAX_ENTRIES = 2**22
 
 
 class Boxes(NamedTuple):
-    """A function on the unit cube: a sum of functions that are constant on a box and 0 elsewhere.
-
-    - `low`, `high`: corners of the boxes.
-    - `value`: constants on them.
-    """
+    """A function on the unit cube: a sum of functions that are constant on a box, 0 elsewhere."""
 
     low: Float[np.ndarray, "m d"]
     high: Float[np.ndarray, "m d"]
@@ -30,11 +25,9 @@ class Boxes(NamedTuple):
 
 
 class Shares(NamedTuple):
-    """Shares of a function's variance; NaN for a constant function.
-
-    - `first`: for each input, the share that vanishes when the input is known.
-    - `total`: for each input, the share that remains when all other inputs are known.
-    - `variance`: the variance of the function.
+    """Shares of a function's variance, NaN for a constant one: for each input the share that
+    vanishes when it is known (`first`), and that remains when all others are (`total`); the
+    variance itself.
     """
 
     first: Float[np.ndarray, " d"]
@@ -45,10 +38,8 @@ class Shares(NamedTuple):
 def leaf_boxes(
     forest: "ExtraTreesRegressor", edges: Sequence[Float[np.ndarray, " _"] | None]
 ) -> Boxes:
-    """Return the leaves of a forest of regression trees over the unit cube.
+    """Return the leaves of a fitted forest of scikit-learn over the unit cube.
 
-    **Arguments:**
-    - `forest`: a fitted forest of scikit-learn.
     - `edges`: borders of the cells of each input, to which thresholds are rounded; None for a
       continuous input.
     """

@@ -17,17 +17,13 @@ from verifai_jax.features import FeatureSpace
 
 
 def fingerprint(study: Study, options: Mapping[str, Any]) -> dict[str, Any]:
-    """Describe everything that determines the table of a sweep, as far as data can.
+    """Describe everything that determines the table of a sweep, as far as plain data can.
 
     Code is described by its name only.
-
-    **Arguments:**
-    - `options`: options of the sweep, as plain data.
-    **Returns:** nested dictionaries of plain data.
     """
     problem = study.untrained_problem()
     return {
-        "study": study.name, "space": _features(study.space),
+        "study": study.name, "space": describe_space(study.space),
         "constrained": study.space.where is not None, "task": describe(study.trainer.task),
         "nominal": describe(study.trainer.evaluation_task),
         "algorithms": {
@@ -37,7 +33,7 @@ def fingerprint(study: Study, options: Mapping[str, Any]) -> dict[str, Any]:
         "seeds": list(study.training_seeds), "p": study.p,
         "curve": None if study.curve_formula is None else str(study.curve_formula),
         "problem": {
-            "name": problem.name, "features": _features(problem.space),
+            "name": problem.name, "features": describe_space(problem.space),
             "formulas": {name: str(formula) for name, formula in problem.formulas.items()},
         },
         "options": dict(options), "version": __version__,
@@ -49,7 +45,8 @@ def digest(value: Mapping[str, Any]) -> str:
     return hashlib.sha256(json.dumps(value, sort_keys=True, default=repr).encode()).hexdigest()[:20]
 
 
-def _features(space: FeatureSpace) -> dict[str, str]:
+def describe_space(space: FeatureSpace) -> dict[str, str]:
+    """Describe a space by its domains."""
     return {name: stable_text(domain) for name, domain in space.domains.items()}
 
 

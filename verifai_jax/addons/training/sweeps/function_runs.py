@@ -1,8 +1,5 @@
 """Trainings by a user's function, each call in one of the processes of a pool.
 
-    runs = FunctionRuns(study, cache, clock)
-    runs.train([runs.add(values, seed=0)], rung=0)
-
 Global random numbers are seeded before each call, so a policy depends only on the arguments of the
 call, unless the function keeps something else for the next. A call that hangs, crashes or exits is
 a row, as a simulation is. A function with an argument `resume` gets a folder with a copy of the
@@ -68,8 +65,6 @@ class FunctionRuns(TrainingRuns):
         self._pool = Pool(self._train, trainer.train, workers, trainer.timeout, retries=0)
         self._pool.what = "training"
         self._faults: dict[Hashable, str] = {}
-        self.starts: dict[int, Any] = {}
-        """For a function with an argument `starts`, what it gets of a training, by its number."""
         if cache.path is None:
             self._folder = Path(tempfile.mkdtemp(prefix="verifai_jax_trainings_"))
             weakref.finalize(self, shutil.rmtree, self._folder, ignore_errors=True)
@@ -85,8 +80,7 @@ class FunctionRuns(TrainingRuns):
 
     def add(self, values: Mapping[str, object], seed: int) -> int:
         steps = whole_number(values.get(STEPS, self._trainer.steps), STEPS)
-        key = digest({name: values[name] for name in sorted(values)})
-        checkpoints = self.study.checkpoints_of(steps)
+        key, checkpoints = digest({**values}), self.study.checkpoints_of(steps)
         self.runs.append(TrainingRun(dict(values), seed, key, checkpoints, None))
         return len(self.runs) - 1
 
@@ -127,8 +121,8 @@ class FunctionRuns(TrainingRuns):
             calls[-1]["checkpoints"] = [
                 c for i, c in earlier if (number, i) not in self._checkpoints
             ]
-            if number in self.starts:
-                calls[-1]["starts"] = self.starts[number]
+            if (number, at) in self.changes:
+                calls[-1]["starts"] = self.changes[number, at]
         seeds = [self.runs[number].seed for number in numbers]
 
         def ended(index: int, result: "Arrays | str") -> None:
@@ -260,12 +254,9 @@ def train_once(
 ) -> Trace:
     """Call the training function, and convert its policy to arrays; runs in a process.
 
-    **Arguments:**
-    - `train`: the training function, see `Trainer`.
-    - `observation`: an example observation for policies that do not define their input, or None.
     - `call`: the hyper-parameters `values`, the total `steps`, the `folder` to resume from, the
-      earlier `checkpoints`, and `starts`, whether the function receives it.
-    - `seed`: training seed.
+      earlier `checkpoints`, and `starts`, if the function receives it.
+
     **Returns:** the arrays, which the pool passes on unchanged.
     """
     random.seed(seed)

@@ -1,10 +1,8 @@
 """Successive halving: at each checkpoint only the best configurations continue to train.
 
     sweep(study, configurations=64, halving=Halving(reduction=3))
-    sweep(study, configurations=64, halving=Halving(reduction=1, p=0.5))    # the unsafe ones end
-    sweep(study, configurations=64, halving=Halving(1, until_safe=True))    # those that pass end
 
-Source: Jamieson and Talwalkar, Non-stochastic best arm identification and hyperparameter
+Sources: Jamieson and Talwalkar, Non-stochastic best arm identification and hyperparameter
 optimization (2016), figure 1; Li et al., A system for massively parallel hyperparameter tuning
 (2020), section 3.1, whose asynchronous form gains nothing where all trainings run on one machine.
 """
@@ -61,12 +59,9 @@ class Halving:
         return math.ceil(configurations / self.reduction)
 
     def select(self, objective: Mapping[int, float]) -> list[int]:
-        """Choose the configurations that continue.
+        """Choose the configurations that continue, by their objectives.
 
-        **Arguments:**
-        - `objective`: objective of each configuration, by number; the smallest is best, NaN is
-          worst.
-        **Returns:** ascending numbers of the configurations; among equal ones the first continue.
+        The smallest objective is best, and NaN worst; among equal ones the first continue.
         """
         count = self.survivors(len(objective))
         values = {n: math.inf if math.isnan(value) else value for n, value in objective.items()}

@@ -2,26 +2,21 @@
 
     importance = sweep.importance()
     importance.table                    # loss of R^2 when one is shuffled, shares of the variance
-    importance.is_reliable("failure_rate")
     importance.unsafe, importance.safe  # principal components of unsafe and safe configurations
 
-A forest learns the failure rate and the return from the hyper-parameters, as coordinates in the
-unit cube of the study's space: a log-uniform one counts by its logarithm. Its R^2 is
-measured on configurations that it was not trained on.
+A forest learns the failure rate and the return from coordinates in the unit cube of the study's
+space: a log-uniform one counts by its logarithm. Its R^2 is measured on configurations that it was
+not trained on. Rank correlations show weak trends in few configurations, of which it cannot learn.
 
-Sources: trees of Geurts, Ernst and Wehenkel, Extremely randomized trees, Machine Learning 63
-(2006); permutation importance of Breiman, Random forests, Machine Learning 45 (2001); shares of
-the variance as in `fanova.py`; principal components as in the paper's case study of
-hyper-parameters (Dreossi et al., CAV 2019).
-
-Rank correlations show weak trends of single inputs in few configurations, from which a forest
-cannot learn.
+Sources: Geurts, Ernst and Wehenkel, Extremely randomized trees (2006); permutation importance of
+Breiman, Random forests (2001); shares of the variance as in `fanova.py`; principal components as in
+the case study of hyper-parameters of Dreossi et al., CAV 2019.
 """
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -169,12 +164,8 @@ class HyperparameterImportance(InNotebook):
 
 @dataclass(frozen=True)
 class _Input:
-    """One hyper-parameter as the models see it.
-
-    - `name`: the name of the hyper-parameter.
-    - `values`: coordinates in [0, 1].
-    - `edges`: borders of the cells of a discrete one; None for a continuous one.
-    - `ordered`: True for numbers, False for choices.
+    """One hyper-parameter as the models see it: coordinates in [0, 1], the borders of its cells if
+    it is discrete, and whether it is a number and not a choice.
     """
 
     name: str
@@ -189,16 +180,10 @@ def hyperparameter_importance(
 ) -> HyperparameterImportance:  # fmt: skip
     """Measure the importance of hyper-parameters from the rows of a sweep's table.
 
-    Nothing is trained or simulated.
-
     **Arguments:**
-    - `table`: a table with columns `configuration`, `steps`, `verdict`, `failure_rate`,
-      `nominal_return` and the hyper-parameters.
-    - `hyperparameters`: names of their columns, without constant ones, and with `steps` if it
-      varies.
+    - `table`: the table, whose hyper-parameters are in these columns; `steps` counts if it varies.
     - `space`: the space of the study; if None, columns are scaled by their minimum and maximum.
-    - `repeats`: how often folds are drawn and each column is shuffled.
-    - `seed`: the seed of folds, shuffles and forests.
+    - `repeats`, `seed`: as in `Sweep.importance`.
     """
     import pandas as pd
 
@@ -221,10 +206,9 @@ def hyperparameter_importance(
         forest = _forest(matrix.shape[1], seed).fit(matrix, values[usable])
         shares = variance_shares(leaf_boxes(forest, [one.edges for one in inputs]))
         scores[target] = score
-        trend = trends(matrix, values[usable], groups[usable], seed)
-        chance[target] = trend.chance
+        trend, chance[target] = trends(matrix, values[usable], groups[usable], seed)
         ordered = np.array([one.ordered for one in inputs])
-        columns[f"{target}_trend"] = np.where(ordered, trend.correlation, np.nan)
+        columns[f"{target}_trend"] = np.where(ordered, trend, np.nan)
         columns |= {target: mean, f"{target}_low": mean - spread, f"{target}_high": mean + spread}
         columns |= {f"{target}_first": shares.first, f"{target}_total": shares.total}
     importances = pd.DataFrame(columns, index=pd.Index([one.name for one in inputs], name="name"))
@@ -356,23 +340,15 @@ SHUFFLES = 1000
 """Shuffled outcomes that decide what chance can do."""
 
 
-class Trends(NamedTuple):
-    """Rank correlations of inputs with an outcome.
-
-    - `correlation`: Spearman's correlation of each input; NaN for a constant one.
-    - `chance`: 95 % quantile of the largest correlation over shuffled outcomes; larger correlations
-      are significant for any number of inputs.
-    """
-
-    correlation: Float[np.ndarray, " d"]
-    chance: float
-
-
 def trends(
     inputs: Float[np.ndarray, "n d"], outcome: Float[np.ndarray, " n"],
     groups: Int[np.ndarray, " n"], seed: int = 0,
-) -> Trends:  # fmt: skip
-    """Correlate inputs with an outcome over groups of rows, using the mean of each group."""
+) -> tuple[Float[np.ndarray, " d"], float]:  # fmt: skip
+    """Correlate inputs with an outcome over groups of rows, using the mean of each group.
+
+    **Returns:** Spearman's correlation of each input, NaN for a constant one; the 95 % quantile of
+    the largest correlation over shuffled outcomes, whatever the number of inputs.
+    """
     distinct, member = np.unique(groups, return_inverse=True)
     counts = np.bincount(member)
     means = np.stack(
@@ -387,7 +363,7 @@ def trends(
     constant = (columns == 0).all(axis=0)
     greatest = np.abs(correlations[1:, ~constant]).max(axis=1, initial=0.0)
     correlation = np.where(constant, np.nan, correlations[0])
-    return Trends(correlation, float(np.quantile(greatest, 0.95)))
+    return correlation, float(np.quantile(greatest, 0.95))
 
 
 def _rank(values: Float[np.ndarray, "n k"]) -> Float[np.ndarray, "n k"]:

@@ -59,12 +59,8 @@ class OptunaSampler:
             raise ValueError("the seed of Optuna's sampler is the sweep's: sweep(..., seed=...)")
 
     def proposer(self, space: FeatureSpace, seed: int, batch: int) -> "OptunaProposer":
-        """Make the proposer of this sampler.
+        """Make the proposer of this sampler, for rounds of `batch` configurations.
 
-        **Arguments:**
-        - `space`: the space of the hyper-parameters.
-        - `seed`: the seed of the sampler.
-        - `batch`: configurations in a round.
         **Raises:** `MissingExtra` without Optuna or a package that the sampler needs; `TypeError`
         for options that the sampler does not have.
         """
@@ -79,14 +75,7 @@ class OptunaSampler:
 
 
 class OptunaProposer:
-    """A proposer that asks an Optuna study for trials.
-
-    **Arguments:**
-    - `description`: the sampler by name and options.
-    - `sampler`: Optuna's own object.
-    - `space`: the space of the hyper-parameters.
-    - `batch`: configurations in a round.
-    """
+    """A proposer that asks an Optuna study, with this sampler, for trials; see `Proposer`."""
 
     learns = True
 
@@ -101,7 +90,6 @@ class OptunaProposer:
         self._trials: list[Trial] = []
 
     def propose(self, maximum: int) -> list[Hyperparameters]:
-        """Return the next configurations; see `Proposer`."""
         self._trials, proposals, refused = [], [], 0
         while len(proposals) < min(maximum, self.batch) and refused < _MAX_REFUSED:
             trial = self._study.ask(self._distributions)
@@ -116,7 +104,6 @@ class OptunaProposer:
         return proposals
 
     def observe(self, objectives: Sequence[float | None]) -> None:
-        """Record the objectives of the last proposals; see `Proposer`."""
         for trial, value in zip(self._trials, objectives, strict=False):
             if value is None:
                 self._study.tell(trial, state=self._failed)
@@ -124,7 +111,6 @@ class OptunaProposer:
                 self._study.tell(trial, float(value))
 
     def to_json(self) -> object:
-        """Return the sampler as plain data."""
         options = {name: repr(value) for name, value in self.description.options.items()}
         return {"optuna": self.description.name, "options": options}
 

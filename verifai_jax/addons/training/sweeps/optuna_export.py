@@ -37,14 +37,6 @@ def export_to_optuna(
 
     A configuration without a certificate becomes a failed trial, one stopped by halving a pruned
     one. A domain that Optuna lacks becomes the range of the tried values.
-
-    **Arguments:**
-    - `configurations`: one row for each, as in `Sweep.configurations`.
-    - `hyperparameters`: names of their columns.
-    - `space`: the space of the hyper-parameters, if known.
-    - `used`: hyper-parameters of each algorithm, by name; empty if all algorithms have all.
-    - `storage`: the storage of the study; in memory when left out.
-    **Raises:** `MissingExtra` without Optuna.
     """
     optuna = require("optuna", "optuna")
     study = quiet_study(study_name=name, storage=storage, directions=list(DIRECTIONS))

@@ -1,10 +1,8 @@
 """Proposals of configurations: a search over the unit cube of the hyper-parameters, or Optuna.
 
-    proposer = make_proposer("bayes", space, configurations=64, seed=0)
-    values = proposer.propose(8)                        # dictionaries of plain values, 8 at most
-    proposer.observe([0.02, None, ...])                 # their objective; None if it is unknown
-
-Proposers minimise `objective`: failure rate first, then worst robustness, then return.
+proposer = make_proposer("bayes", space, configurations=64, seed=0)
+values = proposer.propose(8)                        # dictionaries of plain values, 8 at most
+proposer.observe([0.02, None, ...])                 # their objective; None if it is unknown
 """
 
 import math
@@ -92,7 +90,7 @@ def make_proposer(
 
 
 class SearchProposer:
-    """A search of this package on the unit cube of the space."""
+    """A search of this package on the unit cube of the space; see `Proposer`."""
 
     def __init__(self, search: Search, space: FeatureSpace, batch: int, seed: int) -> None:
         self.search, self.space, self.batch = search, space, batch
@@ -101,7 +99,6 @@ class SearchProposer:
         self._count = 0
 
     def propose(self, maximum: int) -> list[Hyperparameters]:
-        """Return the next configurations; see `Proposer`."""
         if self._proposals.exhausted:
             self._count = 0
             return []
@@ -111,13 +108,11 @@ class SearchProposer:
         return values_at(self.space, points)[:maximum]
 
     def observe(self, objectives: Sequence[float | None]) -> None:
-        """Record the objectives of the last proposals; see `Proposer`."""
         known = [*objectives, *[None] * (self._count - len(objectives))]
         rho = np.array([np.nan if value is None else value for value in known], np.float32)
         self._proposals.tell(rho, np.isfinite(rho), None)
 
     def to_json(self) -> object:
-        """Return the search as plain data."""
         return searches.to_json(self.search) or repr(self.search)
 
 
@@ -125,17 +120,13 @@ def objective(
     failure_rate: float, worst_robustness: float, nominal_return: float,
     return_range: tuple[float, float],
 ) -> float | None:  # fmt: skip
-    """Return the objective of a policy, between 0 and 1.11, which searches minimise.
+    """Return the objective of a policy, between 0 and 1.11, which searches minimise; None if
+    unknown.
 
     The failure rate counts most; the worst robustness, scaled to a tenth, decides between equal
     rates; the return, scaled to a hundredth, decides between policies that are still equal.
 
-    **Arguments:**
-    - `failure_rate`: the failure rate, between 0 and 1.
-    - `worst_robustness`: the least robustness of all simulations.
-    - `nominal_return`: mean return on the nominal task.
     - `return_range`: minimum and maximum nominal return of the first round.
-    **Returns:** the objective; None if the failure rate is unknown.
     """
     if not math.isfinite(failure_rate):
         return None

@@ -28,14 +28,9 @@ def preference_order(table: "pd.DataFrame") -> Int[np.ndarray, " certified"]:
     """
     safe, high = is_safe(table), table["failure_high"].to_numpy(np.float64)
     returned = np.nan_to_num(table["nominal_return"].to_numpy(np.float64), nan=-np.inf)
-    keys = (
-        table["steps"].to_numpy(np.float64),
-        np.where(safe, high, -returned),
-        np.nan_to_num(table["failure_rate"].to_numpy(np.float64), nan=np.inf),
-        np.where(safe, -returned, high),
-        ~safe,
-    )
-    order = np.lexsort(keys)
+    rate = np.nan_to_num(table["failure_rate"].to_numpy(np.float64), nan=np.inf)
+    first, second = np.where(safe, -returned, high), np.where(safe, high, -returned)
+    order = np.lexsort((table["steps"].to_numpy(np.float64), second, rate, first, ~safe))
     return order[np.isfinite(high)[order]]
 
 

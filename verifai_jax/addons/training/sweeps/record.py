@@ -40,10 +40,8 @@ def error_message(status: str) -> str | None:
 
 
 class Curve(NamedTuple):
-    """A learning curve.
-
-    - `steps`: environment steps taken by the end of each update.
-    - `mean_return`: mean return of the episodes that ended in the update; NaN if none did.
+    """A learning curve: environment steps by the end of each update, and the mean return of the
+    episodes that ended in it; NaN if none did.
     """
 
     steps: Int[np.ndarray, " updates"]
@@ -97,9 +95,6 @@ class SweepRecord:
 def algorithm_uses(used: Mapping[str, Sequence[str]], algorithm: object, name: str) -> bool:
     """Return whether an algorithm has a hyper-parameter.
 
-    **Arguments:**
-    - `used`: names of the hyper-parameters of each algorithm; an algorithm that is missing has all.
-    - `algorithm`: name of the algorithm; None has all.
-    - `name`: the name of the hyper-parameter.
+    - `used`: those of each algorithm; one that is missing, and None, have all.
     """
     return name in used.get(str(algorithm), (name,))

@@ -1,11 +1,7 @@
 """The result of a sweep: the certified safety of every policy that was trained.
 
-sweep.summary()                      # configurations with full return, and the safe ones of them
-sweep.table, sweep.safe, sweep.best  # rows are policies
-sweep.policy(12).act(observation)
+sweep.table, sweep.safe, sweep.best  # rows are policies sweep.policy(12).act(observation)
 vj.falsify(sweep.problem(12))        # the closed loop with that policy
-sweep.save("sweeps/mine")
-load_sweep("sweeps/mine", study)
 """
 
 from collections.abc import Mapping
@@ -33,12 +29,7 @@ from verifai_jax.addons.training.sweeps.ranking import (
 )
 from verifai_jax.addons.training.sweeps.record import SweepRecord, TrainedPolicy, algorithm_uses
 from verifai_jax.addons.training.sweeps.study import Study
-from verifai_jax.addons.training.sweeps.summary import (
-    Findings,
-    format_headline,
-    format_html,
-    format_summary,
-)
+from verifai_jax.addons.training.sweeps.summary import format_headline, format_html, format_summary
 from verifai_jax.addons.training.sweeps.trainer import ALGORITHM, STEPS
 from verifai_jax.core.compute.devices import describe_processor
 from verifai_jax.core.display.figure import Figure, Reported
@@ -260,11 +251,16 @@ class Sweep(Reported):
         if STEPS in values:  # The table has those of the checkpoint.
             same = (table["configuration"] == row["configuration"]) & (table["seed"] == row["seed"])
             values[STEPS] = int(table.loc[same, STEPS].max())
+        before, number, parents = [], int(row["configuration"]), self.record.options.get("parents")
+        while (parent := (parents or {}).get(str(number))) is not None:
+            number, at = parent
+            one: Any = table.loc[table["configuration"] == number].iloc[0]
+            before.insert(0, [at, {n: as_scalar(one[n]) for n in self.hyperparameters}])
         return TrainedConfiguration(
             study=self.name, hyperparameters=values, seed=int(row["seed"]),
             steps=int(row[STEPS]), certificate={n: as_scalar(row[n]) for n in CERTIFICATE},
             weights=weights_of(policy), version=self.record.version,
-            processor=describe_processor(), policy=policy,
+            processor=describe_processor(), policy=policy, before=before,
         )  # fmt: skip
 
     def export(self, folder: str | Path, i: int | np.integer | None = None) -> Path:
@@ -393,21 +389,16 @@ class Sweep(Reported):
         return np.asarray(curve.steps)[:count], np.asarray(curve.mean_return)[:count]
 
     @property
-    def findings(self) -> Findings:
-        """The data for the summary."""
-        return Findings(self.record, self.table, self.configurations, self.used, self.p, self.reuse)
-
-    @property
     def headline(self) -> str:
         """Number of configurations with full return, and of the safe ones among them."""
-        return format_headline(self.findings)
+        return format_headline(self)
 
     def summary(self) -> str:
         """Write the findings of the sweep, the most important first.
 
         The summary of a loaded sweep begins with a note if its study's model has changed.
         """
-        text = format_summary(self.findings)
+        text = format_summary(self)
         if self.study is None or self.folder is None:
             return text
         changed = changed_since(self.changes(), None, "the sweep")
@@ -416,7 +407,7 @@ class Sweep(Reported):
     __str__ = __repr__ = summary
 
     def _repr_html_(self) -> str:
-        return format_html(self.findings)
+        return format_html(self)
 
     def save(self, folder: str | Path) -> Path:
         """Write the sweep to a folder: table, policies, curves, record.
@@ -430,8 +421,7 @@ class Sweep(Reported):
         rows = [self.recorded_counterexamples(i).assign(row=i) for i in range(self.record.rows)]
         nothing = [pd.DataFrame({"row": [0]})[:0]]
         failing: Any = pd.concat([part for part in rows if len(part)] or nothing)
-        stored = storage.StoredSweep(self.record, self.space, self.used, failing)
-        return storage.write_sweep(stored, self.table, Path(folder))
+        return storage.write_sweep(self, failing, Path(folder))
 
     def to_optuna(
         self, storage: "str | BaseStorage | None" = None, name: str | None = None
@@ -470,11 +460,10 @@ def load_sweep(folder: str | Path, study: Study | str | None = None) -> Sweep:
         study = load_target(study, Study)
     if study is not None:
         storage.check_study(description, folder, study.name, study.space.columns)
-    stored = storage.read_sweep(description, folder)
-    groups: Any = stored.failing.groupby("row")
+    record, space, every, used = storage.read_sweep(description, folder)
+    groups: Any = every.groupby("row")
     failing = {int(i): part.drop(columns="row").reset_index(drop=True) for i, part in groups}
-    space = stored.space if study is None else None
-    return Sweep(stored.record, study, space, folder, failing, stored.used)
+    return Sweep(record, study, space if study is None else None, folder, failing, used)
 
 
 def _used_hyperparameters(study: Study) -> dict[str, tuple[str, ...]]:

@@ -1,7 +1,6 @@
 """The rows of a sweep's table as columns, in the order and types that `SweepRecord` promises."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -9,7 +8,7 @@ from jaxtyping import Shaped
 
 from verifai_jax.addons.estimation.certification.result import Certificate
 from verifai_jax.addons.training.sweeps.curves import curve_robustness
-from verifai_jax.addons.training.sweeps.record import AFTER, BEFORE, Curve, TrainedPolicy
+from verifai_jax.addons.training.sweeps.record import AFTER, BEFORE
 from verifai_jax.addons.training.sweeps.study import Study
 from verifai_jax.addons.training.sweeps.training_runs import RunCheckpoint
 
@@ -17,81 +16,54 @@ _INTEGERS = {"configuration", "seed", "steps", "failures", "simulations"}
 _TEXTS = {"status", "verdict"}
 
 
-@dataclass(frozen=True, eq=False)
-class Row:
-    """One policy, or one training run without a policy.
-
-    - `configuration`, `seed`, `steps`: number of the configuration, training seed, checkpoint.
-    - `values`: the hyper-parameters.
-    - `status`: see `record`.
-    - `entry`: the number of the training run and that of its checkpoint.
-    - `checkpoint`: the run at that checkpoint; None if it did not train.
-    - `nominal_return`: mean return on the nominal task; NaN if unknown.
-    - `safety`: the safety of the policy; None if it was not certified.
+class Row(NamedTuple):
+    """One policy, or a training run without one: its cells by column, but those of training and
+    certificate; its `entry`, the numbers of run and checkpoint; the run there, None if it did not
+    train; the certificate, None without one.
     """
 
-    configuration: int
-    seed: int
-    steps: int
-    values: Mapping[str, object]
-    status: str
+    cells: Mapping[str, Any]
     entry: tuple[int, int]
     checkpoint: RunCheckpoint | None = None
-    nominal_return: float = float("nan")
     safety: Certificate | None = None
 
 
-class Table(NamedTuple):
-    """The parts of a `SweepRecord` that have one entry for each row, and the learning curves."""
-
-    columns: Mapping[str, Shaped[np.ndarray, " rows"]]
-    policies: tuple[TrainedPolicy | None, ...]
-    worst: tuple[Mapping[str, object] | None, ...]
-    curves: Mapping[tuple[int, int], Curve]
-
-
-def tabulate(rows: Sequence[Row], study: Study) -> Table:
-    """Convert rows to columns, policies, worst features and learning curves."""
+def columns_and_policies(rows: Sequence[Row], study: Study) -> dict[str, Any]:
+    """Return the fields of a `SweepRecord` that its rows say."""
     names = [n for n in study.space.columns if n not in BEFORE]
     cells = [_cells(row, study) for row in rows]
     columns: dict[str, np.ndarray] = {}
     for name in (*BEFORE, *names, *AFTER):
         entries = [cell[name] for cell in cells]
-        if name in _INTEGERS:
-            columns[name] = np.array(entries, np.int64)
-        elif name in _TEXTS:
-            columns[name] = np.array(entries, object)
-        elif name in names:
+        if name in names:
             columns[name] = _hyperparameter_column(entries)
         else:
-            columns[name] = np.array(entries, np.float64)
-    curves: dict[tuple[int, int], Curve] = {}
-    for row in rows:
-        # The last checkpoint of a run has the longest curve.
-        if row.checkpoint is not None:
-            curves[row.configuration, row.seed] = row.checkpoint.curve
-    return Table(
-        columns=columns,
-        policies=tuple(
+            kind = np.int64 if name in _INTEGERS else object if name in _TEXTS else np.float64
+            columns[name] = np.array(entries, kind)
+    return {
+        "columns": columns,
+        "policies": tuple(
             row.checkpoint.policy if row.checkpoint is not None and row.checkpoint.finite else None
             for row in rows
         ),
-        worst=tuple(None if row.safety is None else row.safety.worst_features for row in rows),
-        curves=curves,
-    )
+        "worst": tuple(None if row.safety is None else row.safety.worst_features for row in rows),
+        # The last checkpoint of a run has the longest curve.
+        "curves": {
+            (row.cells["configuration"], row.cells["seed"]): row.checkpoint.curve
+            for row in rows
+            if row.checkpoint is not None
+        },
+    }
 
 
-def _cells(row: Row, study: Study) -> dict[str, object]:
-    nan, checkpoint, safety = float("nan"), row.checkpoint, row.safety
-    curve = nan
-    if study.curve_formula is not None and checkpoint is not None:
-        curve = curve_robustness(study.curve_formula, *checkpoint.curve)
+def _cells(row: Row, study: Study) -> dict[str, Any]:
+    trained, curve = row.checkpoint, float("nan")
+    if study.curve_formula is not None and trained is not None:
+        curve = curve_robustness(study.curve_formula, *trained.curve)
     return {
-        **row.values, "configuration": row.configuration, "seed": row.seed, "steps": row.steps,
-        "status": row.status,
-        "training_return": nan if checkpoint is None else checkpoint.training_return,
-        "nominal_return": row.nominal_return, **columns_of(safety), "curve_robustness": curve,
-        "training_seconds": nan if checkpoint is None else checkpoint.seconds,
+        **row.cells, **columns_of(row.safety), "curve_robustness": curve,
+        "training_return": np.nan if trained is None else trained.training_return,
+        "training_seconds": np.nan if trained is None else trained.seconds,
     }  # fmt: skip
 
 

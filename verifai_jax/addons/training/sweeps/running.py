@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -19,8 +18,9 @@ from verifai_jax.addons.training.sweeps.fingerprint import digest
 from verifai_jax.addons.training.sweeps.function_runs import FunctionRuns
 from verifai_jax.addons.training.sweeps.halving import SAFETY, Halving
 from verifai_jax.addons.training.sweeps.hyperparameters import Hyperparameters
+from verifai_jax.addons.training.sweeps.population import Population
 from verifai_jax.addons.training.sweeps.proposers import WORST, Proposer, objective
-from verifai_jax.addons.training.sweeps.rows import Row, columns_of, tabulate
+from verifai_jax.addons.training.sweeps.rows import Row, columns_and_policies, columns_of
 from verifai_jax.addons.training.sweeps.study import Study
 from verifai_jax.addons.training.sweeps.trainer import FunctionTrainer
 from verifai_jax.addons.training.sweeps.training_runs import TrainingRuns
@@ -70,7 +70,8 @@ class _Configuration:
 class RunningSweep:
     """The state of a sweep: its configurations, training runs, returns and safety.
 
-    An entry is a pair of numbers: a training run, and one of its checkpoints.
+    An entry is a pair of numbers: a training run, and one of its checkpoints. `parents` are, for
+    those that went on from others, the number of that configuration and that of the checkpoint.
     """
 
     study: Study
@@ -83,7 +84,9 @@ class RunningSweep:
     calls: int = 0
     executor: Executor | None = None
     sources: Sequence[Mapping[str, Any]] = ()
+    population: Population | None = None
     runs: TrainingRuns = field(init=False)
+    parents: dict[int, tuple[int, int]] = field(default_factory=dict)
     configurations: list[_Configuration] = field(default_factory=list)
     numbers: dict[str, int] = field(default_factory=dict)
     returns: dict[tuple[int, int], float] = field(default_factory=dict)
@@ -141,25 +144,47 @@ class RunningSweep:
     def _train(self, numbers: Sequence[int]) -> None:
         runs = self._runs_of(numbers)
         last = len(self.study.checkpoints_of(self.study.trainer.steps)) - 1
-        if self.halving is None:
+        halving, population, members = self.halving, self.population, len(numbers)
+        if halving is None and population is None:
             self.runs.train(runs, max(map(self.runs.rungs, runs)) - 1)
             self._measure_returns(runs)
             return
-        compares = self.halving.reduction > 1
+        compares = population is not None or (halving is not None and halving.reduction > 1)
         for rung in range(last + 1):
             self.runs.train(self._runs_of(numbers), rung, further=rung < last)
             if compares:
                 self._measure_returns(self._runs_of(numbers))
             if rung < last:
-                selected = self._going_on(numbers, rung, last, self.halving)
-                if compares:
-                    values = self._halving_objectives(self.halving.by, selected, rung)
-                    selected = self.halving.select(values)
+                selected, added = [*numbers], list[int]()
+                if halving is not None:
+                    selected = self._going_on(numbers, rung, last, halving)
+                if halving is not None and halving.reduction > 1:
+                    selected = halving.select(self._values_at(halving.by, selected, rung))
+                if population is not None:
+                    selected, added = self._succession(population, selected, members, rung)
                 for number in set(numbers) - set(selected):
                     self.configurations[number].stopped = rung
                     self.runs.forget(self.configurations[number].runs)
-                numbers = selected
-        self._measure_returns(runs)
+                numbers = [*selected, *added]
+        self._measure_returns(self._runs_of(range(len(self.configurations))))
+
+    def _succession(
+        self, population: Population, numbers: Sequence[int], members: int, rung: int
+    ) -> tuple[list[int], list[int]]:
+        """Return the configurations that stay, and new ones that go on from the best of these."""
+        # A function of the decisions before, so that a resumed sweep decides the same.
+        rng = np.random.default_rng([self.options["seed"], 4, rung, len(self.configurations)])
+        pairs = population.pairs(self._values_at(population.by, numbers, rung), members, rng)
+        space, trainer, added = self.study.space, self.study.trainer, []
+        for _, parent in pairs:
+            origin, number = self.configurations[parent], len(self.configurations)
+            values = population.changed(origin.values, space, trainer, rng)
+            runs = tuple(self.runs.fork(run, rung, values) for run in origin.runs)
+            self.configurations.append(_Configuration(values, runs))
+            self.parents[number] = parent, rung
+            added.append(number)
+        ended = {number for number, _ in pairs}
+        return [number for number in numbers if number not in ended], added
 
     def _going_on(
         self, numbers: Sequence[int], rung: int, rungs: int, halving: Halving
@@ -212,7 +237,7 @@ class RunningSweep:
         missing: list[tuple[int, int]] = []
         before = len(self.returns)
         for run in runs:
-            for rung in range(self.runs.rungs(run)):
+            for rung in self.runs.own_rungs(run):
                 if not self._is_finite((run, rung)) or (run, rung) in self.returns:
                     continue
                 arrays = self.cache.get(self._return_name(run, rung))
@@ -268,7 +293,7 @@ class RunningSweep:
 
     # Objectives of searches and of halving
 
-    def _halving_objectives(self, by: str, numbers: Sequence[int], rung: int) -> dict[int, float]:
+    def _values_at(self, by: str, numbers: Sequence[int], rung: int) -> dict[int, float]:
         """Return the objectives of configurations at a checkpoint; NaN where one is unknown."""
         if by == SAFETY:
             values = self._screen({n: self._entries_of(n, rung) for n in numbers})
@@ -323,7 +348,7 @@ class RunningSweep:
         entries = [
             (run, rung)
             for run in self._runs_of(range(len(self.configurations)))
-            for rung in range(self.runs.rungs(run))
+            for rung in self.runs.own_rungs(run)
             if self._is_finite((run, rung))
         ]
         if self.halving is not None and self.halving.until_safe:
@@ -375,30 +400,33 @@ class RunningSweep:
                     if row.entry in self.safety:
                         certified[row.entry] = len(rows)
                     rows.append(row)
-        table = tabulate(rows, self.study)
+        if self.population is not None:
+            steps = self.study.checkpoints_of(self.study.trainer.steps)
+            parents = {str(n): [one, steps[at]] for n, (one, at) in self.parents.items()}
+            self.options["parents"] = parents
         return record.SweepRecord(
-            study=self.study.name, seed=self.options["seed"], columns=table.columns,
-            hyperparameters=tuple(self.study.space.columns), policies=table.policies,
-            worst=table.worst, curves=table.curves, certificates=certificates,
+            study=self.study.name, seed=self.options["seed"],
+            hyperparameters=tuple(self.study.space.columns), certificates=certificates,
             certified=tuple(certified[entry] for entry in self.safety), options=self.options,
             version=__version__, seconds=dict(self.clock.seconds), complete=complete,
-            sources=tuple(self.sources),
+            sources=tuple(self.sources), **columns_and_policies(rows, self.study),
         )  # fmt: skip
 
     def _rows(self, number: int, configuration: _Configuration, run: int) -> list[Row]:
         training, rows = self.runs.runs[run], []
-        one = partial(Row, number, training.seed, values=configuration.values)
-        for rung, steps in enumerate(training.checkpoints):
+        cells = {**configuration.values, "configuration": number, "seed": training.seed}
+        for rung in self.runs.own_rungs(run):
             checkpoint, entry = self.runs.checkpoint(run, rung), (run, rung)
             if checkpoint is None:
                 continue
             ended = configuration.stopped == rung and not configuration.passed
             status = record.STOPPED if ended else record.TRAINED
             status = status if checkpoint.finite else record.NONFINITE
-            value, safety = self.returns.get(entry, float("nan")), self.safety.get(entry)
-            known = {"checkpoint": checkpoint, "nominal_return": value, "safety": safety}
-            rows.append(one(steps, status=status, entry=entry, **known))
+            own = {"nominal_return": self.returns.get(entry, np.nan), "status": status}
+            known = checkpoint, self.safety.get(entry)
+            rows.append(Row({**cells, "steps": training.checkpoints[rung], **own}, entry, *known))
         if run in self.runs.errors:
             status = record.error_status(self.runs.errors[run])
-            rows.append(one(training.checkpoints[-1], status=status, entry=(run, -1)))
+            own = {"steps": training.checkpoints[-1], "nominal_return": np.nan, "status": status}
+            rows.append(Row({**cells, **own}, (run, -1)))
         return rows

@@ -14,7 +14,7 @@ import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from reprlib import repr as shown
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 
@@ -33,6 +33,8 @@ from verifai_jax.features import FeatureSpace
 
 if TYPE_CHECKING:
     import pandas as pd
+Sweep: TypeAlias = Any
+"""A `Sweep`, whose file imports this one."""
 RECORD = "sweep.json"
 """File of everything that is neither table, policy nor curve."""
 TABLE = "table.parquet"
@@ -59,38 +61,23 @@ class SweepFileError(ValueError):
     """An error for a folder without a sweep, or with that of another study."""
 
 
-class StoredSweep(NamedTuple):
-    """The contents of a sweep's folder.
-
-    - `record`: table, policies, curves and options; without certificates after reading.
-    - `space`: the space of the hyper-parameters, if known.
-    - `used`: hyper-parameters of each algorithm, by name; empty if all algorithms have all.
-    - `failing`: counterexamples of all rows, with a column `row`.
-    """
-
-    record: SweepRecord
-    space: FeatureSpace | None
-    used: Mapping[str, tuple[str, ...]]
-    failing: "pd.DataFrame"
-
-
-def write_sweep(stored: StoredSweep, table: "pd.DataFrame", folder: Path) -> Path:
+def write_sweep(sweep: Sweep, failing: "pd.DataFrame", folder: Path) -> Path:
     """Write a sweep to a folder, replacing one there.
 
     **Arguments:**
-    - `table`: the table with the columns of the record.
+    - `failing`: counterexamples of all rows, with a column `row`.
     - `folder`: the folder; it is created.
     **Raises:** `FolderInUse` if another process writes there; `OSError` if the file system refuses,
     in which case the old content stays.
     """
     names = (TABLE, FAILING, CURVES, POLICIES, RECORD)
     with write_lock(folder), replacing_all(folder, names) as made:
-        _write_files(stored, table, made)
+        _write_files(sweep, failing, made)
     return folder
 
 
-def _write_files(stored: StoredSweep, table: "pd.DataFrame", folder: Path) -> None:
-    record = stored.record
+def _write_files(sweep: Sweep, failing: "pd.DataFrame", folder: Path) -> None:
+    record, table = sweep.record, sweep.table
     (folder / POLICIES).mkdir()
     mixed = _mixed_columns(table)
     texts = {name: [json.dumps(plain(v)) for v in table[name]] for name in mixed}
@@ -104,7 +91,7 @@ def _write_files(stored: StoredSweep, table: "pd.DataFrame", folder: Path) -> No
                 save_policy(policy, file, sources=sources, **notes)
             else:
                 policy.save(file)
-    stored.failing.to_parquet(folder / FAILING)
+    failing.to_parquet(folder / FAILING)
     arrays: dict[str, np.ndarray] = {}
     for (configuration, seed), curve in record.curves.items():
         arrays[f"{configuration}/{seed}/steps"] = np.asarray(curve.steps)
@@ -113,8 +100,8 @@ def _write_files(stored: StoredSweep, table: "pd.DataFrame", folder: Path) -> No
     data = {name: getattr(record, name) for name in _PLAIN}
     data |= {
         "complete": record.complete, "rows": record.rows, "sources": list(record.sources),
-        "used": stored.used, "mixed": mixed, "worst": record.worst,
-        "space": _space_to_json(stored.space),
+        "used": sweep.used, "mixed": mixed, "worst": record.worst,
+        "space": _space_to_json(sweep.space),
         "checksums": {
             file.relative_to(folder).as_posix(): checksum(read_bytes(file))
             for file in _files(folder, record.rows)
@@ -168,18 +155,19 @@ def check_study(
             )
 
 
-def read_sweep(description: Mapping[str, Any], folder: Path) -> StoredSweep:
-    """Read a sweep from a folder.
+def read_sweep(
+    description: Mapping[str, Any], folder: Path
+) -> "tuple[SweepRecord, FeatureSpace | None, pd.DataFrame, dict[str, tuple[str, ...]]]":
+    """Read the record of a sweep from a folder of this description, without its certificates.
 
-    **Arguments:**
-    - `description`: the description of the folder, from `read_description`.
+    **Returns:** the record, and of the sweep `space`, counterexamples with a column `row`, `used`.
     **Raises:** `SweepFileError` if a file is missing or damaged.
     """
     try:
         _check_files(folder, description["checksums"])
         used = {name: tuple(names) for name, names in description["used"].items()}
         record, space = _read_record(folder, description), _space_from_json(description["space"])
-        return StoredSweep(record, space, used, read_parquet(folder / FAILING).to_pandas())
+        return record, space, read_parquet(folder / FAILING).to_pandas(), used
     except FileNotFoundError as error:
         raise SweepFileError(f"the sweep in {folder} is incomplete: {error}") from error
     except (KeyError, TypeError, ValueError, AttributeError, OSError) as error:

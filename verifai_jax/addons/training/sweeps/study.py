@@ -1,14 +1,7 @@
 """A study: a space of hyper-parameters, a trainer, and the specification of a safe policy.
 
-    study = Study(
-        "safe_training",
-        space=FeatureSpace({"learning_rate": LogUniform(1e-4, 1e-2), "width": Categorical(16, 64)}),
-        trainer=Trainer(task, PPO(), steps=32_768),
-        problem=problem_of,                                 # Policy -> Problem
-        checkpoints=(8_192, 16_384, 32_768),
-    )
-
-`Study.check()` finds everything that is wrong with it before anything trains.
+study = Study("mine", {"width": Categorical(16, 64)}, Trainer(task, PPO()), problem_of)
+study.check()                           # finds all that is wrong before anything trains
 """
 
 from collections.abc import Callable, Mapping, Sequence

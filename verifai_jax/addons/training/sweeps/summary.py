@@ -1,24 +1,25 @@
 """The summary of a sweep in words, and as a table for a notebook.
 
-findings = Findings(record, table, configurations, used, p, reuse)
-format_headline(findings)
-print(format_summary(findings))
+format_headline(sweep)
+print(format_summary(sweep))
 """
 
 import html
 from collections.abc import Mapping, Sequence
 from itertools import repeat
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 
 from verifai_jax.addons.estimation.simultaneous_interval import verdict_kind
 from verifai_jax.addons.training.sweeps import ranking
-from verifai_jax.addons.training.sweeps.record import SweepRecord, algorithm_uses, error_message
+from verifai_jax.addons.training.sweeps.record import algorithm_uses, error_message
 from verifai_jax.core.messages.text import counted, format_features, format_percent
 
 if TYPE_CHECKING:
     import pandas as pd
+Sweep: TypeAlias = Any
+"""A `Sweep`, whose file imports this one."""
 MAX_ROWS = 8
 """Rows that a notebook shows."""
 _VIEWS = ".table .safe .best .configurations .pareto() .importance() .plot() .problem(row)"
@@ -31,31 +32,12 @@ _CSS = {"safe": "#3a9e7d", "unsafe": "#d1495b"}
 """Colours of verdicts in a notebook, those of the pictures; others are grey."""
 
 
-class Findings(NamedTuple):
-    """The data for the summary of a sweep.
-
-    - `record`: the record of the sweep.
-    - `table`: one row for each policy.
-    - `configurations`: one row for each configuration.
-    - `used`: hyper-parameters of each algorithm, by name; empty if all algorithms have all.
-    - `p`: failure probability below which a policy is called safe, if known.
-    - `reuse`: number of entries cached before, and of all, by kind of work.
-    """
-
-    record: SweepRecord
-    table: "pd.DataFrame"
-    configurations: "pd.DataFrame"
-    used: Mapping[str, Sequence[str]]
-    p: float | None
-    reuse: Mapping[str, tuple[int, int]]
-
-
-def format_summary(findings: Findings) -> str:
+def format_summary(sweep: Sweep) -> str:
     """Write the findings of a sweep, the most important first."""
-    record, table = findings.record, findings.table
-    groups: Any = findings.configurations
+    record, table = sweep.record, sweep.table
+    groups: Any = sweep.configurations
     margins: Any = table.get("curve_robustness")
-    lines = [f"{record.study}: {format_headline(findings)}"]
+    lines = [f"{record.study}: {format_headline(sweep)}"]
     if len(record.sources) > 1:
         lines.append("  SEVERAL MODELS: the sweep went on although the study had changed")
     if not record.complete:
@@ -65,13 +47,14 @@ def format_summary(findings: Findings) -> str:
     if len(table) > len(groups):
         lines.append(f"  policies        {format_verdicts(table)}; each seed and checkpoint is one")
     if len(ranking.preference_order(table)):
-        lines += _best_lines(findings)
+        lines += _best_lines(sweep)
     if len(groups) and (groups["seeds"] > 1).any():
-        lines += _seed_lines(findings)
+        lines += _seed_lines(sweep)
     if missing := _missing_policies(table):
         lines.append(f"  without policy  {missing}")
     if stopped := sum(str(status) == "stopped" for status in table["status"]):
-        lines.append(f"  halving         stopped {counted(stopped, 'training')} before the end")
+        kind = "population" if "parents" in record.options else "halving"
+        lines.append(f"  {kind:<15} stopped {counted(stopped, 'training')} before the end")
     correlation = (
         ranking.return_safety_correlation(ranking.last_checkpoints(table)) if len(table) else np.nan
     )
@@ -86,9 +69,9 @@ def format_summary(findings: Findings) -> str:
             f"  learning curve  {int((margins >= 0).sum())} of {len(margins)} policies satisfy "
             f"{formula or 'its formula'}"
         )
-    if evidence := _evidence(findings):
+    if evidence := _evidence(sweep):
         lines.append(f"  evidence        {evidence}")
-    if reused := _reuse(findings.reuse):
+    if reused := _reuse(sweep.reuse):
         lines.append(f"  from the cache  {reused}")
     if seconds := _seconds(record.seconds):
         lines.append(f"  time            {seconds}")
@@ -96,9 +79,9 @@ def format_summary(findings: Findings) -> str:
     return "\n".join(lines)
 
 
-def format_headline(findings: Findings) -> str:
+def format_headline(sweep: Sweep) -> str:
     """Write how many configurations reach full return, and how many of these are safe."""
-    groups: Any = findings.configurations
+    groups: Any = sweep.configurations
     if not len(groups):
         return "no configuration was trained"
     text = f"{counted(len(groups), 'configuration')}; "
@@ -112,7 +95,7 @@ def format_headline(findings: Findings) -> str:
     verb = {0: " are", 1: " is"}.get(safe, " are") if len(full) > 1 else (" is" if safe else "")
     return (
         f"{text}{len(full)} {reach} full return (at least {_format_return(threshold)}), "
-        f"and {of_those}{verb} certified safe{_requirement(findings.p)}"
+        f"and {of_those}{verb} certified safe{_requirement(sweep.p)}"
     )
 
 
@@ -134,18 +117,18 @@ def format_failures(row: Mapping[str, Any]) -> str:
     return f"{failed:,} of {int(row['simulations']):,} simulations fail"
 
 
-def format_hyperparameters(findings: Findings, row: Mapping[str, Any]) -> str:
+def format_hyperparameters(sweep: Sweep, row: Mapping[str, Any]) -> str:
     """Write those hyper-parameters of a row that its algorithm has."""
-    names = [name for name in findings.record.hyperparameters if name != "steps"]
+    names = [name for name in sweep.record.hyperparameters if name != "steps"]
     algorithm = row.get("algorithm")
-    values = {n: row[n] for n in names if algorithm_uses(findings.used, algorithm, n)}
+    values = {n: row[n] for n in names if algorithm_uses(sweep.used, algorithm, n)}
     unknown = [n for n, value in values.items() if isinstance(value, float) and value != value]
     return format_features({n: value for n, value in values.items() if n not in unknown})
 
 
-def format_html(findings: Findings) -> str:
+def format_html(sweep: Sweep) -> str:
     """Write the headline, the first rows to choose from, and the summary to unfold."""
-    record, table = findings.record, findings.table
+    record, table = sweep.record, sweep.table
     rows = table.iloc[ranking.preference_order(table)[:MAX_ROWS]]
     names = [name for name in record.hyperparameters if name != "steps"]
     heads = ["row", "verdict", "P(fail)", "nominal return", "steps", *names]
@@ -153,9 +136,9 @@ def format_html(findings: Findings) -> str:
     body = "".join(map(_html_row, map(str, rows.index), entries, repeat(names)))
     left = len(table) - len(rows)
     more = f"<p>{counted(left, 'further row')}: <code>.table</code></p>" if left else ""
-    summary = html.escape(format_summary(findings))
+    summary = html.escape(format_summary(sweep))
     return (
-        f"<p><b>{html.escape(record.study)}</b>: {html.escape(format_headline(findings))}</p>"
+        f"<p><b>{html.escape(record.study)}</b>: {html.escape(format_headline(sweep))}</p>"
         + "<table><thead><tr>"
         + "".join(f"<th>{html.escape(head)}</th>" for head in heads)
         + f"</tr></thead><tbody>{body}</tbody></table>{more}"
@@ -177,8 +160,8 @@ def _html_row(number: str, row: Mapping[str, Any], names: Sequence[str]) -> str:
     return f"<tr><td>{number}</td>{mark}{cells}</tr>"
 
 
-def _best_lines(findings: Findings) -> list[str]:
-    table = findings.table
+def _best_lines(sweep: Sweep) -> list[str]:
+    table = sweep.table
     number = table.index[ranking.preference_order(table)[0]]
     best: Any = table.loc[number].to_dict()
     verdict = str(best["verdict"])
@@ -190,7 +173,7 @@ def _best_lines(findings: Findings) -> list[str]:
         f"  best            {which}; nominal return {_format_return(best['nominal_return'])}",
         f"                  {_interval(best)}",
     ]
-    if values := format_hyperparameters(findings, best):
+    if values := format_hyperparameters(sweep, best):
         lines.append(f"                  {values}")
     price = f"{int(best['steps']):,} environment steps"
     if np.isfinite(best["training_seconds"]):
@@ -201,9 +184,9 @@ def _best_lines(findings: Findings) -> list[str]:
     return lines
 
 
-def _seed_lines(findings: Findings) -> list[str]:
+def _seed_lines(sweep: Sweep) -> list[str]:
     """Write the configurations that are safe whatever the training seed; one row may be luck."""
-    groups: Any = findings.configurations
+    groups: Any = sweep.configurations
     safe = groups.loc[ranking.is_safe(groups)].sort_values(
         ["nominal_return", "failure_high"], ascending=[False, True], kind="stable"
     )
@@ -214,7 +197,7 @@ def _seed_lines(findings: Findings) -> list[str]:
     return [
         f"  every seed      {counted(len(safe), 'configuration')} {are} safe with all seeds; the "
         f"best is {number}: nominal return {_format_return(best['nominal_return'])}",
-        f"                  {format_hyperparameters(findings, best)}",
+        f"                  {format_hyperparameters(sweep, best)}",
     ]
 
 
@@ -244,14 +227,14 @@ def _requirement(p: float | None) -> str:
     return "" if p is None else f" (failure probability below {format_percent(p)})"
 
 
-def _evidence(findings: Findings) -> str:
+def _evidence(sweep: Sweep) -> str:
     """Write the number of simulations that the certificates rest on, and their confidence."""
-    counts = findings.table["simulations"].to_numpy(np.float64)
+    counts = sweep.table["simulations"].to_numpy(np.float64)
     total = int(np.nansum(np.maximum(counts, 0)))
     if not total:
         return ""
     text = f"{total:,} fresh simulations"
-    confidence = findings.record.options.get("confidence")
+    confidence = sweep.record.options.get("confidence")
     if confidence is not None:
         text += f"; all intervals hold together at {format_percent(float(confidence))} confidence"
     return text

@@ -1,17 +1,13 @@
 """The trainer of a study: from hyper-parameters to trainings, checked before anything trains.
 
-    trainer = Trainer(task, {"ppo": PPO(), "pqn": PQN()}, steps=32_768)
-    trainer.configuration({"algorithm": "ppo", "learning_rate": 1e-3, "width": 32}, seed=0)
-
-Hyper-parameters are `algorithm` (its name), `steps` (environment steps in all), `width` (of all
-hidden layers), and the fields of the algorithms and of the task. An algorithm ignores those that it
-lacks.
+trainer = Trainer(task, {"ppo": PPO(), "pqn": PQN()}, steps=32_768)
+trainer.configuration({"algorithm": "ppo", "learning_rate": 1e-3, "width": 32}, seed=0)
 """
 
 import dataclasses
 import inspect
 import pickle
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Hashable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, TypeAlias, cast
 
@@ -19,16 +15,21 @@ import jax
 import numpy as np
 
 from verifai_jax.addons.rl import algorithms
-from verifai_jax.addons.rl.algorithm import Algorithm
-from verifai_jax.addons.rl.batched_training import Configuration, untrained_policy
+from verifai_jax.addons.rl.algorithm import Algorithm, check_fit
+from verifai_jax.addons.rl.batched_training import (
+    Configuration,
+    policy_structure,
+    untrained_policy,
+)
 from verifai_jax.addons.rl.policies import policy as load
 from verifai_jax.addons.rl.policy import Policy
 from verifai_jax.addons.rl.ppo import PPO
 from verifai_jax.addons.rl.task.task import Task
 from verifai_jax.addons.training.sweeps.hyperparameters import companions, probe_values
 from verifai_jax.core.messages.checks import check_count, check_positive, is_number
-from verifai_jax.core.messages.errors import unknown_name
+from verifai_jax.core.messages.errors import check_names, unknown_name
 from verifai_jax.features import FeatureSpace
+from verifai_jax.features.domain import Domain
 
 ALGORITHM, STEPS, WIDTH = "algorithm", "steps", "width"
 """Hyper-parameters that are no fields of an algorithm or a task."""
@@ -124,6 +125,9 @@ class Trainer:
                 f"got {forms[1]}"
             )
         object.__setattr__(self, "algorithms", dict(given))
+        self._check_steps()
+
+    def _check_steps(self) -> None:
         object.__setattr__(self, "steps", whole_number(self.steps, STEPS))
         if self.steps < 1:
             raise StudyError(f"steps must be at least 1; got {self.steps}")
@@ -177,6 +181,11 @@ class Trainer:
         steps = whole_number(values.get(STEPS, self.steps), STEPS)
         return Configuration(task, algorithm, steps, seed)
 
+    def structure(self, values: Mapping[str, Any]) -> Hashable:
+        """Return a key that is equal for trainings that can go on from one another."""
+        configuration = self.configuration(values)
+        return *policy_structure(configuration), configuration.steps
+
     def algorithm_name(self, values: Mapping[str, Any]) -> str:
         """Return the name of the algorithm chosen by these hyper-parameters."""
         return str(values[ALGORITHM]) if ALGORITHM in values else next(iter(self.by_name))
@@ -224,8 +233,7 @@ class Trainer:
                             "hidden layers"
                         )
                 raise unknown_name("hyper-parameter", name, self.names)
-            if domain.columns(name) not in ((name,), ()) or domain.size > 1:
-                raise StudyError(f"hyper-parameter {name} must be a single value; got {domain!r}")
+            _check_single(name, domain)
             owners = [o for o in self.by_name.values() if name in _fields(o)]
             if owners and name in _fields(self.task):
                 raise StudyError(
@@ -236,34 +244,27 @@ class Trainer:
             self._check_fit(name)
             self._check_values(name, space)
 
-    def _checked_algorithms(self, space: FeatureSpace) -> list[str]:
+    def _checked_algorithms(self, space: FeatureSpace) -> tuple[str, ...]:
         """Return the names of the algorithms that the space can choose."""
-        if ALGORITHM not in space.domains:
-            if len(self.by_name) > 1:
-                listing = ", ".join(map(repr, self.by_name))
-                raise StudyError(
-                    f"the trainer has {len(self.by_name)} algorithms and the space does not choose "
-                    f'one: add "algorithm": Categorical({listing})'
-                )
-            return list(self.by_name)
-        chosen = [value for value, _ in probe_values(space.domains[ALGORITHM])]
-        for name in chosen:
-            if name not in self.by_name:
-                raise unknown_name("algorithm", name, self.by_name)
+        if ALGORITHM not in space.domains and len(self.by_name) > 1:
+            listing = ", ".join(map(repr, self.by_name))
+            raise StudyError(
+                f"the trainer has {len(self.by_name)} algorithms and the space does not choose "
+                f'one: add "algorithm": Categorical({listing})'
+            )
+        chosen = self.algorithms_in(space)
+        check_names("algorithm", chosen, self.by_name)
         return chosen
 
     def _check_fit(self, name: str) -> None:
-        algorithm = self.by_name[name]
-        if isinstance(self.task.action, algorithm.actions):
-            return
-        fitting = [n for n, a in self.by_name.items() if isinstance(self.task.action, a.actions)]
-        fitting += [n for n in algorithms.algorithms_for(self.task.action) if n not in fitting]
-        kinds = " or ".join(kind.__name__.lower() for kind in algorithm.actions)
-        raise StudyError(
-            f"algorithm {name!r}: {type(algorithm).__name__} learns {kinds} actions; "
-            f"{type(self.task).__name__} has {self.task.action}. "
-            f"Those that fit: {', '.join(fitting) or 'none'}"
-        )
+        action = self.task.action
+        try:
+            check_fit(self.by_name[name], self.task)
+        except ValueError as error:
+            fitting = [n for n, a in self.by_name.items() if isinstance(action, a.actions)]
+            fitting += [n for n in algorithms.algorithms_for(action) if n not in fitting]
+            those = f"Those that fit: {', '.join(fitting) or 'none'}"
+            raise StudyError(f"algorithm {name!r}: {error}. {those}") from None
 
     def _check_values(self, algorithm: str, space: FeatureSpace) -> None:
         candidates = companions(space)
@@ -299,9 +300,7 @@ class FunctionTrainer(Trainer):
     """The trainer of a training function; made by `Trainer`."""
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "steps", whole_number(self.steps, STEPS))
-        if self.steps < 1:
-            raise StudyError(f"steps must be at least 1; got {self.steps}")
+        self._check_steps()
         if self.example is None:
             raise StudyError(
                 f"{self.name} is a training function: give example=, a policy with actions of the "
@@ -355,8 +354,7 @@ class FunctionTrainer(Trainer):
         **Raises:** `StudyError`.
         """
         for name, domain in space.domains.items():
-            if domain.columns(name) not in ((name,), ()) or domain.size > 1:
-                raise StudyError(f"hyper-parameter {name} must be a single value; got {domain!r}")
+            _check_single(name, domain)
         try:
             pickle.dumps(self.train)
         except Exception as error:
@@ -364,6 +362,11 @@ class FunctionTrainer(Trainer):
                 f"{self.name} runs in processes of its own, which must be able to import it: "
                 "define it by `def` at the top level of a module or a script"
             ) from error
+
+
+def _check_single(name: str, domain: Domain) -> None:
+    if domain.columns(name) not in ((name,), ()) or domain.size > 1:
+        raise StudyError(f"hyper-parameter {name} must be a single value; got {domain!r}")
 
 
 def takes(train: Train, name: str) -> bool:

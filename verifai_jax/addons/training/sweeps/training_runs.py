@@ -1,6 +1,5 @@
 """The training runs of a sweep: policies at the checkpoints, learning curves, seconds, all cached.
 
-    runs = TrainingRuns(study, cache, clock)
     number = runs.add(values, seed=0)
     runs.train([number, ...], rung=0)                   # to the first checkpoint, or cached
     runs.checkpoint(number, 0).policy
@@ -11,7 +10,7 @@ one checkpoint to the next, so that started runs are soon finished and cached.
 
 import time
 from collections.abc import Hashable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import jax
@@ -34,18 +33,16 @@ from verifai_jax.core.compute.executors import Executor
 from verifai_jax.core.store.cache import Cache, CacheError
 from verifai_jax.core.store.log import Arrays
 
+Lineage = tuple[tuple[int, Mapping[str, Any]], ...]
 RECENT = 0.1
 """Share of the updates so far, the last ones, whose mean is the training return."""
 
 
 @dataclass(frozen=True, eq=False)
 class RunCheckpoint:
-    """A training run at one of its checkpoints.
-
-    - `policy`: the policy, on the host.
-    - `finite`: False if one of its numbers is not finite.
-    - `curve`: learning curve from the start up to the checkpoint.
-    - `seconds`: processor time on one core in seconds, without compilation.
+    """A training run at one of its checkpoints: the policy, on the host; whether all its numbers
+    are finite; the learning curve from the start; processor seconds on one core, without
+    compilation.
     """
 
     policy: TrainedPolicy
@@ -68,12 +65,12 @@ class RunCheckpoint:
 class TrainingRun:
     """One training run of a sweep.
 
-    - `values`: the hyper-parameters, plain values.
-    - `seed`: training seed.
+    - `values`, `seed`: the hyper-parameters, plain values, and the training seed.
     - `key`: hash of the hyper-parameters that the algorithm uses; part of the names in the cache.
     - `checkpoints`: environment steps of its rows.
     - `configuration`: task and algorithm with these values; None if they cannot be trained.
-    - `error`: the reason why they cannot be trained, in one line.
+    - `lineage`: for a run that went on from others, the number of the first checkpoint that it, and
+      each of them, was trained up to with its own hyper-parameters, and these.
     """
 
     values: Mapping[str, object]
@@ -81,17 +78,14 @@ class TrainingRun:
     key: str
     checkpoints: tuple[int, ...]
     configuration: Configuration | None
-    error: str = ""
+    lineage: Lineage = ()
 
 
 class TrainingRuns:
     """All training runs of a sweep, numbered in the order in which they were added.
 
-    **Arguments:**
-    - `study`: the study that is swept.
-    - `cache`: stores each run at each checkpoint.
-    - `clock`: times the training, and stops it.
-    - `executor`: an executor whose workers train; this process when left out.
+    They are stored in the cache at each checkpoint. The clock times and stops them, and the workers
+    of an executor train, if there is one.
     """
 
     def __init__(
@@ -102,6 +96,9 @@ class TrainingRuns:
         self._shipment: Shipment[Study] | None = None if executor is None else ship(study, executor)
         self.runs: list[TrainingRun] = []
         self.errors: dict[int, str] = {}
+        self.changes: dict[tuple[int, int], Any] = {}
+        """What changes in a run from before a checkpoint on: a configuration of the same structure,
+        or what a training function gets as `starts`."""
         self._checkpoints: dict[tuple[int, int], RunCheckpoint] = {}
         self._policy_structures: dict[Hashable, Any] = {}
         self._compiled: set[Hashable] = set()
@@ -114,19 +111,42 @@ class TrainingRuns:
         """
         trainer = self.study.trainer
         key = digest({n: values[n] for n in sorted(trainer.used_hyperparameters(values))})
-        configuration, error = None, ""
         try:
             configuration = trainer.configuration(values, seed)
             configuration.check()
             steps = configuration.steps
         except (ValueError, TypeError) as problem:
-            configuration, error, steps = None, _one_line(problem), trainer.steps
+            configuration, steps = None, trainer.steps
+            self.errors[len(self.runs)] = _one_line(problem)
         checkpoints = self.study.checkpoints_of(steps)
-        self.runs.append(TrainingRun(dict(values), seed, key, checkpoints, configuration, error))
-        number = len(self.runs) - 1
-        if error:
-            self.errors[number] = error
-        return number
+        self.runs.append(TrainingRun(dict(values), seed, key, checkpoints, configuration))
+        return len(self.runs) - 1
+
+    def fork(self, number: int, rung: int, values: Hyperparameters) -> int:
+        """Add a run that goes on from a checkpoint of another, with other hyper-parameters.
+
+        **Returns:** its number.
+        """
+        self._assign_batches()
+        run, child = self.runs[number], len(self.runs)
+        lineage = (*(run.lineage or ((0, run.values),)), (rung + 1, dict(values)))
+        configuration = self.study.trainer.configuration(values, run.seed)
+        key = digest({"from": run.key, "at": run.checkpoints[rung], "values": dict(values)})
+        own = {"values": dict(values), "key": key, "configuration": configuration}
+        self.runs.append(replace(run, **own, lineage=lineage))
+        for at in range(rung + 1):
+            if (known := self._checkpoints.get((number, at))) is not None:
+                self._checkpoints[child, at] = known
+        for at, earlier in lineage:
+            self.changes[child, at] = self.study.trainer.configuration(earlier, run.seed)
+        batch, index = self._batches[number]
+        self._batches[child] = batch, batch.fork(index)
+        return child
+
+    def own_rungs(self, number: int) -> range:
+        """Return the numbers of the checkpoints of a run that are not those of an earlier one."""
+        lineage = self.runs[number].lineage
+        return range(lineage[-1][0] if lineage else 0, self.rungs(number))
 
     def rungs(self, number: int) -> int:
         """Return the number of checkpoints of a run."""
@@ -202,7 +222,8 @@ class TrainingRuns:
             work = []
             for number in block:
                 run = self.runs[number]
-                work.append((dict(run.values), run.seed, run.checkpoints[: rung + 1]))
+                lineage = run.lineage or ((0, run.values),)
+                work.append((lineage, run.seed, run.checkpoints[: rung + 1]))
             futures.append(self._executor.submit(train_block, self._shipment, work))
 
         def ended(index: int, results: list[list[Arrays] | str]) -> None:
@@ -244,11 +265,18 @@ class TrainingRuns:
         batch = self._batches[numbers[0]][0]
         number_of = {self._batches[n][1]: n for n in numbers}
         for at in range(rung + 1):
-            here = [n for n in numbers if at < self.rungs(n) and (n, at) not in self._checkpoints]
+            here = [n for n in numbers if at < self.rungs(n)]
+            for n in here:
+                if (n, at) in self.changes:
+                    batch.change(self._batches[n][1], self.changes[n, at])
+            # A training that was cut off is repeated from its beginning, with the same changes.
+            here = [n for n in here if self.changes or (n, at) not in self._checkpoints]
             targets = {self._batches[n][1]: self.runs[n].checkpoints[at] for n in here}
             began, busy = time.perf_counter(), 0.0
             for index in batch.advance(targets):
                 number = number_of[index]
+                if (number, at) in self._checkpoints:
+                    continue
                 policy, curve = batch.policy(index), Curve(*batch.curve(index))
                 arrays = _encode(policy, curve, batch.seconds(index))
                 self.cache.put({self.cache_name(number, at): arrays})
@@ -296,21 +324,22 @@ class TrainingRuns:
 
 
 def train_block(
-    shipment: Shipment[Study], work: Sequence[tuple[Mapping[str, Any], int, tuple[int, ...]]]
+    shipment: Shipment[Study], work: Sequence[tuple[Lineage, int, tuple[int, ...]]]
 ) -> list[list[Arrays] | str]:
-    """Train runs together from the start; called by a worker.
+    """Train runs, given by lineage, seed and checkpoints, together from the start; called by a
+    worker.
 
-    **Arguments:**
-    - `shipment`: the pickled study.
-    - `work`: for each run its hyper-parameters, its seed, and the steps of its checkpoints.
     **Returns:** for each run the arrays of its checkpoints, or its error in one line.
     """
     trainer = shipment.thing.trainer
     found: list[list[Arrays] | str] = []
     try:
-        batch = BatchedTraining([trainer.configuration(values, seed) for values, seed, _ in work])
-        arrays: list[list[Arrays]] = [[] for _ in work]
+        first = [trainer.configuration(lineage[0][1], seed) for lineage, seed, _ in work]
+        batch, arrays = BatchedTraining(first), [list[Arrays]() for _ in work]
         for at in range(max(len(checkpoints) for _, _, checkpoints in work)):
+            for i, (lineage, seed, _) in enumerate(work):
+                if at in dict(lineage):
+                    batch.change(i, trainer.configuration(dict(lineage)[at], seed))
             steps = {i: each[at] for i, (_, _, each) in enumerate(work) if at < len(each)}
             for i in batch.advance(steps):
                 arrays[i].append(_encode(batch.policy(i), Curve(*batch.curve(i)), batch.seconds(i)))
