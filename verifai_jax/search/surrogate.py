@@ -165,7 +165,7 @@ class Surrogate(NamedTuple):
         options = np.array(
             list(product([0], LENGTHS, NUGGETS)) + list(product([1], ALONG, NUGGETS))
         )
-        measure, (lengths, nuggets) = options[:, 0].astype(int), np.float32(options[:, 1:].T)
+        measure, (lengths, nuggets) = options[:, 0].astype(int), options[:, 1:].T.astype(np.float32)
         square = jax.vmap(squared_distances)(known, known)[measure]
         values = matern(square / lengths[:, None, None] ** 2)
         best, factor, half = _fit(
