@@ -57,8 +57,16 @@ def test_hyper_parameters_move_in_their_range_and_keep_the_structure():
     # A tenth of two decades.
     factors = sorted({round(each["rate"] / 0.1, 3) for each in moves})
     assert factors == pytest.approx([10**-0.2, 10**0.2], rel=1e-3)
+    last = {"rate": 1.0, "width": 4}  # At its end there is one way only.
+    moved = Population(step=0.1, anew=0.0).changed(last, study.space, study.trainer, rng)
+    assert moved == {"rate": pytest.approx(10**-0.2, rel=1e-3), "width": 4}
     anew = [Population(anew=1.0).changed(before, study.space, study.trainer, rng) for _ in "12345"]
     assert len({each["rate"] for each in anew}) == 5
+    mixed = {"rate": vj.Box(0.1, 0.9), "width": vj.Categorical(3, None)}
+    one = {"rate": 0.5, "width": 3}
+    found = WIDE.changed(one, vj.FeatureSpace(mixed), study.trainer, rng)
+    assert found["width"] == 3
+    assert found["rate"] != 0.5
     only = vj.FeatureSpace({"rate": vj.LogUniform(0.01, 1.0)}, where=lambda f: f["rate"] > 0.08)
     for _ in range(5):
         assert WIDE.changed({"rate": 0.1}, only, study.trainer, rng)["rate"] > 0.08

@@ -80,13 +80,17 @@ class Population:
         """Return other hyper-parameters of the same structure, which the space accepts."""
         import pandas as pd
 
-        at = space.points(pd.DataFrame([{n: values[n] for n in space.columns}]))[0]
-        moved = at + self.step * rng.choice([-1.0, 1.0], (TRIES, space.dim))
-        drawn = rng.random((TRIES, space.dim))
-        points = np.where(rng.random((TRIES, space.dim)) < self.anew, drawn, np.clip(moved, 0, 1))
+        # In a table, choices that are no numbers are texts.
+        row = {name: values[name] for name in space.columns}
+        row = {n: v if isinstance(v, bool | int | float) else str(v) for n, v in row.items()}
+        shape, at = (TRIES, space.dim), space.points(pd.DataFrame([row]))[0]
+        moved = np.abs(at + self.step * rng.choice([-1.0, 1.0], shape))
+        # What would leave the range turns at its end: an unchanged copy would train the same again.
+        points = np.where(rng.random(shape) < self.anew, rng.random(shape), 1 - np.abs(1 - moved))
         for candidate in values_at(space, points):
             found = _of_one_structure(values, candidate, trainer)
-            if space.where is None or bool(space.accepts(space.root.coerce(found))):
+            accepted = space.where is None or bool(space.accepts(space.root.coerce(found)))
+            if accepted and found != values:
                 return found
         return dict(values)
 
