@@ -159,7 +159,6 @@ class Replays:
         """Return the number of replays in one call, for numbers of rows and repetitions."""
         if count <= ONE_BY_ONE:
             return ONE_BY_ONE
-        # Few rows are divided among the devices, so that most lanes have one.
         some, many = LANES[0], LANES[1] * len(jax.local_devices())
         return many if count * times > CALLS * some else some
 

@@ -235,7 +235,7 @@ class Run(InNotebook):
 
         - `row`: the row in question; all rows when left out.
         """
-        now = None if self.problem is None else self.problem.sources(commit=False)
+        now = None if self.problem is None else self.problem.sources(git=False)
         return model_changes(self.sources, now, row)
 
     def changed_since(self, row: int | None = None) -> str:
@@ -265,7 +265,7 @@ class Run(InNotebook):
         then = sources_of_row(self.sources, row)
         if then is None or self.problem is None:
             return "the files of its model were not recorded, so it may have changed"
-        if versions := then.other_versions(self.problem.sources(commit=False)):
+        if versions := then.other_versions(self.problem.sources(git=False)):
             return f"no file of its model has changed, but these versions: {', '.join(versions)}"
         why = "the system has memory, chance or state of its own, or reads what is not recorded"
         if self.engine == "native":

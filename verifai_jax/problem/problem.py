@@ -188,16 +188,15 @@ class Problem(InNotebook):
         """True if the system runs on the host, where JAX cannot trace it."""
         return self.system.black_box
 
-    def sources(self, first: int = 0, commit: bool = True) -> Sources:
+    def sources(self, first: int = 0, git: bool = True) -> Sources:
         """Return the files that define the problem, with hashes, and versions of libraries.
 
         **Arguments:**
         - `first`: the first row of the table to which they apply.
-        - `commit`: whether git is asked for the commit, which a comparison of files does not need.
+        - `git`: whether git is asked for the commit, which a comparison of files does not need.
         """
         program = self.programs.get(FINGERPRINT, None, self._fingerprint)
-        made = self.made_in or ()
-        return sources_of(self, made=made, first=first, program=program, commit=commit)
+        return sources_of(self, made=self.made_in or (), first=first, program=program, git=git)
 
     def requirement_entries(self) -> dict[str, dict[str, str]]:
         """Return the content of the formulas' requirements, by identifier, as plain data."""

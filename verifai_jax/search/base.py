@@ -220,7 +220,7 @@ class Search(ForUsers, abc.ABC, Generic[State]):
 
     _internal = frozenset((
         "counting", "distinct", "fallback", "learns", "needs_derivatives", "origin", "plan",
-        "samples_prior", "sequence", "stage", "staying", "temperature", "total", "wants",
+        "proposed", "samples_prior", "sequence", "stage", "staying", "temperature", "total", "wants",
         "warm_start",
     ))  # fmt: skip
 

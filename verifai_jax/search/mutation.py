@@ -14,6 +14,7 @@ Nothing is fitted, so it works from the first few simulations on, when cross-ent
 fill its elite.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -94,30 +95,17 @@ class Mutation(Search[MutationState]):
         )
 
     def ask(self, state: MutationState, cube: Cube, batch: int) -> Asked[MutationState]:
-        u = self._proposed(state, cube, self._numbers(state, cube, batch))
+        u = self.proposed(state, cube, [(state.key, batch)])
         return u, state._replace(round=state.round + 1)
 
-    def ask_for_both(
-        self, state: MutationState, cube: Cube, batch: int, key: Key[Array, ""], more: int
-    ) -> tuple[Float[Array, "batch d"], Float[Array, "more d"], MutationState]:
-        """Propose points as `ask` does, and more of them with another key, by one program."""
-        numbers = (
-            self._numbers(state, cube, batch),
-            self._numbers(state._replace(key=key), cube, more),
-        )
-        u = self._proposed(state, cube, jnp.concatenate(numbers))
-        return u[:batch], u[batch:], state._replace(round=state.round + 1)
-
-    def _numbers(self, state: MutationState, cube: Cube, rows: int) -> Float[Array, "rows numbers"]:
-        """Draw the random numbers of so many proposals."""
-        key = jax.random.fold_in(state.key, state.round)
-        return draw_uniform(key, (rows, 16 + 4 * cube.dim))
-
-    def _proposed(
-        self, state: MutationState, cube: Cube, numbers: Float[Array, "n numbers"]
+    def proposed(
+        self, state: MutationState, cube: Cube, wanted: Sequence[tuple[Key[Array, ""], int]]
     ) -> Float[Array, "n d"]:
-        """Return the proposals of these random numbers."""
-        coins, values, cuts, masks, noise = jnp.split(numbers, 16 + cube.dim * np.arange(4), axis=1)
+        """Return proposals, of each key so many, by one program."""
+        keys = [(jax.random.fold_in(key, state.round), rows) for key, rows in wanted]
+        numbers = [draw_uniform(key, (rows, 16 + 4 * cube.dim)) for key, rows in keys]
+        ends = 16 + cube.dim * np.arange(4)
+        coins, values, cuts, masks, noise = jnp.split(jnp.concatenate(numbers), ends, axis=1)
         idle = jnp.minimum(state.stale / self.idle, 1.0)
         # Where all points are equally good there is nothing to start from, nor to lean to.
         level = (state.highest <= state.score[0]) & (state.score[0] >= 0)

@@ -202,15 +202,11 @@ class Portfolio(Search[PortfolioState]):
         return self
 
     def ask(self, state: PortfolioState, cube: Cube, batch: int) -> Asked[PortfolioState]:
-        before, modelled = state, None
-        if state.model is None:
-            mutated, mutation = Mutation().ask(state.mutation, cube, batch)
-        else:
-            key = jax.random.fold_in(state.key, state.mutation.round)
-            mutated, others, mutation = Mutation().ask_for_both(
-                state.mutation, cube, batch, key, CHOICES // 3
-            )
-            modelled = partial(state.model.propose, key, cube, batch, others, state.mutation.stale)
+        before, key = state, jax.random.fold_in(state.key, state.mutation.round)
+        wanted = [(state.mutation.key, batch), (key, CHOICES // 3)]
+        wanted = wanted[:1] if state.model is None else wanted
+        mutated, more = jnp.split(Mutation().proposed(state.mutation, cube, wanted), [batch])
+        mutation = state.mutation._replace(round=state.mutation.round + 1)
         drawn, cross_entropy = self._cross_entropy(batch).ask(state.cross_entropy, cube, batch)
         state = state._replace(mutation=mutation, cross_entropy=cross_entropy)
         share = self._shares(state, cube, batch)
@@ -248,10 +244,9 @@ class Portfolio(Search[PortfolioState]):
         u = jnp.where(
             member == GRADIENT, points, jnp.where(member == CROSS_ENTROPY, drawn, mutated)
         )
-        if modelled is not None:
-            u = jax.lax.cond(
-                rows[MODEL] > 0, lambda: jnp.where(member == MODEL, modelled(), u), lambda: u
-            )
+        if before.model is not None:
+            model = partial(before.model.propose, key, cube, batch, more, before.mutation.stale)
+            u = jnp.where(member == MODEL, jax.lax.cond(rows[MODEL] > 0, model, lambda: u), u)
         state = state._replace(rows=rows, differentiates=differentiates, opening=opening)
         if before.interior is None:
             return u, state

@@ -211,15 +211,13 @@ def _fit(
     covariances = jnp.broadcast_to(covariances, (len(noises), n, n))
     covariances += jnp.eye(n) * jnp.where(there, noises, 1.0)[:, None]
 
-    # All at once: a loop over them would be compiled, too.
-    factors = jax.lax.linalg.cholesky(covariances, symmetrize_input=False)
-    halves = jax.lax.linalg.triangular_solve(
-        factors, jnp.broadcast_to(y[:, None], (len(noises), n, 1)), left_side=True, lower=True
-    )[..., 0]
-    diagonals = jnp.diagonal(factors, axis1=1, axis2=2)
-    found = -0.5 * count * jnp.log(jnp.sum(halves**2, axis=1))
-    found -= jnp.sum(jnp.log(diagonals), axis=1)
-    found = jnp.where(jnp.isfinite(found), found, -jnp.inf)
+    def evidence(covariance: Array) -> tuple[Array, Array, Array]:
+        factor = jnp.linalg.cholesky(covariance)
+        half = solve_triangular(factor, y, lower=True)
+        found = -0.5 * count * jnp.log(half @ half) - jnp.sum(jnp.log(jnp.diag(factor)))
+        return jnp.where(jnp.isfinite(found), found, -jnp.inf), factor, half
+
+    found, factors, halves = jax.lax.map(evidence, covariances)
     best = jnp.argmax(found)
     return best, factors[best], halves[best]
 

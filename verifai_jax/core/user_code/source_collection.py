@@ -77,9 +77,8 @@ def made_here() -> tuple[Maker, ...]:
 
 
 def sources_of(
-    *things: object, made: Sequence[Maker] = (), first: int = 0, program: str = "",
-    commit: bool = True,
-) -> Sources:  # fmt: skip
+    *things: object, made: Sequence[Maker] = (), first: int = 0, program: str = "", git: bool = True
+) -> Sources:
     """Return the files and versions of some objects: code as imported, data as declared.
 
     **Arguments:**
@@ -87,7 +86,7 @@ def sources_of(
     - `made`: the modules in which they were made, from `made_here`.
     - `first`: the first row of a table to which they apply.
     - `program`: the fingerprint of the traced program; empty without one.
-    - `commit`: whether git is asked for the commit, for a record.
+    - `git`: whether git is asked for the commit, which a comparison of files does not need.
     """
     modules: dict[str, Source] = {}
     others: dict[str, Source] = {}
@@ -121,10 +120,10 @@ def sources_of(
     files += sorted(others.values())
     files += [Source(PROGRAM, PROGRAM, program)] if program else []
     tree = next((tree for tree in map(tree_of, modules) if tree is not None), None)
-    oid, dirty = _checked_out() if tree is None and commit else ("", False)
+    commit, dirty = _checked_out() if tree is None and git else ("", False)
     root, revision = Path.cwd().as_posix(), "" if tree is None else tree_commits[tree]
     without_file = tuple(without)
-    return Sources(tuple(files), versions(), without_file, root, first, oid, dirty, revision)
+    return Sources(tuple(files), versions(), without_file, root, first, commit, dirty, revision)
 
 
 def _checked_out() -> tuple[str, bool]:
