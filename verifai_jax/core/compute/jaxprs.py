@@ -15,14 +15,13 @@ CALLS = frozenset({
 """Steps that call a function, which has no derivative of its own."""
 CUSTOM_CALLS = frozenset({"custom_jvp_call", "custom_vjp_call", "custom_vjp_call_jaxpr"})
 """Steps that call a function with a derivative of its own."""
-_ALL_CALLS = CALLS | CUSTOM_CALLS
 _PARAMETERS = ("jaxpr", "call_jaxpr", "fun_jaxpr", "call")
 """Parameters by which such steps hold the program of the function."""
 
 
 def called(step: Any) -> Any | None:
     """Return the program that an equation calls once on its operands; None if it calls none."""
-    if step.primitive.name not in _ALL_CALLS:
+    if step.primitive.name not in CALLS and step.primitive.name not in CUSTOM_CALLS:
         return None
     return next(step.params[name] for name in _PARAMETERS if name in step.params)
 
