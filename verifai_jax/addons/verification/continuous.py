@@ -53,10 +53,9 @@ def between_samples(problem: Problem) -> Problem:
                 "continuous=True supports formulas with comparisons, not, and, or, always, "
                 f"eventually, historically, once and durations; {part} is about single samples"
             )
-        if not getattr(part, "interval", Interval()).closed:
+        if not (window := getattr(part, "interval", Interval())).closed:
             raise ProblemError(
-                f"continuous=True needs windows with both of their ends, written [a,b]; {part} has "
-                f"the window {part.interval}"
+                f"continuous=True needs closed windows, such as [0,1], not the {window} of {part}"
             )
 
     def during(time: Any, state: PyTree, control: Any, features: Any) -> Any:
@@ -95,8 +94,8 @@ def _measured(formula: Formula) -> Formula:
     """Return a formula whose durations are those of time, not of samples."""
 
     def measured(part: Term) -> Term | None:
-        own = [*map(_measured, part.counted)] if isinstance(part, Duration) else None
-        return own and _Measure.of(own, part.window)
+        own = part if isinstance(part, Duration) else None
+        return None if own is None else _Measure.of([*map(_measured, own.counted)], own.window)
 
     return changed_leaves(formula, lambda leaf: with_terms(leaf, measured))
 

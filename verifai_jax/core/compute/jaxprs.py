@@ -18,7 +18,6 @@ CALLS = frozenset({
 """Steps that call a function, which has no derivative of its own."""
 CUSTOM_CALLS = frozenset({"custom_jvp_call", "custom_vjp_call", "custom_vjp_call_jaxpr"})
 """Steps that call a function with a derivative of its own."""
-_ALL_CALLS = CALLS | CUSTOM_CALLS
 _PARAMETERS = ("jaxpr", "call_jaxpr", "fun_jaxpr", "call")
 """Parameters by which such steps hold the program of the function."""
 WRITTEN_OUT: dict[str, Callable[..., Any]] = {
@@ -32,8 +31,8 @@ WRITTEN_OUT: dict[str, Callable[..., Any]] = {
 def called(step: Any) -> Any | None:
     """Return the program that an equation calls once on its operands; None if it calls none."""
     name = step.primitive.name
-    if name in _ALL_CALLS:
-        return next(step.params[name] for name in _PARAMETERS if name in step.params)
+    if name in CALLS or name in CUSTOM_CALLS:
+        return next(step.params[key] for key in _PARAMETERS if key in step.params)
     if name in WRITTEN_OUT or name == "call_hi_primitive":
         function = WRITTEN_OUT.get(name) or step.params["_prim"].expand
         return _traced(function, *((each.aval.shape, each.aval.dtype) for each in step.invars))
