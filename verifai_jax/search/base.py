@@ -220,7 +220,7 @@ class Search(ForUsers, abc.ABC, Generic[State]):
 
     _internal = frozenset((
         "counting", "distinct", "fallback", "learns", "needs_derivatives", "origin", "plan",
-        "proposed", "samples_prior", "sequence", "stage", "staying", "temperature", "total", "wants",
+        "samples_prior", "sequence", "stage", "staying", "temperature", "total", "wants",
         "warm_start",
     ))  # fmt: skip
 
