@@ -22,8 +22,8 @@ if TYPE_CHECKING:
     from verifai_jax.addons.assurance.signing import sign_report as sign_report
     from verifai_jax.addons.assurance.traceability import TraceMatrix as TraceMatrix
     from verifai_jax.addons.assurance.traceability import trace_matrix as trace_matrix
-    from verifai_jax.addons.avoidability import LastChance as LastChance
-    from verifai_jax.addons.avoidability import last_chance as last_chance
+    from verifai_jax.addons.avoidability._last_chance import last_chance as last_chance
+    from verifai_jax.addons.avoidability.result import LastChance as LastChance
     from verifai_jax.addons.checking import replay_counterexamples as replay_counterexamples
     from verifai_jax.addons.checking import test as test
     from verifai_jax.addons.estimation import Estimate as Estimate
@@ -50,9 +50,9 @@ if TYPE_CHECKING:
     from verifai_jax.addons.events.reactive import Reactive as Reactive
     from verifai_jax.addons.faults.failure_table import FailureTable as FailureTable
     from verifai_jax.addons.faults.failure_table import fmea as fmea
-    from verifai_jax.addons.fuzzing import FuzzCoverage as FuzzCoverage
-    from verifai_jax.addons.fuzzing import FuzzRun as FuzzRun
-    from verifai_jax.addons.fuzzing import fuzz as fuzz
+    from verifai_jax.addons.fuzzing._fuzz import fuzz as fuzz
+    from verifai_jax.addons.fuzzing.coverage import FuzzCoverage as FuzzCoverage
+    from verifai_jax.addons.fuzzing.run import FuzzRun as FuzzRun
     from verifai_jax.addons.reports import plain_errors as plain_errors
     from verifai_jax.addons.rl import policies as policies
     from verifai_jax.addons.rl.policies import policy as policy
@@ -74,11 +74,11 @@ if TYPE_CHECKING:
     from verifai_jax.addons.simulators.mujoco import native as native
     from verifai_jax.addons.simulators.program import program as program
     from verifai_jax.addons.simulators.remote import remote as remote
-    from verifai_jax.addons.synthesis import Aim as Aim
-    from verifai_jax.addons.synthesis import Repair as Repair
-    from verifai_jax.addons.synthesis import Synthesis as Synthesis
-    from verifai_jax.addons.synthesis import repair as repair
-    from verifai_jax.addons.synthesis import synthesize as synthesize
+    from verifai_jax.addons.synthesis._repair import repair as repair
+    from verifai_jax.addons.synthesis._synthesize import synthesize as synthesize
+    from verifai_jax.addons.synthesis.aim import Aim as Aim
+    from verifai_jax.addons.synthesis.results import Repair as Repair
+    from verifai_jax.addons.synthesis.results import Synthesis as Synthesis
     from verifai_jax.addons.training import augmentation as augmentation
     from verifai_jax.addons.training.augmentation import Augmentation as Augmentation
     from verifai_jax.addons.training.augmentation import SupervisedTask as SupervisedTask
@@ -97,9 +97,9 @@ if TYPE_CHECKING:
     from verifai_jax.addons.training.sweeps import Trainer as Trainer
     from verifai_jax.addons.training.sweeps import load_sweep as load_sweep
     from verifai_jax.addons.training.sweeps import sweep as sweep
-    from verifai_jax.addons.verification import Verification as Verification
-    from verifai_jax.addons.verification import load_verification as load_verification
-    from verifai_jax.addons.verification import verify as verify
+    from verifai_jax.addons.verification._verify import verify as verify
+    from verifai_jax.addons.verification.result import Verification as Verification
+    from verifai_jax.addons.verification.result import load_verification as load_verification
     from verifai_jax.core.values.trace import Status as Status
     from verifai_jax.core.values.trace import Trace as Trace
     from verifai_jax.core.values.waveform import Waveform as Waveform

@@ -406,6 +406,20 @@ def test_the_help_may_be_cut_off_too():
 
 
 @pytest.mark.addons
+def test_the_help_of_all_commands_imports_nothing_heavy():
+    code = (
+        "import atexit, sys\nfrom verifai_jax.cli.main import main\n"
+        "atexit.register(lambda: print(*{'jax', 'pandas'} & {*sys.modules}, file=sys.stderr))"
+        "\nmain()"
+    )
+    command = [sys.executable, "-c", code, "--help"]
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
+    done = subprocess.run(command, capture_output=True, timeout=60, env=environment, check=True)
+    assert b"last-chance" in done.stdout
+    assert done.stderr.strip() == b""
+
+
+@pytest.mark.addons
 @pytest.mark.parametrize("words", [["--help"], ["monitor", "always x > 0", "log.csv"]])
 def test_an_output_that_cannot_be_written_is_one_line(tmp_path, words):
     if not Path("/dev/full").exists():

@@ -60,7 +60,7 @@ def test_results_show_themselves(problem, run):
 @pytest.mark.addons
 def test_results_of_every_verb_show_themselves():
     from verifai_jax import counterexamples
-    from verifai_jax.addons import analysis, synthesis
+    from verifai_jax.addons import analysis
     from verifai_jax.addons.checking.check import CheckOutcome
     from verifai_jax.addons.estimation.certification.result import Certificate
     from verifai_jax.addons.estimation.comparison.result import Transfer
@@ -74,7 +74,7 @@ def test_results_of_every_verb_show_themselves():
     verbs = [vj.Estimate, vj.Modes, vj.Comparison, vj.Certificates, vj.Augmentation]
     verbs += [vj.Synthesis, vj.Repair, vj.Confirmation, vj.Confirmations, vj.FuzzRun]
     verbs += [counterexamples.Explained, counterexamples.Shrunk, vj.Mode]
-    verbs += [vj.perception.Compositional, synthesis.Repair, vj.mtl.Explanation, vj.mtl.Mined]
+    verbs += [vj.perception.Compositional, vj.mtl.Explanation, vj.mtl.Mined]
     verbs += [vj.mtl.Judgement, Transfer, Hardening, vj.Study, Certificate]
     verbs += [analysis.Clusters, analysis.Diverse, analysis.FrequentPatterns, analysis.Neighbours]
     verbs += [CheckOutcome, SequenceEstimate, HyperparameterImportance, Score, FailureTable]

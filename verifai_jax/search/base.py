@@ -220,8 +220,8 @@ class Search(ForUsers, abc.ABC, Generic[State]):
 
     _internal = frozenset((
         "counting", "distinct", "fallback", "learns", "needs_derivatives", "origin", "plan",
-        "proposed", "samples_prior", "sequence", "stage", "staying", "temperature", "total",
-        "wants", "warm_start",
+        "samples_prior", "sequence", "stage", "staying", "temperature", "total", "wants",
+        "warm_start",
     ))  # fmt: skip
 
     @property

@@ -14,8 +14,8 @@ import verifai_jax as vj
 from envs import cartpole
 from specs.cartpole import balance
 from specs.tuning import decay, first_order, gains
+from verifai_jax import repair
 from verifai_jax.addons.rl import load_policy
-from verifai_jax.addons.synthesis import repair
 from verifai_jax.addons.synthesis.commands.repair import repair as command
 
 

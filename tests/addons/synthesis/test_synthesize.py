@@ -12,7 +12,7 @@ from scipy.stats import norm
 
 import verifai_jax as vj
 from specs.tuning import decay, first_order
-from verifai_jax.addons.synthesis import repair, synthesize
+from verifai_jax import repair, synthesize
 from verifai_jax.addons.synthesis.commands.synthesize import synthesize as command
 from verifai_jax.addons.synthesis.parametric import FeatureParameters
 

@@ -45,8 +45,8 @@ from verifai_jax.statistics.binomial import clopper_pearson
 from verifai_jax.statistics.stopping import Stop
 
 if TYPE_CHECKING:
-    from verifai_jax.addons.verification import Verification
     from verifai_jax.addons.verification.rest import Rest
+    from verifai_jax.addons.verification.result import Verification
 GRADIENTS_FROM = 3
 """Continuous coordinates from which the searches for failing regions take gradients."""
 CHEAP_BATCH = 4096

@@ -30,7 +30,7 @@ from verifai_jax.addons.assurance.qualification.recorded_oracles import (
 )
 from verifai_jax.addons.estimation import estimate
 from verifai_jax.addons.estimation.comparison import compare
-from verifai_jax.addons.verification import verify
+from verifai_jax.addons.verification._verify import verify
 from verifai_jax.core.values.trace import Trace
 from verifai_jax.counterexamples import shrink
 from verifai_jax.falsification import falsify, load, resume, simulate
