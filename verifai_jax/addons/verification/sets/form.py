@@ -118,7 +118,7 @@ class Form:
         slopes = symbols[:, None] * np.where(finite, whole.radius, 0.0)
         radius = np.where((symbols != 0).any(0) & finite, SLACK * whole.size, whole.radius)
         form = cls(whole.centre, slopes, radius, whole.size, dtype, whole.low, whole.high)
-        form._bounds = whole.low, whole.high
+        form._bounds = whole.bounds()
         return form
 
     @property
@@ -163,7 +163,8 @@ class Form:
             move(self.centre, 1), None if self.slopes is None else move(self.slopes, 2),
             move(self.radius, 1), move(self.size, 1), self.dtype, low, high, self.frame, common,
         )  # fmt: skip
-        if self._bounds is not None and self._bounds[0] is self.low:
+        known = self._bounds is not None and self._bounds[0] is self.low
+        if known and low is not None and high is not None:
             form._bounds = low, high
         return form
 

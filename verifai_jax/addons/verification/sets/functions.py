@@ -51,7 +51,7 @@ class Function(NamedTuple):
     def __call__(self, x: Form) -> Form:
         """Return the set of its values on a set."""
         (low, high), (first, last), spread = x.bounds(), self.domain, x.spread
-        wide, points = high - low, [low, high]
+        wide, outside, points = high - low, np.zeros(1, bool), [low, high]
         # Nothing is an exception where all is within the domain, and as wide as some number.
         plain = affine.least(wide) > 0 and affine.greatest(spread) < np.inf
         if np.isfinite(first) or np.isfinite(last):
@@ -65,7 +65,7 @@ class Function(NamedTuple):
             slope = np.where(np.isfinite(slope), slope, 0.0)
         lowest, highest = values
         if not self.rises:
-            turns = self._points(np.float64(0), *points)
+            turns = self._points(np.zeros(1), *points)
             lowest, highest = _extremes([*values, *(self.value(point) for point in turns)])
         inner = self._points(slope, *points)
         points, values = points + inner, values + [self.value(point) for point in inner]

@@ -96,8 +96,8 @@ def _times(
             one = np.eye(math.prod(a.shape))
             matrix = times(one.reshape(len(one), *a.shape), numbers).reshape(len(one), -1)
         # Their rounding, and that of factors that go back through the matrix.
-        own = sums.radius - gross * (1 - (terms + 1) * SLACK)
-        sums.common = through_layer(matrix, a, own)
+        alone = sums.radius - gross * (1 - (terms + 1) * SLACK)
+        sums.common = through_layer(matrix, a, alone)
         if sums.common is not None:
             sums.radius = refined(sums.radius, sums.common)
     return sums
