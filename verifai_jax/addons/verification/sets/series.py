@@ -34,10 +34,9 @@ CURVED = frozenset({
 })  # fmt: skip
 """Functions with derivatives of all orders, which JAX knows."""
 SLOPES: dict[str, Callable[[Array], Array]] = {
-    "asinh": lambda x: jax.lax.rsqrt(1 + x * x),
-    "erf": lambda x: 2 / np.sqrt(np.pi) * jnp.exp(-x * x),
-    "erfc": lambda x: -2 / np.sqrt(np.pi) * jnp.exp(-x * x),
-}
+    "asinh": lambda x: jax.lax.rsqrt(1 + x * x), "erf": lambda x: 2 / np.pi**0.5 * jnp.exp(-x * x),
+    "erfc": lambda x: -2 / np.pi**0.5 * jnp.exp(-x * x),
+}  # fmt: skip
 """Derivatives in one formula, for which JAX 0.12 has branches by the size of the number."""
 LINEAR = frozenset({
     "add", "add_any", "broadcast_in_dim", "concatenate", "copy", "convert_element_type", "cumsum",
@@ -62,8 +61,7 @@ class Node(NamedTuple):
 class Rates:
     """The rates of a differential equation as nodes, with coefficients up to an order.
 
-    Its program has the shared operands, which do not vary, as constants, and a time and a state as
-    inputs.
+    Its program has the shared operands, which do not vary, as constants; time and state are inputs.
 
     **Raises:** `MissingRule` for rates that are not smooth, with the operation and its line.
     """
@@ -119,9 +117,8 @@ class Rates:
         varies = [self.nodes[each].varies for each in operands]
         if name == "pow" and varies[1]:
             forms = [jax.ShapeDtypeStruct(v.aval.shape, v.aval.dtype) for v in step.invars]
-            return self._through(
-                jax.make_jaxpr(lambda x, y: jnp.exp(y * jnp.log(x)))(*forms), operands
-            )
+            power = jax.make_jaxpr(lambda x, y: jnp.exp(y * jnp.log(x)))(*forms)
+            return self._through(power, operands)
         first, last = CHOOSING.get(name, (0, None))
         choices = varies[:first] + ([] if last is None else varies[last:])
         real = all(jnp.issubdtype(out.aval.dtype, jnp.floating) for out in step.outvars)
@@ -144,8 +141,8 @@ class Rates:
 
     def _is_square(self, number: int) -> bool:
         step, operands, *_ = self.nodes[number]
-        name = "" if step is None else step.primitive.name
-        return name in ("mul", "square", "integer_pow") and operands[1:] == operands[:1]
+        same = step is not None and operands[1:] == operands[:1]
+        return same and step.primitive.name in ("mul", "square", "integer_pow")
 
     def slopes(self, number: int) -> list[tuple[int, int]]:
         """Return the operands of a function that vary, each with the derivative by it."""
@@ -158,16 +155,14 @@ class Rates:
             for i, operand in enumerate(operands):
 
                 def slope(*values: Array, i: int = i) -> Array:
-                    if step.primitive.name in SLOPES:
-                        return SLOPES[step.primitive.name](*values)
-
                     def of(x: Array) -> Array:
                         return step.primitive.bind(*values[:i], x, *values[i + 1 :], **step.params)
 
                     return jax.jvp(of, (values[i],), (jnp.ones_like(values[i]),))[1]
 
                 if self.nodes[operand].varies:
-                    (found,) = self._through(jax.make_jaxpr(slope)(*forms), operands)
+                    program = jax.make_jaxpr(SLOPES.get(step.primitive.name, slope))(*forms)
+                    (found,) = self._through(program, operands)
                     self._slopes[number].append((operand, found))
         return self._slopes.get(number, [])
 
