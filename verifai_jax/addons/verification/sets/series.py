@@ -141,8 +141,8 @@ class Rates:
 
     def _is_square(self, number: int) -> bool:
         step, operands, *_ = self.nodes[number]
-        same = step is not None and operands[1:] == operands[:1]
-        return same and step.primitive.name in ("mul", "square", "integer_pow")
+        names = ("mul", "square", "integer_pow")
+        return step is not None and step.primitive.name in names and operands[1:] == operands[:1]
 
     def slopes(self, number: int) -> list[tuple[int, int]]:
         """Return the operands of a function that vary, each with the derivative by it."""
