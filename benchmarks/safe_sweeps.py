@@ -19,7 +19,9 @@ configurations. The sides are
   arguments of one program, and each policy is simulated in one program at independent samples, as
   many as show it to be safe if none fails or one in four hundred does, with Clopper-Pearson bounds
   that hold together (Bonferroni). It needs `pip install optuna rejax gymnax`, and is left out in
-  words without them.
+  words without them;
+- `stable_baselines`: the same with PPO of stable-baselines3, whose environments step together in a
+  program of JAX. It needs `pip install optuna stable-baselines3 gymnax`.
 
 Times are of this process's processors. Each side runs once before, with four configurations and
 other seeds, so that programs are compiled; what that took is printed apart. `first` is the
@@ -243,53 +245,21 @@ def parameters_of(task: Any) -> Any:
     return () if jax.tree.leaves(task) == [task] else task
 
 
-class RejaxSide:
-    """Optuna, rejax and Monte Carlo, whose programs are compiled once for all configurations."""
+class OptunaSide:
+    """Optuna, another trainer, and Monte Carlo."""
 
     def __init__(self, case: Case) -> None:
         import optuna
-        import rejax  # pyright: ignore[reportMissingImports]
 
         optuna.logging.set_verbosity(optuna.logging.WARNING)
         self.case, self.optuna = case, optuna
-        ours = PPO(**case.settings)
-        self.algorithm = rejax.PPO.create(
-            env=environment_of(case),
-            env_params=parameters_of(case.task),
-            num_envs=ours.environments,
-            num_steps=ours.horizon,
-            num_epochs=ours.epochs,
-            num_minibatches=ours.minibatches,
-            max_grad_norm=ours.max_gradient,
-            normalize_observations=ours.normalise,
-            agent_kwargs={"hidden_layer_sizes": HIDDEN, "activation": "tanh"},
-            total_timesteps=case.steps,
-            eval_freq=case.steps,
-            skip_initial_evaluation=True,
-        ).replace(eval_callback=lambda *_: ())
-
-        def train(algorithm: Any, key: Any) -> Any:
-            state, _ = algorithm.train(key)
-            return state.actor_ts.params["params"], state.obs_rms_state
-
-        self.train = jax.jit(train)
         self.simulate = jax.jit(
             lambda policy, points: jax.vmap(case.problem(policy).objective())(points)
         )
 
-    def policy(self, weights: Any, statistics: Any) -> Policy:
-        """Return rejax' network as a policy of ours."""
-        kind = self.case.task.action
-        last = weights["action_logits" if isinstance(kind, Discrete) else "action_mean"]
-        dense = [*weights["features"].values(), last]
-        layers = [(one["kernel"], one["bias"]) for one in dense]
-        if isinstance(kind, Continuous):
-            middle, half = (kind.high + kind.low) / 2, (kind.high - kind.low) / 2
-            layers[-1] = (layers[-1][0] / half, (layers[-1][1] - middle) / half)
-        mean = scale = None
-        if self.case.settings.get("normalise"):
-            mean, scale = statistics.mean, jnp.sqrt(statistics.var + 1e-8)
-        return Policy(tuple(layers), mean, scale, None, kind)
+    def trained(self, task: Any, values: dict[str, float], seed: int) -> Policy:
+        """Return the policy that a training on a task with hyper-parameters ends with."""
+        raise NotImplementedError
 
     def run(self, configurations: int, seed: int) -> Outcome:
         """Propose, train, and certify each policy."""
@@ -308,9 +278,8 @@ class RejaxSide:
             task = dataclasses.replace(
                 self.case.task, **{n: jnp.float32(values[n]) for n in self.case.ranges}
             )
-            named = {THEIR_NAMES.get(n, n): jnp.float32(values[n]) for n in OPTIMISER}
-            algorithm = self.algorithm.replace(env_params=parameters_of(task), **named)
-            policy = self.policy(*self.train(algorithm, jax.random.key(1000 * seed + number)))
+            named = {name: values[name] for name in OPTIMISER}
+            policy = self.trained(task, named, 1000 * seed + number)
             study.tell(trial, float(evaluate(self.case.nominal, policy, episodes=20).mean()))
             policies.append(policy)
         seconds["training"] = time.process_time() - began
@@ -332,6 +301,76 @@ class RejaxSide:
         return upper_bound(failures, count, confidence) < P
 
 
+class RejaxSide(OptunaSide):
+    """Optuna and rejax, whose program is compiled once for all configurations."""
+
+    def __init__(self, case: Case) -> None:
+        import rejax  # pyright: ignore[reportMissingImports]
+
+        super().__init__(case)
+        ours = PPO(**case.settings)
+        self.algorithm = rejax.PPO.create(
+            env=environment_of(case),
+            env_params=parameters_of(case.task),
+            num_envs=ours.environments,
+            num_steps=ours.horizon,
+            num_epochs=ours.epochs,
+            num_minibatches=ours.minibatches,
+            max_grad_norm=ours.max_gradient,
+            normalize_observations=ours.normalise,
+            agent_kwargs={"hidden_layer_sizes": HIDDEN, "activation": "tanh"},
+            total_timesteps=case.steps,
+            eval_freq=case.steps,
+            skip_initial_evaluation=True,
+        ).replace(eval_callback=lambda *_: ())
+
+        def train(algorithm: Any, key: Any) -> Any:
+            state, _ = algorithm.train(key)
+            return state.actor_ts.params["params"], state.obs_rms_state
+
+        self.train = jax.jit(train)
+
+    def trained(self, task: Any, values: dict[str, float], seed: int) -> Policy:
+        named = {THEIR_NAMES.get(n, n): jnp.float32(value) for n, value in values.items()}
+        algorithm = self.algorithm.replace(env_params=parameters_of(task), **named)
+        return self.policy(*self.train(algorithm, jax.random.key(seed)))
+
+    def policy(self, weights: Any, statistics: Any) -> Policy:
+        """Return rejax' network as a policy of ours."""
+        kind = self.case.task.action
+        last = weights["action_logits" if isinstance(kind, Discrete) else "action_mean"]
+        dense = [*weights["features"].values(), last]
+        layers = [(one["kernel"], one["bias"]) for one in dense]
+        if isinstance(kind, Continuous):
+            middle, half = (kind.high + kind.low) / 2, (kind.high - kind.low) / 2
+            layers[-1] = (layers[-1][0] / half, (layers[-1][1] - middle) / half)
+        mean = scale = None
+        if self.case.settings.get("normalise"):
+            mean, scale = statistics.mean, jnp.sqrt(statistics.var + 1e-8)
+        return Policy(tuple(layers), mean, scale, None, kind)
+
+
+class StableBaselinesSide(OptunaSide):
+    """Optuna and stable-baselines3, whose environments step in one program of JAX."""
+
+    def __init__(self, case: Case) -> None:
+        from benchmarks import stable_baselines
+
+        super().__init__(case)
+        self.trainer = stable_baselines
+        self.programs = stable_baselines.programs_of(environment_of(case))
+
+    def trained(self, task: Any, values: dict[str, float], seed: int) -> Policy:
+        case, parameters = self.case, parameters_of(task)
+        return self.trainer.train(
+            self.programs, parameters, case.task.action, PPO(**case.settings), case.steps, values,
+            HIDDEN, seed,
+        )  # fmt: skip
+
+
+THEIRS = {"rejax": RejaxSide, "stable_baselines": StableBaselinesSide}
+
+
 def failure_rate(case: Case, policy: Any, count: int) -> float:
     """Count failures among fresh simulations that decided nothing."""
     run = vj.falsify(
@@ -344,7 +383,7 @@ def main() -> None:
     """Print what each side finds in an hour of a processor."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("cases", nargs="+", choices=list(CASES))
-    sides = [*SIDES, "rejax"]
+    sides = [*SIDES, *THEIRS]
     parser.add_argument("--sides", nargs="+", choices=sides, default=sides)
     parser.add_argument("--configurations", type=int, default=32)
     parser.add_argument("--seeds", type=int, nargs="+", default=[0])
@@ -356,9 +395,9 @@ def main() -> None:
         case = CASES[name]
         print(f"{name}: {chosen.configurations} configurations of {case.steps:,} steps at most")
         for side in chosen.sides:
-            if side == "rejax":
+            if side in THEIRS:
                 try:
-                    run = RejaxSide(case).run
+                    run = THEIRS[side](case).run
                 except ImportError as error:
                     print(f"  {side}: left out, {error}")
                     continue
