@@ -198,6 +198,7 @@ def test_a_black_box_tells_what_happens_too():
 
     problem = vj.Problem("box", BANDED.space, box, "always (x < 1 & y < 1)")
     run = vj.falsify(
-        problem, vj.search.Diverse(vj.search.CrossEntropy(), by="behaviour"), 400, seed=0
-    )
+        problem, vj.search.Diverse(vj.search.CrossEntropy(), by="behaviour"), 400, seed=0,
+        confirm=False,
+    )  # fmt: skip
     assert kinds(run) >= 7
