@@ -203,6 +203,7 @@ class TestWithScenic:
         root = GALLERY.parents[3]
         monkeypatch.chdir(root)
         page = (root / "docs" / "scenic.md").read_text()
+        page = re.sub(r"<!-- not run.*?-->\n```.*?```", "", page, flags=re.DOTALL)
         blocks = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
         names: dict = {"__name__": "page"}
         for block in blocks:

@@ -19,6 +19,7 @@ from verifai_jax.core.display.figure import Figure
 from verifai_jax.core.messages.text import format_error, one_line
 from verifai_jax.counterexamples import Explained, Shrunk, explain, shrink
 from verifai_jax.evaluation.replay import Replay
+from verifai_jax.evaluation.run_on import RunOn
 from verifai_jax.falsification.run import Run
 from verifai_jax.pictures.animation import animate
 
@@ -142,8 +143,8 @@ def study(
 def _modes(run: Run, budget: int) -> ModesSection:
     assert run.problem is not None
     return extension("verifai_jax.reports", "modes")(
-        run.problem, budget, seed=run.seed, precision=run.precision, backend=run.backend,
-        progress=False,
+        run.problem, budget, seed=run.seed, precision=run.precision,
+        run_on=RunOn(backend=run.backend), progress=False,
     )  # fmt: skip
 
 
