@@ -94,7 +94,7 @@ def test_the_region_is_that_of_brute_force():
 def test_what_is_confirmed_fails_because_the_network_errs():
     result = vj.perception.abstract(
         problem(), lambda s: braking(late(s)), frame, ERROR,
-        search="uniform", budget=1000, samples=500, stop_after=3, batch=40,
+        search="uniform", budget=1000, samples=500, stop=vj.Stop(after=3), batch=40,
     )  # fmt: skip
     assert result.ended == "found"
     assert len(result.confirmed) == 3
@@ -120,7 +120,7 @@ def test_what_is_confirmed_fails_because_the_network_errs():
         result.replay(7)
     again = vj.perception.abstract(
         problem(), lambda s: braking(late(s)), frame, ERROR,
-        search="uniform", budget=1000, samples=500, stop_after=3, batch=40,
+        search="uniform", budget=1000, samples=500, stop=vj.Stop(after=3), batch=40,
     )  # fmt: skip
     pd.testing.assert_frame_equal(again.candidates, result.candidates)
 
