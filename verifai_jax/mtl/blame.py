@@ -30,7 +30,7 @@ def broken_at(formula: Formula, trace: Trace, end: End = "hold") -> dict[Formula
     **Arguments:** as in `robustness`; the trace is evenly spaced.
     **Returns:** by predicate the samples of the trace, without those after its last valid one.
     """
-    return _Blame(HostValues.of(trace, "truncate" if end == "truncate" else "hold")).of(formula)
+    return _Blame(HostValues.for_verdict(trace, end)).of(formula)
 
 
 def certain_from(formula: Formula, trace: Trace, end: End = "hold") -> int | None:
@@ -42,10 +42,7 @@ def certain_from(formula: Formula, trace: Trace, end: End = "hold") -> int | Non
 
     **Arguments:** as in `broken_at`.
     """
-    values, formula = (
-        HostValues.of(trace, "truncate" if end == "truncate" else "hold"),
-        expand(formula),
-    )
+    values, formula = HostValues.for_verdict(trace, end), expand(formula)
     leaves = [part for part in dict.fromkeys(formula.subformulas(True)) if part.is_predicate]
     left = values.length - np.arange(values.length)
     signals = {f"p{i}": left * values.truth(part) for i, part in enumerate(leaves)}

@@ -80,6 +80,11 @@ class HostValues:
         truths = frozenset(filter(trace.is_truth, signals))
         return cls(signals, dt, end, trace.stride, truths=truths, units=trace.units)
 
+    @classmethod
+    def for_verdict(cls, trace: Trace, end: End) -> "HostValues":
+        """Return the values that a verdict has: a strict one needs no sample after the last."""
+        return cls.of(trace, "truncate" if end == "truncate" else "hold")
+
     @functools.cached_property
     def _sizes(self) -> dict[str, int]:
         return sizes_of(self.signals, self.lanes)

@@ -83,7 +83,7 @@ def plot_replay(
     clock = np.asarray(trace.clock())
     decisive = decisive_instant(formulas[name], trace, replay.problem.end)
     broken, held = _broken(replay), _held(replay)
-    values_of = _values(trace, replay.problem.end)
+    values_of = HostValues.for_verdict(trace, replay.problem.end)
     figure = new_figure(figsize=(8, 1.2 + 1.45 * len(shown)))
     panels = figure.subplots(len(shown), 1, sharex=True, squeeze=False).ravel()
     for axes, signal in zip(panels, shown, strict=True):
@@ -213,16 +213,11 @@ def decisive_instant(formula: Formula, trace: Trace, end: End = "hold") -> tuple
     """
     if not all(np.all(np.isfinite(np.asarray(trace.signals[n]))) for n in formula.signals()):
         return None
-    values = _values(trace, end)
+    values = HostValues.for_verdict(trace, end)
     decided = values.walk(formula).decision(formula)
     if decided is None or not (named := decided[0].signals()):
         return None
     return named[0], min(decided[1], values.length - 1) // values.stride
-
-
-def _values(trace: Trace, end: End) -> HostValues:
-    """Return what formulas are on a trace, in NumPy, where nothing compiles."""
-    return HostValues.of(trace, "truncate" if end == "truncate" else "hold")
 
 
 def _bounds(replay: Replay, signal: str, shown: Sequence[str]) -> dict[Formula, list[Expression]]:
@@ -267,7 +262,7 @@ def _draw_limits(
         constant = constant_value(limit)
         course: Any = constant
         if constant is None:
-            course = _values(trace, "hold")(limit >= 0)[:: trace.stride]
+            course = HostValues.for_verdict(trace, "hold")(limit >= 0)[:: trace.stride]
         # A bound far away would squeeze the signal into a flat line, unless it is one.
         if np.min(np.abs(course)) > 4 * reach and np.ptp(finite) > 0:
             continue

@@ -263,7 +263,7 @@ def finder(trace: Trace, reading: Reading) -> Callable[[Formula], tuple[Found, s
         own = trace
         if reading.resample_to is not None and reading.method is not None:
             own = resampling.resample(own, reading.resample_to, reading.method)
-        return HostValues.of(own, "truncate" if reading.end == "truncate" else "hold"), own
+        return HostValues.for_verdict(own, reading.end), own
 
     even, dense = _even_step(trace) and reading.method is None, None
     if not even and reading.end != "truncate":

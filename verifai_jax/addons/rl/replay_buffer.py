@@ -12,7 +12,7 @@ from jaxtyping import Array, Bool, Float, Int, Key
 
 
 class ReplayBuffer(NamedTuple):
-    """A ring of transitions: `rows` `[capacity, 2 * size + actions + 2]`, where `unpack` is told
+    """A ring of transitions: `rows` `[capacity, 2 * size + actions + 2]`, where `unpack` takes
     the number of actions; the `index` of the row to write next; the number of rows that are
     `filled`.
     """

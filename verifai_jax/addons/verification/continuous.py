@@ -74,8 +74,8 @@ def between_samples(problem: Problem) -> Problem:
 class _Measure(Duration):
     """The seconds, within a window of time, in which a formula holds: no period counts as whole.
 
-    A window starts and ends within steps, of which it has as much together as one step: in these
-    the formula holds as long as in one of them, or some time in between.
+    A window covers parts of its first and its last step, together as long as one step. In these
+    parts the formula holds as long as in one of the two steps, or some time in between.
     """
 
     def value(self, of: Operations[V], operands: Sequence[V], first: int, last: int) -> V:

@@ -6,7 +6,7 @@
 
 A forest learns the failure rate and the return from coordinates in the unit cube of the study's
 space: a log-uniform one counts by its logarithm. Its R^2 is measured on configurations that it was
-not trained on. Rank correlations show weak trends in few configurations, of which it cannot learn.
+not trained on. Rank correlations show weak trends where configurations are too few for it.
 
 Sources: Geurts, Ernst and Wehenkel, Extremely randomized trees (2006); permutation importance of
 Breiman, Random forests (2001); shares of the variance as in `fanova.py`; principal components as in
