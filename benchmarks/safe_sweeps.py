@@ -2,6 +2,7 @@
 
     python benchmarks/safe_sweeps.py cartpole --configurations 32 --seeds 0 1 2
     python benchmarks/safe_sweeps.py mountain_car lane_keeping --sides ours rejax
+    python benchmarks/safe_sweeps.py reacher inverted_pendulum      # physics of MJX and of Brax
     python benchmarks/safe_sweeps.py cartpole --check 100000        # counts ten certificates again
 
 Each side gets the same space of hyper-parameters, maximum number of steps, network and number of
@@ -48,10 +49,12 @@ from benchmarks.hardening import lane_with
 from envs.cartpole_task import CartPoleTask
 from envs.lane_keeping import LaneKeepingTask
 from envs.mountain_car import MountainCarTask
+from envs.reacher import reacher_task
 from specs.cartpole import balance_with
 from specs.mountain_car import climb_with, trained_on
+from specs.reacher import reach_with
 from verifai_jax.addons.estimation.intervals import upper_bound
-from verifai_jax.addons.rl import PPO, Continuous, Discrete, Policy, evaluate
+from verifai_jax.addons.rl import PPO, Continuous, Discrete, Policy, brax_task, evaluate
 from verifai_jax.addons.training.sweeps.running import RunningSweep
 from verifai_jax.addons.training.sweeps.training_runs import TrainingRuns
 from verifai_jax.search.cross_entropy import CrossEntropy
@@ -70,7 +73,9 @@ THEIR_NAMES = {"discount": "gamma", "clip": "clip_eps", "entropy": "ent_coef"}
 
 @dataclasses.dataclass(frozen=True)
 class Case:
-    """A task to train on, the one that returns are measured on, and the closed loop to certify."""
+    """A task to train on, the one that returns are measured on, and the closed loop to certify: its
+    failure probability is to be below `p`.
+    """
 
     task: Any
     nominal: Any
@@ -78,6 +83,7 @@ class Case:
     steps: int
     ranges: dict[str, Any]
     settings: dict[str, Any]
+    p: float = P
 
     def study(self, checkpoints: int = 0) -> vj.Study:
         """Return the study of our side, with so many checkpoints before the end."""
@@ -87,11 +93,33 @@ class Case:
             space=OPTIMISER | self.ranges,
             trainer=vj.Trainer(self.task, ppo, steps=self.steps, nominal=self.nominal),
             problem=self.problem,
-            p=P,
+            p=self.p,
             checkpoints=[self.steps * i // (checkpoints + 1) for i in range(1, checkpoints + 1)],
         )
 
 
+def upright_with(policy: Policy) -> vj.Problem:
+    """Return the problem of Brax' inverted pendulum for a policy: 4 s upright near the middle."""
+    system = vj.brax(
+        PENDULUM.env,
+        policy.act,
+        duration=4.0,
+        features={"mass": "link.inertia.mass[pole]"},
+        initial={"angle": "q[hinge]", "cart": "q[slider]", "speed": "qd[hinge]"},
+        signals={"cart": 0, "angle": 1},
+    )
+    space = {
+        "angle": vj.Box(-0.15, 0.15),  # rad
+        "cart": vj.Box(-0.5, 0.5),  # m
+        "speed": vj.Box(-0.5, 0.5),  # rad/s
+        "mass": vj.Box(2.0, 10.0),  # kg
+    }
+    formula = "(always abs(angle) <= 0.2) & always abs(cart) <= 1"
+    return vj.Problem("upright", space, system, formula)
+
+
+REACHER = reacher_task(varied=True)
+PENDULUM = brax_task("inverted_pendulum", backend="generalized", time_limit=200)
 CASES = {
     "cartpole": Case(
         CartPoleTask(length_range=0.0, x0_range=0.05),
@@ -111,6 +139,18 @@ CASES = {
     ),
     "lane_keeping": Case(
         LaneKeepingTask(varied=True), LaneKeepingTask(varied=True), lane_with, 131_072, {}, {}
+    ),
+    "reacher": Case(
+        REACHER,
+        REACHER,
+        reach_with,
+        393_216,
+        {},
+        {"environments": 32, "horizon": 64, "minibatches": 8, "normalise": True},
+        p=0.05,
+    ),
+    "inverted_pendulum": Case(
+        PENDULUM, PENDULUM, upright_with, 131_072, {}, {"environments": 16, "normalise": True}
     ),
 }
 
@@ -292,13 +332,13 @@ class OptunaSide:
         """Return whether independent samples show the policy to be safe."""
         confidence = 1 - (1 - CONFIDENCE) / among
         count = 64
-        while upper_bound(count // 400, count, confidence) >= P:
+        while upper_bound(count // 400, count, confidence) >= self.case.p:
             count += 64
         points = np.random.default_rng([seed, 7]).random(
             (count, self.case.problem(policy).space.dim), np.float32
         )
         failures = int(np.sum(~(np.asarray(self.simulate(policy, points)) >= 0)))
-        return upper_bound(failures, count, confidence) < P
+        return upper_bound(failures, count, confidence) < self.case.p
 
 
 class RejaxSide(OptunaSide):
@@ -441,7 +481,7 @@ def count_again(case: Case, found: Outcome, count: int) -> None:
     """Print the failure rates of ten certified policies in fresh simulations."""
     safe = [p for p, good in zip(found.policies, found.safe, strict=True) if good][:10]
     rates = [failure_rate(case, policy, count) for policy in safe]
-    wrong = sum(rate >= P for rate in rates)
+    wrong = sum(rate >= case.p for rate in rates)
     print(f"    of {len(safe)} certificates counted again {wrong} are wrong: {rates}")
 
 

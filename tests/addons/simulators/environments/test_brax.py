@@ -490,3 +490,15 @@ def test_a_missing_or_old_package_is_one_line(monkeypatch):
     monkeypatch.setattr(importlib.metadata, "version", lambda name: "0.9.1")
     with pytest.raises(MissingExtra, match=r"brax 0.9.1 is installed, .* needs 0.14 or later"):
         brax("hopper", push, steps=3)
+
+
+@pytest.mark.parametrize("backend", ["spring", None])
+def test_made_while_the_weights_of_its_policy_are_traced(backend):
+    name = "inverted_pendulum"
+    env = name if backend else brax(name, push, steps=1, backend="spring").env
+
+    def last(weights):
+        system = brax(env, lambda seen: seen @ weights, steps=2, backend=backend, signals={"x": 0})
+        return system({}, KEY)["x"][-1]
+
+    assert jax.eval_shape(last, jnp.ones((4, 1))).shape == ()

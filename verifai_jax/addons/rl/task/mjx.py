@@ -22,9 +22,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Float, Key, Shaped
 
 from verifai_jax.addons.rl.task.stepping import abstract_action
-from verifai_jax.addons.simulators.mujoco.model import load
+from verifai_jax.addons.simulators.mujoco.model import load, mjx_module
 from verifai_jax.core.messages.checks import check_count
-from verifai_jax.core.messages.errors import check_names, require, suggests_options
+from verifai_jax.core.messages.errors import check_names, suggests_options
 from verifai_jax.systems.actions import Action, Continuous
 from verifai_jax.systems.pytree_checks import outline
 
@@ -91,7 +91,7 @@ class MjxTask:
 
         If the next state is not finite the episode ends in the previous state, without a reward.
         """
-        mjx = require("mujoco.mjx", extra="mujoco")
+        mjx = mjx_module()
         model, before = self._at(state)
         data = before.replace(ctrl=jnp.asarray(self.control(action)).reshape(before.ctrl.shape))
         data = jax.lax.fori_loop(0, self.substeps, lambda _, d: mjx.step(model, d), data)
@@ -112,7 +112,7 @@ class MjxTask:
 
     def _at(self, state: MjxState) -> tuple[MjxModel, MjxData]:
         """Return the model of an episode, and data with positions of bodies and sites."""
-        mjx = require("mujoco.mjx", extra="mujoco")
+        mjx = mjx_module()
         model, blank = self._mjx
         if state.varied:
             model = model.tree_replace(state.varied)
@@ -124,7 +124,7 @@ class MjxTask:
 
     @cached_property
     def _mjx(self) -> tuple[MjxModel, MjxData]:
-        mjx = require("mujoco.mjx", extra="mujoco")
+        mjx = mjx_module()
         # Constants of every program that is traced, so never traced themselves.
         with jax.ensure_compile_time_eval():
             model = mjx.put_model(self.compiled, impl="jax")

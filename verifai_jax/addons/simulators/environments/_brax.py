@@ -7,7 +7,9 @@
 The result is a pure function `(features, key) -> Trace` of one episode, which is never reset.
 """
 
+import contextlib
 import copy
+import io
 import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -208,7 +210,9 @@ def brax(
     check_version("brax", OLDEST)
     if isinstance(env, str):
         name = env
-        env = _make(name, backend, dict(options or {}))
+        # A problem may be made while JAX traces the weights of its policy; models are no part of it.
+        with jax.ensure_compile_time_eval():
+            env = _make(name, backend, dict(options or {}))
     else:
         name = type(getattr(env, "unwrapped", env)).__name__
         if backend is not None or options:
@@ -218,7 +222,8 @@ def brax(
     _check_env(env, name)
     if dt is None:
         try:
-            dt = env.dt
+            with jax.ensure_compile_time_eval():
+                dt = env.dt
         except AttributeError as error:
             raise ValueError(f"{name} has no dt: give dt=..., seconds of a step") from error
     delays = (observation_delay, action_delay)
@@ -246,7 +251,7 @@ def brax(
 
 def import_quietly(module: str, extra: str = "brax") -> Any:
     """Import a module without the messages that it and its dependencies print."""
-    with warnings.catch_warnings():
+    with warnings.catch_warnings(), contextlib.redirect_stdout(io.StringIO()):
         warnings.simplefilter("ignore", DeprecationWarning)
         require(module.partition(".")[0], extra=extra)
         return require(module, extra=extra)

@@ -320,7 +320,7 @@ def sampling_period(seconds: object) -> float:
     value: Any = seconds
     number = isinstance(seconds, int | float | np.number) and not isinstance(seconds, bool)
     if isinstance(seconds, jax.Array | np.ndarray) and np.shape(seconds) == ():
-        number = True
+        number, value = True, np.asarray(seconds)
     if not number or not (math.isfinite(value) and value > 0):
         raise ValueError(f"dt must be a positive number of seconds; got {seconds!r}")
     if getattr(seconds, "dtype", None) == np.float32:
