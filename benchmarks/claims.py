@@ -160,6 +160,20 @@ def rules_precision() -> float:
     return vj.analysis.rules(run).rules[0].precision.estimate
 
 
+def swept() -> float:
+    """Count the configurations of the overview's sweep that are certified safe."""
+    from envs.cartpole_task import CartPoleTask
+    from specs.cartpole import balance_with
+
+    study = vj.Study(
+        "safe_training",
+        space={"learning_rate": vj.LogUniform(3e-4, 1e-2), "length_range": vj.Box(0.0, 2.0)},
+        trainer=vj.Trainer(CartPoleTask(), vj.rl.PPO(anneal=False), steps=32_768),
+        problem=balance_with,
+    )
+    return float(len(vj.sweep(study, configurations=32, progress=False).safe))
+
+
 def arch(name: str) -> Callable[[], float]:
     """Return the measurement of a requirement: the median simulations to the first failure."""
 
@@ -183,6 +197,7 @@ MEASURES: dict[str, Callable[[], float]] = {
     "shrunk": shrunk,
     "rules_covered": rules_covered,
     "rules_precision": rules_precision,
+    "swept": swept,
     **{name: arch(name) for name in ("at1", "at6b", "at6c")},
 }
 

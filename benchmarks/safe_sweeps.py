@@ -468,11 +468,12 @@ def show(name: str, outcomes: list[Outcome]) -> None:
     first = float(np.mean([one.first for one in outcomes]))
     when = [one.passed for one in outcomes if not math.isnan(one.passed)]
     earliest = f" (passed {np.mean(when):.2f} s, {len(when)} runs)" if when else ""
-    known = [one.nominal for one in outcomes if one.safe and not math.isnan(one.nominal)]
-    nominal = float(np.mean(known)) if known else math.nan
+    known = [one.nominal for one in outcomes if not math.isnan(one.nominal)]
+    of_them = f"; nominal return of the safe ones {np.mean(known):.1f}" if known else ""
+    soon = f"; first after {first:.1f} s{earliest}" if math.isfinite(first) else ""
     print(
         f"    {name:9} {safe} safe in {total:.1f} CPU s ({parts}): {3600 * safe / total:,.0f} an "
-        f"hour; first after {first:.1f} s{earliest}; nominal return of the safe ones {nominal:.1f}",
+        f"hour{soon}{of_them}",
         flush=True,
     )
 

@@ -10,11 +10,13 @@ installed, `<!-- not run: why -->` compiles it only. What a block prints is as t
 On a page that shows what a command prints, its commands run, too.
 """
 
+import ast
 import contextlib
 import importlib.util
 import io
 import itertools
 import os
+import pkgutil
 import re
 import shlex
 import subprocess
@@ -33,6 +35,7 @@ ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
 BLOCK = re.compile(r"(?:<!-- (needs|not run:?) ([^>]*?) -->\n)?```python\n(.*?)```", re.DOTALL)
 FILES = (ROOT / "README.md", *sorted(DOCS.glob("*.md")))
+OURS = ("verifai_jax", "envs", "specs")
 PAGES = [
     "../README",
     *(file.stem for file in sorted(DOCS.glob("*.md")) if "```python" in file.read_text()),
@@ -79,6 +82,30 @@ def test_every_block_is_python(page):
     assert len(found) == (DOCS / f"{page}.md").read_text().count("```python")
     for block in found:
         compile(block.code, page, "exec")
+
+
+def dotted_names(code: str) -> set[str]:
+    """Return the names, from their modules on, that code imports from here or reads from these."""
+    tree, known = ast.parse(code), {"vj": "verifai_jax"}
+    for part in ast.walk(tree):
+        if isinstance(part, ast.ImportFrom) and str(part.module).split(".")[0] in OURS:
+            known |= {one.asname or one.name: f"{part.module}.{one.name}" for one in part.names}
+    read = [
+        ast.unparse(part).split(".") for part in ast.walk(tree) if isinstance(part, ast.Attribute)
+    ]
+    chains = {".".join([known[first], *rest]) for first, *rest in read if first in known}
+    return {*known.values(), *(chain for chain in chains if re.fullmatch(r"[\w.]+", chain))}
+
+
+@pytest.mark.thorough
+def test_code_that_is_not_run_names_what_there_is():
+    for page in PAGES:
+        text = (DOCS / f"{page}.md").read_text()
+        inline = set(re.findall(r"`((?:envs|specs)\.[\w.]+)`", text))
+        for block in blocks(page):
+            inline |= dotted_names(block.code)
+        for name in sorted(inline):
+            pkgutil.resolve_name(name)
 
 
 @pytest.mark.parametrize("file", FILES, ids=lambda file: file.stem)

@@ -210,7 +210,7 @@ def brax(
     check_version("brax", OLDEST)
     if isinstance(env, str):
         name = env
-        # A problem may be made while JAX traces the weights of its policy; models are no part of it.
+        # A problem may be made while JAX traces the weights of its policy, which a model lacks.
         with jax.ensure_compile_time_eval():
             env = _make(name, backend, dict(options or {}))
     else:
