@@ -43,10 +43,10 @@ SEEDS = 32
 """Seeds of a host system's rows that are made in one call, so that one program makes all."""
 LANES = (64, 256)
 """Rows that all devices replay together if there are more, and that each does where there are more
-than `CALLS` calls of the first would take, since a call costs something whatever its size."""
-CALLS = 6
-"""Calls of the smaller program up to which the larger one is not compiled. Of a quadrotor of four
-states six calls take 0.12 s, the two of the larger program 0.10 s, and 0.28 s to compile."""
+than `CALLS` calls of the first would take, and much work."""
+CALLS, WORK = 6, 10**10
+"""Calls and operations up to which the larger program is not compiled. These operations take 2 s,
+of which it saves a fifth to two fifths, and 0.3 to 0.6 s to compile (`benchmarks/RESULTS.md`)."""
 
 
 class Refiner:
@@ -117,7 +117,7 @@ class Replays:
         - `numbers`: the numbers of the rows, which their random keys come from.
         **Returns:** the verdicts of the rows, once for each.
         """
-        together = self._together(len(numbers), len(each))
+        together = self._together(factor, len(numbers), len(each))
         features = jax.tree.map(
             lambda form, *leaves: np.concatenate(leaves).astype(form.dtype), self._form, *each
         )
@@ -147,20 +147,20 @@ class Replays:
 
     def begin_compiling(self, factor: int, count: int, times: int) -> None:
         """Compile in the background the programs that replay this many rows this many times."""
-        engine = self._engine(factor, self._together(count, times))
+        engine = self._engine(factor, self._together(factor, count, times))
         compiled = engine.compile_seconds
         # An error in it is reported when rows are replayed.
         with suppress(Exception):
             engine.begin_compiling()
         self.compile_seconds += engine.compile_seconds - compiled
 
-    @staticmethod
-    def _together(count: int, times: int) -> int:
+    def _together(self, factor: int, count: int, times: int) -> int:
         """Return the number of replays in one call, for numbers of rows and repetitions."""
         if count <= ONE_BY_ONE:
             return ONE_BY_ONE
         some, many = LANES[0], LANES[1] * len(jax.local_devices())
-        return many if count * times > CALLS * some else some
+        replays, work = count * times, factor * self._engine(1, ONE_BY_ONE).program.work
+        return many if replays > CALLS * some and replays * work > WORK else some
 
     def _keys(self, numbers: Int[np.ndarray, " n"], together: int) -> Key[Array, " together"]:
         if not self.draws:
