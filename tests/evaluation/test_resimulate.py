@@ -12,9 +12,9 @@ from verifai_jax.core.compute.keys import run_keys
 from verifai_jax.evaluation.resimulate import CALLS, LANES, REPLAYS, Replays
 
 
-def test_a_larger_program_is_compiled_for_much_work_alone(monkeypatch):
+def test_a_larger_program_is_compiled_for_much_work_or_in_a_long_run(monkeypatch):
     made = []
-    for work in (10**12, 10**5):
+    for work, first in ((10**12, 0), (10**5, 0), (10**12, 10**6)):
         monkeypatch.setattr("verifai_jax.evaluation.resimulate.WORK", work)
         system = vj.ode(
             lambda t, s, control, f: {"x": -s["x"]}, lambda f, key: {"x": f["a"]}, dt=0.1,
@@ -23,10 +23,10 @@ def test_a_larger_program_is_compiled_for_much_work_alone(monkeypatch):
         problem = vj.Problem("decay", {"a": vj.Box(0.5, 2.0)}, system, "always x <= 1.5")
         replays = Replays(problem, "float32", run_keys(0)[1])
         values = np.linspace(0.6, 1.9, CALLS * LANES[0] + 1).astype(np.float32)
-        [found] = replays(4, [{"a": values}], np.arange(len(values)))
+        [found] = replays(4, [{"a": values}], first + np.arange(len(values)))
         np.testing.assert_allclose(found.rho[:, 0], 1.5 - values, rtol=1e-6)
         made.append(problem.programs.peek(REPLAYS, ("float32", 0, LANES[0])) is not None)
-    assert made == [True, False]
+    assert made == [True, False, False]
 
 
 @pytest.mark.thorough
