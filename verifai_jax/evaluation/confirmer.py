@@ -279,7 +279,7 @@ class Confirmer:
             together.setdefault((id(replays), factor), []).append(name)
         for names in together.values():
             replays, factor = self._checks[names[0]]
-            replays.begin_compiling(factor, len(numbers), len(names))
+            replays.begin_compiling(factor, numbers, len(names))
         replayed: dict[str, Verdicts] = {}
         for names in together.values():
             replays, factor = self._checks[names[0]]

@@ -209,7 +209,8 @@ class Engine:
             if differentiates:
                 lowered = self._lower_gradient()
             else:
-                layout = layout.for_program(self.program.trace(mode).jaxpr.jaxpr)
+                single = self.precision == "float32"
+                layout = layout.for_program(self.program.trace(mode).jaxpr.jaxpr, single)
                 lowered = self._lower(mode, layout)
             splits = not layout.fills_machine
             compiling = compile_soon(name, lowered, self.effort, splits=splits, wide=layout.wide)
@@ -311,16 +312,9 @@ def engine_for(
 ) -> Engine:  # fmt: skip
     """Return the engine for this (problem, batch, mode), made once and cached with the problem."""
     mode = EngineMode(batch, gradient, precision, clauses, guidance, given)
+    make = partial(
+        Engine, problem, batch, gradient, precision=precision, clauses=clauses, guidance=guidance
+    )
     return problem.programs.get(
-        ENGINES,
-        mode,
-        lambda: Engine(
-            problem,
-            batch,
-            gradient,
-            precision=precision,
-            clauses=clauses,
-            guidance=guidance,
-            inputs=CubePoints(problem, given, precision),
-        ),
+        ENGINES, mode, lambda: make(inputs=CubePoints(problem, given, precision))
     )

@@ -75,8 +75,10 @@ class Layout(NamedTuple):
         """True if every core has its own rows, so that none is free to help another."""
         return 1 < len(self.devices) == len(jax.local_devices())
 
-    def for_program(self, program: Any) -> "Layout":
+    def for_program(self, program: Any, anywhere: bool = True) -> "Layout":
         """Return the layout that suits the `Jaxpr` of one row, with the same number of rows.
+
+        - `anywhere`: whether other threads may call Python; this one alone is in double precision.
 
         If all operations are on single numbers, a chunk needs little memory and starting an
         operation takes a fifth of the time, so chunks are twice as long. Other programs lose by
@@ -86,13 +88,15 @@ class Layout(NamedTuple):
             return self
         steps = list(_steps(program))
         layout = self._replace(wide=all(step.primitive.name in PLAIN for step in steps))
+        if not anywhere and any("callback" in step.primitive.name for step in steps):
+            layout = layout._replace(devices=self.devices[:1], chunks=self.padded // self.lanes)
         together = any(
             step.primitive.name.startswith(TOGETHER) and any(v.aval.size > 1 for v in step.invars)
             for step in steps
         )
-        if together or self.chunks % 2:
+        if together or layout.chunks % 2:
             return layout
-        return layout._replace(chunks=self.chunks // 2, lanes=2 * self.lanes)
+        return layout._replace(chunks=layout.chunks // 2, lanes=2 * layout.lanes)
 
     def spread(self, one_row: Callable[..., Any], own_keys: bool) -> Callable[..., Any]:
         """Map a function of one row over chunks of lanes and over the devices.

@@ -43,10 +43,11 @@ SEEDS = 32
 """Seeds of a host system's rows that are made in one call, so that one program makes all."""
 LANES = (64, 256)
 """Rows that all devices replay together if there are more, and that each does where there are more
-than `CALLS` calls of the first would take, since a call costs something whatever its size."""
-CALLS = 6
-"""Calls of the smaller program up to which the larger one is not compiled. Of a quadrotor of four
-states six calls take 0.12 s, the two of the larger program 0.10 s, and 0.28 s to compile."""
+than `CALLS` calls of the first would take, and much work."""
+CALLS, WORK, ROWS_BEFORE = 6, 10**10, 2**17
+"""Calls, operations, and rows of the run up to which the larger program is not compiled. It takes
+0.3 to 0.6 s to compile, and saves a fifth to two fifths of the time, which for these operations is
+2 s (`benchmarks/RESULTS.md`). Of longer runs thousands of rows are replayed, round by round."""
 
 
 class Refiner:
@@ -117,7 +118,7 @@ class Replays:
         - `numbers`: the numbers of the rows, which their random keys come from.
         **Returns:** the verdicts of the rows, once for each.
         """
-        together = self._together(len(numbers), len(each))
+        together = self._together(factor, numbers, len(each))
         features = jax.tree.map(
             lambda form, *leaves: np.concatenate(leaves).astype(form.dtype), self._form, *each
         )
@@ -145,22 +146,23 @@ class Replays:
         verdicts = Verdicts.concatenate([part._replace(features=None) for part in parts])
         return verdicts.split(len(each))
 
-    def begin_compiling(self, factor: int, count: int, times: int) -> None:
-        """Compile in the background the programs that replay this many rows this many times."""
-        engine = self._engine(factor, self._together(count, times))
+    def begin_compiling(self, factor: int, numbers: Int[np.ndarray, " n"], times: int) -> None:
+        """Compile in the background the programs that replay these rows this many times."""
+        engine = self._engine(factor, self._together(factor, numbers, times))
         compiled = engine.compile_seconds
         # An error in it is reported when rows are replayed.
         with suppress(Exception):
             engine.begin_compiling()
         self.compile_seconds += engine.compile_seconds - compiled
 
-    @staticmethod
-    def _together(count: int, times: int) -> int:
+    def _together(self, factor: int, numbers: Int[np.ndarray, " n"], times: int) -> int:
         """Return the number of replays in one call, for numbers of rows and repetitions."""
-        if count <= ONE_BY_ONE:
+        if len(numbers) <= ONE_BY_ONE:
             return ONE_BY_ONE
         some, many = LANES[0], LANES[1] * len(jax.local_devices())
-        return many if count * times > CALLS * some else some
+        replays, work = len(numbers) * times, factor * self._engine(1, ONE_BY_ONE).program.work
+        much = replays * work > WORK or np.max(numbers) > ROWS_BEFORE
+        return many if replays > CALLS * some and much else some
 
     def _keys(self, numbers: Int[np.ndarray, " n"], together: int) -> Key[Array, " together"]:
         if not self.draws:
@@ -220,7 +222,7 @@ class HostReplays:
         enable_compile_cache()
         self._engine = HostEngine(problem, precision)
 
-    def begin_compiling(self, factor: int, count: int, times: int) -> None:
+    def begin_compiling(self, factor: int, numbers: Int[np.ndarray, " n"], times: int) -> None:
         """Do nothing, because a black box is not compiled."""
 
     def __call__(

@@ -106,11 +106,11 @@ class Rounds:
         cube = self.problem.space.cube
         while_compiling(import_tables, after=0.0)
         stage = self.search.stage(None, cube, self.batch)
-        compiled_search(stage, cube, self.batch, self.learning.coverage_id_count)
-        compiled_start(stage, cube, self.batch)
         if stage.wants.clause_gradients and not resumed:
             # They take longest to compile.
             self._simulations.begin_derivatives()
+        compiled_search(stage, cube, self.batch, self.learning.coverage_id_count)
+        compiled_start(stage, cube, self.batch)
         self.evaluate.begin_compiling()
         if self._confirmer is not None:
             # Meanwhile; whatever fails will be replayed.
