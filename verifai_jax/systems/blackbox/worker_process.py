@@ -31,6 +31,25 @@ START = (
 )
 
 
+MARK = "VERIFAI_JAX_WORKER"
+"""Variable of a worker's environment, which all processes that it starts inherit."""
+
+
+def end_marked(mark: str) -> None:
+    """End the processes with this mark, or one that begins with it, except for this one."""
+    ended, marked = {os.getpid()}, f"\0{MARK}={mark}".encode()
+    while mark:  # Until none has started another meanwhile.
+        found = set[int]()
+        for file in Path("/proc").glob("[0-9]*/environ"):
+            with contextlib.suppress(OSError):
+                if marked in b"\0" + file.read_bytes():
+                    found.add(int(file.parent.name))
+        for process in found - ended:
+            with contextlib.suppress(OSError):
+                os.kill(process, signal.SIGKILL)
+        mark, ended = (mark if found - ended else ""), ended | found
+
+
 def pickled_setup(
     simulation: Callable[[Features, int], Trace], function: Callable[..., object]
 ) -> bytes:
@@ -137,4 +156,5 @@ def _outlive_no_parent(parent: int) -> None:
     """End this process, and those it has started, if its parent is gone."""
     while os.getppid() == parent:
         time.sleep(1.0)
+    end_marked(os.environ.get(MARK, ""))
     os.killpg(os.getpid(), signal.SIGKILL)  # It leads a session, and so a group, of its own.

@@ -277,6 +277,7 @@ def test_interrupted_and_resumed_it_is_the_same_sweep(case, monkeypatch, tmp_pat
         assert sum(used for _, used in again.reuse.values()) == pieces
         assert sum(cached for cached, _ in again.reuse.values()) >= min(after, pieces)
         assert f"  from the cache  {again.reuse['certify'][0]} of " in str(again)
+    same_tables(vj.load_sweep(tmp_path / "through"), through, but=())
     # Nothing is trained again: all is remembered, with the seconds that it took.
     monkeypatch.setattr(training_runs.BatchedTraining, "advance", None)
     same_tables(sweep(study, folder=tmp_path / "through", **how), through, but=())

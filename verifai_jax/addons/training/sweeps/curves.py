@@ -63,9 +63,9 @@ def curve_trace(
     held = known[np.where(last >= 0, last, int(np.argmax(present)))]
     signals, times = {"return": np.concatenate([held[:1], held])}, np.concatenate([[0.0], steps])
     period = float(steps[0])
-    if np.array_equal(times, period * np.arange(len(times))):
-        return Trace(signals, dt=period)
-    return Trace(signals, times=times)
+    even = np.array_equal(times, period * np.arange(len(times)))
+    clock = {"dt": period} if even else {"times": times}
+    return Trace(signals, **clock, units={"time": "environment steps"})
 
 
 def curve_robustness(

@@ -22,6 +22,7 @@ from verifai_jax.addons.training.sweeps.study import Study, StudyError
 from verifai_jax.core.compute.devices import describe_processor
 from verifai_jax.core.store import files
 from verifai_jax.core.store.cache import Cache
+from verifai_jax.core.store.foreign_files import read_bytes
 from verifai_jax.core.store.locks import write_lock
 from verifai_jax.core.store.replacements import replacing_all
 
@@ -64,7 +65,8 @@ class TrainedConfiguration:
         folder = Path(folder)
         with write_lock(folder), replacing_all(folder, (POLICY, CONFIGURATION)) as made:
             self.policy.save(made / POLICY)
-            record = {name: value for name, value in vars(self).items() if name != "policy"}
+            onnx = files.checksum(read_bytes(made / POLICY))
+            record = {n: value for n, value in vars(self).items() if n != "policy"} | {"onnx": onnx}
             files.write_record(made / CONFIGURATION, files.plain(record))
         return folder
 
@@ -113,8 +115,10 @@ def load_configuration(folder: str | Path) -> TrainedConfiguration:
     **Raises:** `FileNotFoundError` for a folder without one; `DamagedError` for one that has
     changed since; the errors of `vj.policy`.
     """
-    record = files.read_record(Path(folder) / CONFIGURATION)
+    record, file = files.read_record(Path(folder) / CONFIGURATION), Path(folder) / POLICY
+    if files.checksum(read_bytes(file)) != record.pop("onnx", None):
+        raise files.DamagedError(f"{file} is not the policy of {CONFIGURATION}, or is damaged")
     try:
-        return TrainedConfiguration(**record, policy=load(Path(folder) / POLICY))
+        return TrainedConfiguration(**record, policy=load(file))
     except TypeError as error:
         raise files.DamagedError(f"{folder} has no configuration of a sweep: {error}") from error

@@ -20,7 +20,7 @@ from verifai_jax.addons.training.sweeps.importance import (
     HyperparameterImportance,
     hyperparameter_importance,
 )
-from verifai_jax.addons.training.sweeps.optuna_export import export_to_optuna
+from verifai_jax.addons.training.sweeps.optuna_export import export_to_optuna, state_of
 from verifai_jax.addons.training.sweeps.ranking import (
     group_by_configuration,
     is_safe,
@@ -275,17 +275,17 @@ class Sweep(Reported):
     def trials_dataframe(self) -> "pd.DataFrame":
         """Return one row for each configuration, with the columns of Optuna's `trials_dataframe`.
 
-        `values_0` is the upper end of the failure probability, `values_1` the nominal return.
+        `values_0` is the upper end of the failure probability, `values_1` the nominal return;
+        `state` is COMPLETE, PRUNED where halving stopped it, FAIL without one of the two.
         """
         groups: Any = self.configurations
         renamed = {name: f"params_{name}" for name in self.hyperparameters}
         values = {"failure_high": "values_0", "nominal_return": "values_1"}
         table = groups[[*values, *renamed]].rename(columns={**values, **renamed})
         table.insert(0, "number", range(len(table)))
-        text_columns = {"verdict": "user_attrs_verdict", "status": "state"}
-        return table.join(groups[[*text_columns]].rename(columns=text_columns)).reset_index(
-            drop=True
-        )
+        attributes = {name: f"user_attrs_{name}" for name in ("verdict", "status")}
+        table = table.join(groups[[*attributes]].rename(columns=attributes))
+        return table.assign(state=groups.apply(state_of, axis=1)).reset_index(drop=True)
 
     @suggests_options
     def importance(self, *, repeats: int = 5, seed: int = 0) -> HyperparameterImportance:
