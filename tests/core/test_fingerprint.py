@@ -160,5 +160,7 @@ def test_the_text_of_an_object_is_the_same_in_a_script_and_where_it_is_imported(
     assert text("__main__") == text("_target_mine") == text("some.mine") == "[<Cart object>]"
     assert text("mine", "Other") != text("mine")
     assert stable_text("x < b.Cart object") == "'x < b.Cart object'"
-    assert stable_text(text) == "<function test_the_text_of_an_object_is_the_same_in_a_script_and_" \
+    assert (
+        stable_text(text) == "<function test_the_text_of_an_object_is_the_same_in_a_script_and_"
         "where_it_is_imported.<locals>.text>"
+    )

@@ -156,8 +156,8 @@ def test_what_a_worker_has_started_ends_in_whatever_session():
     marks, started = ("8/1-2/", "8/1-2/3-0/", "8/1-20/", "7/8/1-2/"), []
     for mark in marks:
         command = ["sh", "-c", "echo; sleep 1000 & wait"]
-        started.append(subprocess.Popen(command, env={**os.environ, MARK: mark},
-                                        stdout=subprocess.PIPE, start_new_session=True))  # fmt: skip
+        how = {"env": {**os.environ, MARK: mark}, "start_new_session": True}
+        started.append(subprocess.Popen(command, stdout=subprocess.PIPE, **how))
         started[-1].stdout.readline()  # Its environment is its own by now.
     try:
         end_marked("8/1-2/")

@@ -354,7 +354,8 @@ def _encode(
     held = {**arrays, **{name: s for (name, _), s in zip(graph.memory, start, strict=True)}}
     return {
         "graph": np.frombuffer(json.dumps(graph.to_json()).encode(), np.uint8),
-        "steps": np.asarray(steps, np.int64), "mean_return": np.asarray(returns, np.float64),
+        "steps": steps.astype(np.int64),
+        "mean_return": returns.astype(np.float64),
         "seconds": np.asarray(seconds, np.float64),
         **{f"{ARRAY}{name}": array for name, array in held.items()},
     }
