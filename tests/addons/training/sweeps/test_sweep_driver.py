@@ -283,6 +283,22 @@ def test_interrupted_and_resumed_it_is_the_same_sweep(case, monkeypatch, tmp_pat
     same_tables(sweep(study, folder=tmp_path / "through", **how), through, but=())
 
 
+@pytest.mark.thorough
+@pytest.mark.parametrize("case", ["halton", "population"])
+def test_a_checkpoint_that_a_damaged_cache_lacks_is_trained_again(case, monkeypatch, tmp_path):
+    cases = {**CASES, "population": {"configurations": 4, "search": vj.Population()}}
+    study, how = drifting(), {"certification": vj.Certification(samples=64), **cases[case]}
+    through = sweep(study, folder=tmp_path, **how)
+
+    class Damaged(Cache):
+        def get(self, name):
+            lost = name.endswith("32 of 128") and name not in self._own
+            return None if lost else super().get(name)
+
+    monkeypatch.setattr("verifai_jax.core.store.cache.Cache", Damaged)
+    same_tables(sweep(study, folder=tmp_path, **how), through)
+
+
 @pytest.mark.slow
 def test_a_store_of_another_sweep_says_what_differs(tmp_path):
     sweep(drifting(), configurations=2, certification=vj.Certification(samples=8), folder=tmp_path)

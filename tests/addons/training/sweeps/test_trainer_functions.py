@@ -163,6 +163,19 @@ def test_what_a_training_reported_before_it_failed_is_a_row_of_its_own(tmp_path)
     assert runs.errors[other].startswith("its files in resume cannot be copied: ")
 
 
+@pytest.mark.parametrize(("lost", "at"), [(0, 1), (1, 1), (None, None)])
+def test_a_call_is_made_again_where_the_cache_has_lost_any_of_its_checkpoints(
+    lost, at, monkeypatch, tmp_path
+):
+    runs = FunctionRuns(study(train_reporting), Cache(tmp_path), Clock("by_hand", None, False))
+    number, calls = runs.add({"rate": 0.3}, 3), []
+    runs._checkpoints = {(number, rung): None for rung in range(2) if rung != lost}
+    monkeypatch.setattr(runs, "_recall", lambda *_: None)
+    monkeypatch.setattr(runs, "_call", lambda *call: calls.append(call))
+    runs.train([number], 1)
+    assert calls == ([] if at is None else [([number], at)])
+
+
 def test_a_call_leaves_the_next_one_its_folder_and_a_curve_that_is_one(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     call = {"values": {}, "steps": 8, "folder": str(tmp_path / "8.part"), "checkpoints": []}

@@ -96,10 +96,11 @@ class FunctionRuns(TrainingRuns):
                 if number in self.errors or at >= self.rungs(number):
                     continue
                 self._recall(number, at)
-                if (number, at) in self._checkpoints:
-                    self._advanced(number, at)
-                elif number not in self.errors and at in self._calls_of(number, rung):
+                called = number not in self.errors and at in self._calls_of(number, rung)
+                if called and not self._has_all(number, at):
                     waiting.append(number)
+                elif (number, at) in self._checkpoints:
+                    self._advanced(number, at)
             if waiting:
                 self._call(waiting, at)
         if not further:
