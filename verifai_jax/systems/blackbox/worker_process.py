@@ -37,17 +37,11 @@ MARK = "VERIFAI_JAX_WORKER"
 
 def end_marked(mark: str) -> None:
     """End the processes with this mark, or one that begins with it, except for this one."""
-    ended, marked = {os.getpid()}, f"\0{MARK}={mark}".encode()
-    while mark:  # Until none has started another meanwhile.
-        found = set[int]()
-        for file in Path("/proc").glob("[0-9]*/environ"):
-            with contextlib.suppress(OSError):
-                if marked in b"\0" + file.read_bytes():
-                    found.add(int(file.parent.name))
-        for process in found - ended:
-            with contextlib.suppress(OSError):
-                os.kill(process, signal.SIGKILL)
-        mark, ended = (mark if found - ended else ""), ended | found
+    marked, own = f"\0{MARK}={mark}".encode(), str(os.getpid())
+    for file in Path("/proc").glob("[0-9]*/environ"):
+        with contextlib.suppress(OSError):
+            if marked in b"\0" + file.read_bytes() and file.parent.name != own:
+                os.kill(int(file.parent.name), signal.SIGKILL)
 
 
 def pickled_setup(
@@ -156,5 +150,5 @@ def _outlive_no_parent(parent: int) -> None:
     """End this process, and those it has started, if its parent is gone."""
     while os.getppid() == parent:
         time.sleep(1.0)
-    end_marked(os.environ.get(MARK, ""))
+    end_marked(os.environ[MARK])
     os.killpg(os.getpid(), signal.SIGKILL)  # It leads a session, and so a group, of its own.

@@ -56,7 +56,8 @@ def plot_slices(sweep: Sweep, path: str | Path | None = None) -> Figure:
         axes.set_xlabel(name)
         style.tidy(axes)
     figure.axes[0].set_ylabel("failure rate")
-    figure.axes[-1].legend(frameon=False, fontsize=8)
+    if len(table):
+        figure.axes[-1].legend(frameon=False, fontsize=8)
     return style.show_or_save(figure, path)
 
 

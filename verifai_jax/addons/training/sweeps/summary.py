@@ -90,7 +90,7 @@ def format_headline(sweep: Sweep) -> str:
         if all(policy is None for policy in sweep.record.policies):
             return text + "none has a policy"
         safe = f"{int(ranking.is_safe(groups).sum())} certified safe{_requirement(sweep.p)}"
-        return f"{text}{safe}, and no return is known"
+        return f"{text}{safe}, and no return at the end of a training is known"
     full = groups.loc[groups["nominal_return"] >= threshold]
     safe = int(ranking.is_safe(full).sum())
     reach = "reaches" if len(full) == 1 else "reach"
