@@ -285,7 +285,8 @@ class Sweep(Reported):
         table.insert(0, "number", range(len(table)))
         attributes = {name: f"user_attrs_{name}" for name in ("verdict", "status")}
         table = table.join(groups[[*attributes]].rename(columns=attributes))
-        return table.assign(state=groups.apply(state_of, axis=1)).reset_index(drop=True)
+        states = [*map(state_of, groups.to_dict("records"))]
+        return table.assign(state=states).reset_index(drop=True)
 
     @suggests_options
     def importance(self, *, repeats: int = 5, seed: int = 0) -> HyperparameterImportance:
