@@ -14,7 +14,17 @@ import pytest
 from checked_types import unchecked
 from drifting import Point, closed_loop
 from misbehaving_training import train_badly
-from numpy_training import Gain, seed_of, study, sweep, train, train_anew, train_reporting, trained
+from numpy_training import (
+    Gain,
+    seed_of,
+    study,
+    sweep,
+    train,
+    train_anew,
+    train_reporting,
+    train_towards,
+    trained,
+)
 
 import verifai_jax as vj
 from verifai_jax.addons.training.sweeps import StudyError
@@ -197,6 +207,11 @@ def test_one_call_of_a_training_gives_all_its_rows():
     for name in ("steps", "failures", "simulations", "verdict"):
         rows = [found.table.loc[found.table["rate"] < 0.4, name] for found in (reported, anew)]
         np.testing.assert_array_equal(*rows)
+    for halving, weight in ((None, -0.5), (vj.Halving(2), -1.0)):
+        at_four = sweep(train_towards, halving=halving).configuration(0)
+        assert (at_four.steps, at_four.called) == (4, 8 if halving is None else 4)
+        for policy in (at_four.policy, at_four.train(study(train_towards))):
+            assert policy.act(jnp.float32([1.0, 0.0])) == weight
 
 
 @pytest.mark.slow

@@ -19,6 +19,7 @@ from verifai_jax.addons.training.sweeps.clock import Clock
 from verifai_jax.addons.training.sweeps.record import TrainedPolicy
 from verifai_jax.addons.training.sweeps.running import runs_of
 from verifai_jax.addons.training.sweeps.study import Study, StudyError
+from verifai_jax.addons.training.sweeps.trainer import takes
 from verifai_jax.core.compute.devices import describe_processor
 from verifai_jax.core.store import files
 from verifai_jax.core.store.cache import Cache
@@ -37,6 +38,7 @@ class TrainedConfiguration:
     - `study`: the name of the study.
     - `hyperparameters`: their values, with `steps` if it was swept: those of the whole training.
     - `seed`, `steps`: the training seed, and the environment steps of the policy.
+    - `called`: the steps with which a training function was called that reports checkpoints.
     - `certificate`: `verdict`, `failures`, `simulations`, the ends of the interval, and the nominal
       return.
     - `before`: for one of a population the earlier `[steps, hyperparameters]`: what it was trained
@@ -50,6 +52,7 @@ class TrainedConfiguration:
     hyperparameters: dict[str, Any]
     seed: int
     steps: int
+    called: int
     certificate: dict[str, Any]
     weights: int
     version: str
@@ -85,12 +88,14 @@ class TrainedConfiguration:
         lineage = [*(values for _, values in self.before), self.hyperparameters]
         number = runs.add(lineage[0], self.seed)
         checkpoints = runs.runs[number].checkpoints
-        for at in (*(at for at, _ in self.before), self.steps):
+        for at in (*(at for at, _ in self.before), self.steps, self.called):
             if at not in checkpoints:
                 raise StudyError(f"its policy is that of {at} steps; got {checkpoints}")
         for (at, _), values in zip(self.before, lineage[1:], strict=True):
             number = runs.fork(number, checkpoints.index(at), values)
-        runs.train([number], checkpoints.index(self.steps))
+        own = getattr(study.trainer, "train", None)
+        trains_to = self.called if own is not None and takes(own, "checkpoint") else self.steps
+        runs.train([number], checkpoints.index(trains_to))
         trained = runs.checkpoint(number, checkpoints.index(self.steps))
         if trained is None:
             raise StudyError(f"the configuration does not train: {runs.errors[number]}")

@@ -248,9 +248,10 @@ class Sweep(Reported):
         policy, table = self.policy(i), self.table
         row: Any = table.loc[i].to_dict()
         values = {n: as_scalar(row[n]) for n in self.hyperparameters}
+        same = (table["configuration"] == row["configuration"]) & (table["seed"] == row["seed"])
+        whole = int(table.loc[same, STEPS].max())
         if STEPS in values:  # The table has those of the checkpoint.
-            same = (table["configuration"] == row["configuration"]) & (table["seed"] == row["seed"])
-            values[STEPS] = int(table.loc[same, STEPS].max())
+            values[STEPS] = whole
         before, number, parents = [], int(row["configuration"]), self.record.options.get("parents")
         while (parent := (parents or {}).get(str(number))) is not None:
             number, at = parent
@@ -258,7 +259,9 @@ class Sweep(Reported):
             before.insert(0, [at, {n: as_scalar(one[n]) for n in self.hyperparameters}])
         return TrainedConfiguration(
             study=self.name, hyperparameters=values, seed=int(row["seed"]),
-            steps=int(row[STEPS]), certificate={n: as_scalar(row[n]) for n in CERTIFICATE},
+            steps=int(row[STEPS]),
+            called=int(row[STEPS]) if self.record.options.get("halving") else whole,
+            certificate={n: as_scalar(row[n]) for n in CERTIFICATE},
             weights=weights_of(policy), version=self.record.version,
             processor=describe_processor(), policy=policy, before=before,
         )  # fmt: skip
