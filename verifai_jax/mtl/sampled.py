@@ -17,7 +17,7 @@ import numpy as np
 
 from verifai_jax.core.display.extensions import extension, extensions
 from verifai_jax.mtl.expression import Expression, Number, Signal, constant_value, expression
-from verifai_jax.mtl.formula import Formula, Interval, Next, Prev, Term, Witness, formula
+from verifai_jax.mtl.formula import Formula, Interval, Term, formula
 from verifai_jax.mtl.tree import Node, postorder
 from verifai_jax.mtl.words import number_text
 
@@ -257,12 +257,6 @@ def sampled_in(*formulas: Formula) -> tuple[Sampled, ...]:
                 found[each] = None
                 todo += each.operands
     return tuple(found)
-
-
-def about_single_samples(*formulas: Formula) -> list[Formula]:
-    """Return the parts that depend on the sampling period: they count or order samples."""
-    parts = (part for f in formulas for part in f.subformulas(valued=True))
-    return [f for f in parts if isinstance(f, Next | Prev | Witness) or sampled_in(f)]
 
 
 def with_counted(*formulas: Formula) -> list[Formula]:
