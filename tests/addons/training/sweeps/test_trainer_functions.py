@@ -31,7 +31,7 @@ from verifai_jax.addons.training.sweeps import StudyError
 from verifai_jax.addons.training.sweeps.clock import Clock
 from verifai_jax.addons.training.sweeps.function_runs import (
     FunctionRuns,
-    _Reports,
+    Reports,
     reported_steps,
     train_once,
 )
@@ -145,7 +145,7 @@ def test_what_a_training_reported_before_it_failed_is_a_row_of_its_own(tmp_path)
     number = runs.add({"rate": 0.3}, 3)
     assert runs._begins(number, 1)
     folder = runs._folder_of(number, 1).with_suffix(".part")
-    reports = _Reports([4], folder, np.zeros(2))
+    reports = Reports([4], folder, np.zeros(2))
     reports(5, Gain(np.float32([2.0, 0.0])), np.float32(7.0))
     runs._take_reported(number, 1)
     taken = runs.checkpoint(number, 0)
@@ -162,7 +162,7 @@ def test_what_a_training_reported_before_it_failed_is_a_row_of_its_own(tmp_path)
         ):
             reports(steps, None)
     # Another call begins without them.
-    _Reports([4], folder, np.zeros(2))(4, Gain(np.float32([2.0, 0.0])), 7.0)
+    Reports([4], folder, np.zeros(2))(4, Gain(np.float32([2.0, 0.0])), 7.0)
     assert runs._begins(number, 1)
     assert [file.name for file in folder.parent.glob("*.npz")] == []
     # Files that cannot be copied are an error of this training.

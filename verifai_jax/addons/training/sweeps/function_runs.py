@@ -282,7 +282,7 @@ def train_once(
     if (torch := sys.modules.get("torch")) is not None:
         torch.manual_seed(seed)
     folder = Path(call["folder"])
-    reports = _Reports(call["checkpoints"], folder, observation)
+    reports = Reports(call["checkpoints"], folder, observation)
     given = {"resume": folder, "checkpoint": reports}
     options: dict[str, Any] = {name: value for name, value in given.items() if takes(train, name)}
     if "starts" in call:
@@ -301,7 +301,7 @@ def train_once(
     return cast(Trace, _encode(made, observation, curve, seconds))
 
 
-class _Reports:
+class Reports:
     """What a training function reports: how far it is, its returns, and policies at checkpoints,
     which it writes beside the folder of the call.
     """
@@ -322,11 +322,14 @@ class _Reports:
             self.curve["steps"].append(steps)
             self.curve["mean_return"].append(float(mean_return))
         for at in passed:
-            seconds = time.perf_counter() - self._began
-            arrays = _encode(policy, self._observation, self.curve, seconds)
-            with replacing(_reported(self._folder, at)) as made, made.open("wb") as file:
-                np.savez(file, **cast(Any, arrays))
+            self._take(policy, _reported(self._folder, at))
         self._folder.with_suffix(".steps").write_text(str(self.last))
+
+    def _take(self, policy: Any, path: Path) -> None:
+        seconds = time.perf_counter() - self._began
+        arrays = _encode(policy, self._observation, self.curve, seconds)
+        with replacing(path) as made, made.open("wb") as file:
+            np.savez(file, **cast(Any, arrays))
 
 
 def _reported(folder: Path, steps: object) -> Path:
