@@ -236,7 +236,7 @@ def test_a_simulator_that_workers_cannot_import(tmp_path, monkeypatch):
     import licensed  # pyright: ignore[reportMissingImports]
 
     system = blackbox(licensed.simulate, workers=1)
-    match = "a worker process could not import the simulator: ImportError: no licence left"
+    match = "a worker process could not import what it runs: ImportError: no licence left"
     with pytest.raises(workers.StartError, match=match):
         list(system.simulate_each([{}], [0]))
 
