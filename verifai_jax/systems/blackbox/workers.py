@@ -28,13 +28,7 @@ from verifai_jax.core.messages.checks import check_count
 from verifai_jax.core.values.trace import Status, Trace
 from verifai_jax.systems.base import Features, Outcome
 from verifai_jax.systems.blackbox import worker_process
-from verifai_jax.systems.blackbox.worker_process import (
-    MARK,
-    START,
-    end_marked,
-    main_guard,
-    pickled_setup,
-)
+from verifai_jax.systems.blackbox.worker_process import MARK, START, main_guard, pickled_setup
 
 log = logging.getLogger("verifai_jax.workers")
 WORKER_ENVIRONMENT = {
@@ -432,7 +426,7 @@ class _Worker:
         # Its number is not given to another process while its group has members.
         with contextlib.suppress(ProcessLookupError, PermissionError):
             os.killpg(self.process.pid, signal.SIGKILL)
-        end_marked(self.mark)
+        worker_process.end_marked(self.mark)
         self.pipe.close()
         return f"the worker process {_manner(code)}"
 
