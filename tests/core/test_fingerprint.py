@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from verifai_jax.core.compute.fingerprint import fingerprint, identity
+from verifai_jax.core.compute.fingerprint import fingerprint, identity, stable_text
 from verifai_jax.search import CrossEntropy, Portfolio
 
 X = jax.ShapeDtypeStruct((3,), jnp.float32)
@@ -151,3 +151,16 @@ def test_a_program_that_is_not_differentiated_does_not_depend_on_derivatives(rev
     other_value = with_derivative(jnp.cos, jnp.tan, reverse=reverse)
     assert alone(one) == alone(other_slope) != alone(other_value)
     assert of(one) != of(other_slope)
+
+
+def test_the_text_of_an_object_is_the_same_in_a_script_and_where_it_is_imported():
+    def text(module, name="Cart"):
+        return stable_text([type(name, (), {"__module__": module})()])
+
+    assert text("__main__") == text("_target_mine") == text("some.mine") == "[<Cart object>]"
+    assert text("mine", "Other") != text("mine")
+    assert stable_text("x < b.Cart object") == "'x < b.Cart object'"
+    assert (
+        stable_text(text) == "<function test_the_text_of_an_object_is_the_same_in_a_script_and_"
+        "where_it_is_imported.<locals>.text>"
+    )

@@ -307,18 +307,17 @@ def test_native_mujoco_gives_the_same_rows_from_workers():
     pytest.importorskip("mujoco")
     from specs import mujoco_cartpole
 
-    options = {"search": "uniform", "budget": 300, "batch": 256, "backend": "native"}
-    options["confirm"] = False
-    equal(
-        vj.falsify(mujoco_cartpole.balance, **options),
-        vj.falsify(mujoco_cartpole.balance, **options, run_on=vj.RunOn(executor=Disorder(1))),
-    )
+    def run(executor=None):
+        on = vj.RunOn(backend="native", executor=executor)
+        return vj.falsify(
+            mujoco_cartpole.balance, "uniform", 300, batch=256, confirm=False, run_on=on
+        )
+
+    here = run()
+    equal(here, run(Disorder(1)))
     # In one process its batches of MuJoCo are used by one block at a time.
     with ThreadPoolExecutor(2) as executor:
-        equal(
-            vj.falsify(mujoco_cartpole.balance, **options),
-            vj.falsify(mujoco_cartpole.balance, **options, run_on=vj.RunOn(executor=executor)),
-        )
+        equal(here, run(executor))
 
 
 def test_rows_of_another_processor_are_said_to_be():

@@ -121,9 +121,10 @@ def test_a_sweep(tmp_path):
     stored = load_sweep(tmp_path / "toy-1")
     path = stored.report(tmp_path / "toy.html")
     text = path.read_text()
-    assert (
-        f"{len(stored.safe)} of {len(stored.table)} policies fail with a probability below" in text
-    )
+    shown = f"{len(stored.safe)} of {len(stored.table)} policies are shown to fail with a"
+    assert f"{shown} probability below" in text
+    without = (~stored.table["status"].isin(["trained", "stopped"])).sum()
+    assert f"{without} trainings gave no policy, or one that is not finite." in text
     assert "log-uniform between 0.0001 and 0.01" in text
     assert "sweep.json" in text
     again = load_sweep(tmp_path / "toy-1").report(tmp_path / "toy.html")

@@ -20,6 +20,7 @@ from verifai_jax.core.values.waveform import Waveform
 from verifai_jax.systems.base import Outcome
 from verifai_jax.systems.blackbox import blackbox, workers
 from verifai_jax.systems.blackbox._blackbox import single_trace
+from verifai_jax.systems.blackbox.worker_process import MARK, end_marked
 
 ROOT = Path(__file__).parents[3]
 HERE = r" \([^()]*host_systems.py, line \d+, in \w+\)"
@@ -150,6 +151,26 @@ def test_what_a_simulator_has_started_ends_with_the_pool():
     until(lambda: not alive(child), 5)
 
 
+@pytest.mark.skipif(not Path("/proc").is_dir(), reason="Linux lists processes there")
+def test_what_a_worker_has_started_ends_in_whatever_session():
+    marks, started = ("8/1-2/", "8/1-2/3-0/", "8/1-20/", "7/8/1-2/"), []
+    for mark in marks:
+        command = ["sh", "-c", "echo; sleep 1000 & wait"]
+        how = {"env": {**os.environ, MARK: mark}, "start_new_session": True}
+        started.append(subprocess.Popen(command, stdout=subprocess.PIPE, **how))
+        started[-1].stdout.readline()  # Its environment is its own by now.
+    try:
+        end_marked("8/1-2/")
+        assert [process.wait(5) for process in started[:2]] == [-signal.SIGKILL] * 2
+        assert [process.poll() for process in started[2:]] == [None, None]
+    finally:
+        for process in started:
+            with contextlib.suppress(ProcessLookupError):
+                os.killpg(process.pid, signal.SIGKILL)
+            process.stdout.close()
+            process.wait()
+
+
 @pytest.mark.slow
 def test_what_has_ended_when_interrupted_is_handed_over(monkeypatch, tmp_path):
     """Outcomes of several workers lie in the queue when Ctrl-C comes."""
@@ -215,7 +236,7 @@ def test_a_simulator_that_workers_cannot_import(tmp_path, monkeypatch):
     import licensed  # pyright: ignore[reportMissingImports]
 
     system = blackbox(licensed.simulate, workers=1)
-    match = "a worker process could not import the simulator: ImportError: no licence left"
+    match = "a worker process could not import what it runs: ImportError: no licence left"
     with pytest.raises(workers.StartError, match=match):
         list(system.simulate_each([{}], [0]))
 

@@ -10,8 +10,9 @@ from verifai_jax.addons.reports.provenance import Model, folder_inputs
 from verifai_jax.addons.reports.run_question import About, space_table
 from verifai_jax.addons.reports.sections import MODEL, result_page
 from verifai_jax.addons.reports.studies import png
+from verifai_jax.addons.training.sweeps.record import STOPPED, TRAINED
 from verifai_jax.addons.training.sweeps.result import Sweep
-from verifai_jax.core.messages.text import format_percent
+from verifai_jax.core.messages.text import counted, format_percent
 from verifai_jax.features.english import number
 
 FILES = (
@@ -50,7 +51,8 @@ def sweep_page(sweep: Sweep, about: About, problem: object = None) -> Page:
         Claim("C1", headline, ("the table of the sweep",), (MODEL, TOGETHER)),
         Claim(
             "C2",
-            f"{len(safe):,} of {len(frame):,} policies fail with a probability below {limit}.",
+            f"{len(safe):,} of {len(frame):,} policies are shown to fail with a probability below "
+            f"{limit}.",
             ("certificates: fresh samples of the problem's prior",), (MODEL, TOGETHER),
         ),
     ]  # fmt: skip
@@ -62,7 +64,7 @@ def sweep_page(sweep: Sweep, about: About, problem: object = None) -> Page:
     options = [
         (name, str(value)) for name, value in sorted(record.options.items()) if value is not None
     ]
-    statuses = [f"{status}" for status in frame["status"].astype(str) if status != "ok"]
+    ended = sum(status in (TRAINED, STOPPED) for status in frame["status"])
     asked = [paragraph(f"Which trainings of {sweep.name} are safe: fail below {limit}.")]
     if sweep.space is not None:
         asked.append(space_table(sweep.space, {}, about))
@@ -92,7 +94,7 @@ def sweep_page(sweep: Sweep, about: About, problem: object = None) -> Page:
         limits=[
             "A high return is not safety: a policy without the verdict safe is not shown to be "
             "safe.",
-            f"{len(statuses):,} policies did not end properly.",
+            f"{counted(len(frame) - ended, 'training')} gave no policy, or one that is not finite.",
             *([] if record.complete else ["The sweep was cut off before its end."]),
             "An attack finds counterexamples and enters no interval.",
             MODEL,

@@ -36,8 +36,8 @@ _CUSTOM = ("custom_jvp_call", "custom_vjp_call")
 """Primitives of functions that bring their own derivative."""
 _NAMED = ("UnspecifiedValue", "PRNGImpl", "Mesh", "AbstractMesh", "PyTreeDef", "Device", "FTTuple")
 """Classes of JAX whose text says all of them; the last one groups the operands of a loop (0.12)."""
-_ADDRESS = re.compile(r" at 0x[0-9a-fA-F]+")
-"""Addresses in memory, which differ between processes."""
+_PLACE = re.compile(r" at 0x[0-9a-fA-F]+|(?<=<)(\w+\.)+(?=[\w.<>]+ object\b)")
+"""Addresses in memory and modules of objects, which differ between processes and scripts."""
 
 
 class _Unknown(Exception):
@@ -350,7 +350,7 @@ _CALLBACKS = frozenset({"pure_callback", "io_callback"})
 
 
 def stable_text(value: object) -> str:
-    """Return the `repr` of a value without memory addresses; for an array, with all its numbers."""
+    """Return the `repr` of a value without addresses and modules; for an array, all its numbers."""
     if isinstance(value, np.ndarray | jax.Array):
         return repr(np.asarray(value).tolist())
-    return _ADDRESS.sub("", repr(value))
+    return _PLACE.sub("", repr(value))

@@ -67,7 +67,7 @@ class Trace(InNotebook):
       there what its clock skips, and verdicts include it.
     - `notes`: messages of the producer on this simulation or recording, each with the number of its
       occurrences, `{"the solver fell back to Euler": 3}`. A run adds them up in its notes.
-    - `units`: units of signals by name, from the recording.
+    - `units`: units of signals by name, from the recording; of `time` if it is not in seconds.
     - `truths`: names of the signals of numbers 1, 0 and NaN that are truth values with gaps.
 
     Notes and units stay on the host: JAX's transformations drop them.
@@ -288,9 +288,11 @@ class Trace(InNotebook):
     def _span(self) -> str:
         """Return the number of samples, the clock, and how it ended."""
         count = f"{self.length} sample{'s' * (self.length != 1)}"
-        text = count if self.dt is None else f"{count} every {format_seconds(self.dt)}"
+        unit = None if "time" in self.signals else self.units.get("time")
+        written = format_seconds if unit is None else lambda time: f"{time:z,.10g} {unit}"
+        text = count if self.dt is None else f"{count} every {written(self.dt)}"
         if self.dt is None and not isinstance(self.times, Tracer | jax.ShapeDtypeStruct):
-            first, last = (format_seconds(float(self.clock()[i])) for i in (0, -1))
+            first, last = (written(float(self.clock()[i])) for i in (0, -1))
             text += f" from {first} to {last}"
         valid, status = (
             None if code is None or np.shape(code) or not _is_known(code) else int(code)

@@ -31,6 +31,19 @@ START = (
 )
 
 
+MARK = "VERIFAI_JAX_WORKER"
+"""Variable of a worker's environment, which all processes that it starts inherit."""
+
+
+def end_marked(mark: str) -> None:
+    """End the processes with this mark, or one that begins with it, except for this one."""
+    marked, own = f"\0{MARK}={mark}".encode(), str(os.getpid())
+    for file in Path("/proc").glob("[0-9]*/environ"):
+        with contextlib.suppress(OSError):
+            if marked in b"\0" + file.read_bytes() and file.parent.name != own:
+                os.kill(int(file.parent.name), signal.SIGKILL)
+
+
 def pickled_setup(
     simulation: Callable[[Features, int], Trace], function: Callable[..., object]
 ) -> bytes:
@@ -46,9 +59,8 @@ def pickled_setup(
         if preparing:  # Its module is half imported; and nothing will be simulated here.
             return b""
         raise ValueError(
-            f"blackbox(..., workers=...) starts new processes, which must be able to import what "
-            f"they run: {name} cannot be ({error}). Define it by `def` {where}, "
-            "or leave out workers"
+            f"new processes must be able to import what they run: {name} cannot be ({error}). "
+            f"Define it by `def` {where}; a black box may leave out workers"
         ) from error
     main = None
     if b"__main__" in pickled:
@@ -56,10 +68,10 @@ def pickled_setup(
         file = getattr(sys.modules["__main__"], "__file__", None)
         if not main or ("init_main_from_path" in main and not (file and Path(file).exists())):
             raise ValueError(
-                f"blackbox(..., workers=...) starts new processes, which cannot import {name} from "
+                f"a new process cannot import {name} from "
                 "a notebook or an interactive session: put it into a file next to the notebook "
-                f"(`%%writefile simulator.py`), {where}, and import it from there, or leave out "
-                "workers"
+                f"(`%%writefile simulator.py`), {where}, and import it from there; a black "
+                "box may leave out workers"
             )
     module = getattr(function, "__module__", None) or type(function).__module__
     # Those that are loaded by their file are not found by their name: a target of the command line.
@@ -94,7 +106,7 @@ def work(fd: int) -> None:
                 _import(module, file)
         simulation = pickle.loads(pickled)
     except BaseException as error:
-        problem = f"a worker process could not import the simulator: {format_user_error(error)}"
+        problem = f"a worker process could not import what it runs: {format_user_error(error)}"
         if main_guard() in str(error):
             problem = main_guard()
     preparing = False
@@ -137,4 +149,5 @@ def _outlive_no_parent(parent: int) -> None:
     """End this process, and those it has started, if its parent is gone."""
     while os.getppid() == parent:
         time.sleep(1.0)
+    end_marked(os.environ[MARK])
     os.killpg(os.getpid(), signal.SIGKILL)  # It leads a session, and so a group, of its own.

@@ -2,7 +2,7 @@
 
 Each worker is a new Python process, so no state of this process (threads, JAX, locks) is partly
 copied into it. It has its own session: Ctrl-C reaches only this process, and ending a worker also
-ends the processes that it has started.
+ends the processes that it has started; on Linux those in sessions of their own too.
 """
 
 import contextlib
@@ -28,7 +28,7 @@ from verifai_jax.core.messages.checks import check_count
 from verifai_jax.core.values.trace import Status, Trace
 from verifai_jax.systems.base import Features, Outcome
 from verifai_jax.systems.blackbox import worker_process
-from verifai_jax.systems.blackbox.worker_process import START, main_guard, pickled_setup
+from verifai_jax.systems.blackbox.worker_process import MARK, START, main_guard, pickled_setup
 
 log = logging.getLogger("verifai_jax.workers")
 WORKER_ENVIRONMENT = {
@@ -338,6 +338,7 @@ class _Worker:
 
     def __init__(self, setup: bytes) -> None:
         self.number = next(_numbers)
+        self.mark = f"{os.environ.get(MARK, '')}{os.getpid()}-{self.number}/"
         self.asked = self.dropped = 0
         self.pipe, theirs = Pipe()
         try:
@@ -347,7 +348,7 @@ class _Worker:
                 stdout=subprocess.DEVNULL,
                 pass_fds=[theirs.fileno()],
                 start_new_session=True,
-                env={**WORKER_ENVIRONMENT, **os.environ, "VERIFAI_JAX_CORES": "1"},
+                env={**WORKER_ENVIRONMENT, **os.environ, "VERIFAI_JAX_CORES": "1", MARK: self.mark},
             )
         except OSError as error:
             raise StartError(f"no worker process could start: {error}") from error
@@ -425,6 +426,7 @@ class _Worker:
         # Its number is not given to another process while its group has members.
         with contextlib.suppress(ProcessLookupError, PermissionError):
             os.killpg(self.process.pid, signal.SIGKILL)
+        worker_process.end_marked(self.mark)
         self.pipe.close()
         return f"the worker process {_manner(code)}"
 

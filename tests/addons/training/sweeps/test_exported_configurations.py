@@ -1,5 +1,7 @@
 """Configurations that leave a sweep: exported, loaded, trained again, and as Optuna's trials."""
 
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -26,6 +28,20 @@ def swept():
             drifting(space, seeds=(3,)), configurations=3,
             certification=vj.Certification(samples=64),
         )  # fmt: skip
+
+
+def partly_certified(swept):
+    """Return a sweep of whose three configurations one raised, and one was stopped."""
+    columns = {name: np.copy(column) for name, column in swept.record.columns.items()}
+    columns["kind"] = np.array(["relu", "tanh", "tanh"], object)[columns["configuration"]]
+    for name in ("failure_rate", "failure_high", "nominal_return"):
+        columns[name] = np.where(columns["configuration"] == 0, np.nan, columns[name])
+    columns["status"] = np.array(["error: odd", "trained", "stopped"], object)[
+        columns["configuration"]
+    ]
+    columns["verdict"] = np.where(columns["configuration"] == 0, "", columns["verdict"])
+    names = (*swept.hyperparameters, "kind")
+    return replace(swept, record=replace(swept.record, columns=columns, hyperparameters=names))
 
 
 def bits(policy):
@@ -65,6 +81,13 @@ def test_what_cannot_be_loaded_or_trained_again(swept, tmp_path):
     object.__setattr__(best, "steps", 96)
     with pytest.raises(StudyError, match="that of 96 steps"):
         best.train(swept.study)
+    policy = tmp_path / "policy.onnx"
+    whole = policy.read_bytes()
+    policy.write_bytes(whole[:-9] + bytes([whole[-9] ^ 1]) + whole[-8:])
+    with pytest.raises(DamagedError, match=r"policy\.onnx is not the policy of configuration"):
+        load_configuration(tmp_path)
+    policy.write_bytes(whole)
+    load_configuration(tmp_path)
     file = tmp_path / "configuration.json"
     file.write_text(file.read_text().replace('"seed": 3', '"seed": 4'))
     with pytest.raises(DamagedError, match="has changed"):
@@ -76,7 +99,12 @@ def test_the_trials_are_those_of_optuna(swept):
     ours, theirs = swept.trials_dataframe(), swept.to_optuna().trials_dataframe()
     for name in ("number", "values_0", "values_1", "params_rate", "params_steps"):
         np.testing.assert_allclose(ours[name], theirs[name].astype(float), rtol=1e-6)
-    assert list(ours["user_attrs_verdict"]) == list(theirs["user_attrs_verdict"])
+    for name in ("user_attrs_verdict", "user_attrs_status", "state"):
+        assert list(ours[name]) == list(theirs[name])
+    assert {*ours["state"]} == {"COMPLETE"}
+    halved = partly_certified(swept)
+    assert list(halved.trials_dataframe()["state"]) == ["FAIL", "COMPLETE", "PRUNED"]
+    assert list(halved.to_optuna().trials_dataframe()["state"]) == ["FAIL", "COMPLETE", "PRUNED"]
 
 
 @pytest.mark.parametrize("kind", ["parallel", "slices"])
@@ -89,7 +117,12 @@ def test_pictures_that_people_know(swept, tmp_path, kind):
         assert axes[0].get_xscale() == "log"
         shown = np.concatenate([each.get_offsets()[:, 0] for each in axes[0].collections])
         np.testing.assert_allclose(sorted(shown), sorted(swept.configurations["rate"]))
+        halved = partly_certified(swept).plot(tmp_path / "b.png", kind=kind).axes[-1]
+        assert [each.get_text() for each in halved.get_xticklabels()] == ["tanh"]
     else:
+        assert {each.get_text() for each in axes[0].get_legend().texts} == {
+            *swept.configurations["verdict"]
+        }
         assert len(axes[0].lines) == len(swept.configurations)
         for line, (_, row) in zip(axes[0].lines, swept.configurations.iterrows(), strict=True):
             np.testing.assert_allclose(line.get_ydata()[-1], row["failure_rate"])

@@ -277,9 +277,26 @@ def test_interrupted_and_resumed_it_is_the_same_sweep(case, monkeypatch, tmp_pat
         assert sum(used for _, used in again.reuse.values()) == pieces
         assert sum(cached for cached, _ in again.reuse.values()) >= min(after, pieces)
         assert f"  from the cache  {again.reuse['certify'][0]} of " in str(again)
+    same_tables(vj.load_sweep(tmp_path / "through"), through, but=())
     # Nothing is trained again: all is remembered, with the seconds that it took.
     monkeypatch.setattr(training_runs.BatchedTraining, "advance", None)
     same_tables(sweep(study, folder=tmp_path / "through", **how), through, but=())
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize("case", ["halton", "population"])
+def test_a_checkpoint_that_a_damaged_cache_lacks_is_trained_again(case, monkeypatch, tmp_path):
+    cases = {**CASES, "population": {"configurations": 4, "search": vj.Population()}}
+    study, how = drifting(), {"certification": vj.Certification(samples=64), **cases[case]}
+    through = sweep(study, folder=tmp_path, **how)
+
+    class Damaged(Cache):
+        def get(self, name):
+            lost = name.endswith("32 of 128") and name not in self._own
+            return None if lost else super().get(name)
+
+    monkeypatch.setattr("verifai_jax.core.store.cache.Cache", Damaged)
+    same_tables(sweep(study, folder=tmp_path, **how), through)
 
 
 @pytest.mark.slow

@@ -14,15 +14,28 @@ import pytest
 from checked_types import unchecked
 from drifting import Point, closed_loop
 from misbehaving_training import train_badly
-from numpy_training import seed_of, study, sweep, train, train_anew, train_reporting, trained
+from numpy_training import (
+    Gain,
+    seed_of,
+    study,
+    sweep,
+    train,
+    train_anew,
+    train_reporting,
+    train_towards,
+    trained,
+)
 
 import verifai_jax as vj
 from verifai_jax.addons.training.sweeps import StudyError
+from verifai_jax.addons.training.sweeps.clock import Clock
 from verifai_jax.addons.training.sweeps.function_runs import (
     FunctionRuns,
+    Reports,
     reported_steps,
     train_once,
 )
+from verifai_jax.core.store.cache import Cache
 
 HERE = Path(__file__).parent
 
@@ -110,13 +123,14 @@ def test_a_training_reports_its_checkpoints_and_how_far_it_is(tmp_path):
     weights, returns = trained(rng, np.zeros(2), {"rate": 0.1}, 8)
     np.testing.assert_array_equal(found["steps"], np.arange(1, 9))
     np.testing.assert_array_equal(found["mean_return"], returns)
-    np.testing.assert_array_equal(found["4/mean_return"], returns[:4])
+    at_four = np.load(tmp_path / "8.4.npz")
+    np.testing.assert_array_equal(at_four["mean_return"], returns[:4])
     again, _ = trained(
         np.random.default_rng(seed_of(jax.random.key(3))), np.zeros(2), {"rate": 0.1}, 4
     )
-    for prefix, expected in (("", weights), ("4/", again)):
-        held = [a for n, a in found.items() if n.startswith(f"{prefix}array/")]
-        assert any(np.array_equal(np.ravel(a), np.float32(expected)) for a in held), prefix
+    for arrays, expected in ((found, weights), (at_four, again)):
+        held = [a for n, a in arrays.items() if n.startswith("array/")]
+        assert any(np.array_equal(np.ravel(a), np.float32(expected)) for a in held)
     assert reported_steps(tmp_path / "8.part") == 8
     assert reported_steps(tmp_path / "other.part") == 0
     with (
@@ -124,6 +138,65 @@ def test_a_training_reports_its_checkpoints_and_how_far_it_is(tmp_path):
         pytest.raises(ValueError, match="checkpoint was not called at 4 steps or after them"),
     ):
         train_once(train_reporting, seen, {**call, "values": {"rate": 0.5}, "checkpoints": [4]}, 3)
+
+
+def test_what_a_training_reported_before_it_failed_is_a_row_of_its_own(tmp_path):
+    runs = FunctionRuns(study(train_reporting), Cache(tmp_path), Clock("by_hand", None, False))
+    number = runs.add({"rate": 0.3}, 3)
+    assert runs._begins(number, 1)
+    folder = runs._folder_of(number, 1).with_suffix(".part")
+    reports = Reports([4], folder, np.zeros(2))
+    reports(5, Gain(np.float32([2.0, 0.0])), np.float32(7.0))
+    runs._take_reported(number, 1)
+    taken = runs.checkpoint(number, 0)
+    assert taken.training_return == 7.0
+    np.testing.assert_array_equal(taken.policy.act(jnp.float32([1.0, 3.0])), [2.0])
+    assert [file.name for file in folder.parent.iterdir()] == ["8.part", "8.steps"]
+    reports(6, Gain(np.float32([np.nan, 0.0])), 7.0)
+    with pytest.raises(ValueError, match="called at 6 steps after 6 steps"):
+        reports(6, None)
+    for steps in ("7", 7.5, -7):
+        with (
+            unchecked(),
+            pytest.raises(ValueError, match="steps of a checkpoint must be an integer"),
+        ):
+            reports(steps, None)
+    # Another call begins without them.
+    Reports([4], folder, np.zeros(2))(4, Gain(np.float32([2.0, 0.0])), 7.0)
+    assert runs._begins(number, 1)
+    assert [file.name for file in folder.parent.glob("*.npz")] == []
+    # Files that cannot be copied are an error of this training.
+    other = runs.add({"rate": 0.1}, 3)
+    runs._folder_of(other, 0).mkdir(parents=True)
+    os.mkfifo(runs._folder_of(other, 0) / "pipe")
+    assert not runs._begins(other, 1)
+    assert runs.errors[other].startswith("its files in resume cannot be copied: ")
+
+
+@pytest.mark.parametrize(("lost", "at"), [(0, 1), (1, 1), (None, None)])
+def test_a_call_is_made_again_where_the_cache_has_lost_any_of_its_checkpoints(
+    lost, at, monkeypatch, tmp_path
+):
+    runs = FunctionRuns(study(train_reporting), Cache(tmp_path), Clock("by_hand", None, False))
+    number, calls = runs.add({"rate": 0.3}, 3), []
+    runs._checkpoints = {(number, rung): None for rung in range(2) if rung != lost}
+    monkeypatch.setattr(runs, "_recall", lambda *_: None)
+    monkeypatch.setattr(runs, "_call", lambda *call: calls.append(call))
+    runs.train([number], 1)
+    assert calls == ([] if at is None else [([number], at)])
+
+
+def test_a_call_leaves_the_next_one_its_folder_and_a_curve_that_is_one(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    call = {"values": {}, "steps": 8, "folder": str(tmp_path / "8.part"), "checkpoints": []}
+
+    def moving(key, hyperparameters, steps):
+        os.chdir("/")
+        return Gain(np.float32([2.0, 0.0])), {"steps": [2, 1], "mean_return": [0.0, 0.0]}
+
+    with pytest.raises(ValueError, match=r"which are positive and increase; got 2 steps and 2"):
+        train_once(moving, np.zeros(2), call, 0)
+    assert Path.cwd() == tmp_path
 
 
 @pytest.mark.slow
@@ -134,6 +207,11 @@ def test_one_call_of_a_training_gives_all_its_rows():
     for name in ("steps", "failures", "simulations", "verdict"):
         rows = [found.table.loc[found.table["rate"] < 0.4, name] for found in (reported, anew)]
         np.testing.assert_array_equal(*rows)
+    for halving, weight in ((None, -0.5), (vj.Halving(2), -1.0)):
+        at_four = sweep(train_towards, halving=halving).configuration(0)
+        assert (at_four.steps, at_four.called) == (4, 8 if halving is None else 4)
+        for policy in (at_four.policy, at_four.train(study(train_towards))):
+            assert policy.act(jnp.float32([1.0, 0.0])) == weight
 
 
 @pytest.mark.slow

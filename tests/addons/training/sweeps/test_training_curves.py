@@ -16,6 +16,7 @@ HELD = [20.0, 20.0, 20.0, 20.0, 60.0, 95.0, 85.0, 85.0, 70.0]
 
 def test_the_curve_is_a_trace_over_environment_steps():
     trace = curve_trace(STEPS, RETURN)
+    assert str(trace).startswith(f"trace of 9 samples every {STEPS[0]:,} environment steps")
     assert trace["return"].tolist() == HELD
     assert trace.clock().tolist() == [0.0, *STEPS]
 

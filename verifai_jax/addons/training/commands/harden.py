@@ -18,10 +18,10 @@ from verifai_jax.cli.json_output import command, draw, give_result, say
     type=int,
     help="Environment steps of each round  [default: an eighth of --steps]",
 )
-@option("--samples", default=512, help="Confidence of each certificate.")
+@option("--samples", default=512, help="Minimum number of samples of each certificate.")
 @option("--attack", default="cross_entropy", help="Search used for attacks.")
-@option("--attack-simulations", default=512)
-@option("--confidence", default=0.95)
+@option("--attack-simulations", default=512, help="Simulations of each attack.")
+@option("--confidence", default=0.95, help="Confidence of each certificate.")
 @option("--baseline", is_flag=True, help="Train with plain domain randomisation as well.")
 @arguments.SEED
 @arguments.MAX_SECONDS

@@ -1,7 +1,6 @@
 """`verifai-jax sweep specs/mountain_car.py:safe_training --configurations 32`."""
 
 from collections.abc import Mapping
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -101,12 +100,12 @@ def sweep(
                 stop=Stop(seconds=max_seconds), note=note, run_on=RunOn(executor=executor),
                 even_if_changed=even_if_changed, **keywords,
             )  # fmt: skip
-            record = replace(result.record, options={**result.record.options, "target": target})
-            result = replace(result, record=record)
+            record = result.record
             say(result)
             if len(result.table):
                 say(_format_table(result))
-            result.save(folder)
+            if cache not in (None, folder):
+                result.save(folder)
     except KeyboardInterrupt:
         if folder is not None and cache_file(folder if cache is None else cache).exists():
             say(f"  resume       {_resuming(folder, target, cache, max_seconds, cluster)}")

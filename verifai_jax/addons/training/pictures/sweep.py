@@ -74,7 +74,8 @@ def _draw_safety(axes: Axes, sweep: Sweep) -> None:
     table = sweep.table.iloc[preference_order(sweep.table)]
     table = table.loc[np.isfinite(table["nominal_return"].to_numpy(np.float64))]
     if not len(table):
-        axes.text(0.5, 0.5, "no policy was certified", ha="center", transform=axes.transAxes)
+        said = "no policy has a certificate and a return"
+        axes.text(0.5, 0.5, said, ha="center", transform=axes.transAxes)
         axes.set_axis_off()
         return
     crowded = len(table) > 60

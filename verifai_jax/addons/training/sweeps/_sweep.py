@@ -63,10 +63,11 @@ def sweep(
     - `halving`: how to stop all but the best configurations at each checkpoint.
     - `batch`: configurations in a round of a search that learns.
     - `episodes`: number of episodes over which the nominal return is averaged.
-    - `folder`: the folder that caches finished work; passing it again resumes an interrupted sweep.
+    - `folder`: the folder of finished work and the result, which `load_sweep` reads; passing it
+      again resumes an interrupted sweep.
     - `stop`: the seconds of the sweep; no training begins after two thirds of them, and the call of
       a training function that has not ended by then is ended, as an error of its row.
-    - `note`: plain data that is stored in the folder next to the work.
+    - `note`: plain data stored in the folder next to the work; its `target` names the study.
     - `callbacks`: functions called for each policy when its return is known, and again when its
       safety is, with the number of calls so far and a dictionary of plain numbers; cached work
       counts too.
@@ -112,13 +113,18 @@ def sweep(
         sources = cache.claim(fingerprint(study, options), study.sources(), even_if_changed)
         if note is not None:
             cache.note("command", dict(note))
+            options["target"] = note.get("target")
         options |= {"configurations": configurations, "p": study.p}
         options["curve"] = None if study.curve_formula is None else str(study.curve_formula)
         running = RunningSweep(
             study, options, cache, clock, halving, certified, called, executor=executor,
             sources=sources, population=population,
         )  # fmt: skip
-        return Sweep(running.run(proposer), study, reuse=cache.reuse())
+        result = Sweep(running.run(proposer), study, reuse=cache.reuse())
+    if folder is not None:
+        with cache.writing(folder):
+            result.save(folder)
+    return result
 
 
 def _given(halving: Halving) -> dict[str, Any]:

@@ -63,9 +63,9 @@ def curve_trace(
     held = known[np.where(last >= 0, last, int(np.argmax(present)))]
     signals, times = {"return": np.concatenate([held[:1], held])}, np.concatenate([[0.0], steps])
     period = float(steps[0])
-    if np.array_equal(times, period * np.arange(len(times))):
-        return Trace(signals, dt=period)
-    return Trace(signals, times=times)
+    even, unit = np.array_equal(times, period * np.arange(len(times))), "environment steps"
+    dt, times = (period, None) if even else (None, times)
+    return Trace(signals, dt=dt, times=times, units={"time": unit})
 
 
 def curve_robustness(

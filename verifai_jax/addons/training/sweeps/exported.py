@@ -19,9 +19,11 @@ from verifai_jax.addons.training.sweeps.clock import Clock
 from verifai_jax.addons.training.sweeps.record import TrainedPolicy
 from verifai_jax.addons.training.sweeps.running import runs_of
 from verifai_jax.addons.training.sweeps.study import Study, StudyError
+from verifai_jax.addons.training.sweeps.trainer import takes
 from verifai_jax.core.compute.devices import describe_processor
 from verifai_jax.core.store import files
 from verifai_jax.core.store.cache import Cache
+from verifai_jax.core.store.foreign_files import read_bytes
 from verifai_jax.core.store.locks import write_lock
 from verifai_jax.core.store.replacements import replacing_all
 
@@ -36,6 +38,7 @@ class TrainedConfiguration:
     - `study`: the name of the study.
     - `hyperparameters`: their values, with `steps` if it was swept: those of the whole training.
     - `seed`, `steps`: the training seed, and the environment steps of the policy.
+    - `called`: the steps with which a training function was called that reports checkpoints.
     - `certificate`: `verdict`, `failures`, `simulations`, the ends of the interval, and the nominal
       return.
     - `before`: for one of a population the earlier `[steps, hyperparameters]`: what it was trained
@@ -49,6 +52,7 @@ class TrainedConfiguration:
     hyperparameters: dict[str, Any]
     seed: int
     steps: int
+    called: int
     certificate: dict[str, Any]
     weights: int
     version: str
@@ -64,7 +68,8 @@ class TrainedConfiguration:
         folder = Path(folder)
         with write_lock(folder), replacing_all(folder, (POLICY, CONFIGURATION)) as made:
             self.policy.save(made / POLICY)
-            record = {name: value for name, value in vars(self).items() if name != "policy"}
+            onnx = files.checksum(read_bytes(made / POLICY))
+            record = {n: value for n, value in vars(self).items() if n != "policy"} | {"onnx": onnx}
             files.write_record(made / CONFIGURATION, files.plain(record))
         return folder
 
@@ -83,12 +88,14 @@ class TrainedConfiguration:
         lineage = [*(values for _, values in self.before), self.hyperparameters]
         number = runs.add(lineage[0], self.seed)
         checkpoints = runs.runs[number].checkpoints
-        for at in (*(at for at, _ in self.before), self.steps):
+        for at in (*(at for at, _ in self.before), self.steps, self.called):
             if at not in checkpoints:
                 raise StudyError(f"its policy is that of {at} steps; got {checkpoints}")
         for (at, _), values in zip(self.before, lineage[1:], strict=True):
             number = runs.fork(number, checkpoints.index(at), values)
-        runs.train([number], checkpoints.index(self.steps))
+        own = getattr(study.trainer, "train", None)
+        trains_to = self.called if own is not None and takes(own, "checkpoint") else self.steps
+        runs.train([number], checkpoints.index(trains_to))
         trained = runs.checkpoint(number, checkpoints.index(self.steps))
         if trained is None:
             raise StudyError(f"the configuration does not train: {runs.errors[number]}")
@@ -113,8 +120,10 @@ def load_configuration(folder: str | Path) -> TrainedConfiguration:
     **Raises:** `FileNotFoundError` for a folder without one; `DamagedError` for one that has
     changed since; the errors of `vj.policy`.
     """
-    record = files.read_record(Path(folder) / CONFIGURATION)
+    record, file = files.read_record(Path(folder) / CONFIGURATION), Path(folder) / POLICY
+    if files.checksum(read_bytes(file)) != record.pop("onnx", None):
+        raise files.DamagedError(f"{file} is not the policy of {CONFIGURATION}, or is damaged")
     try:
-        return TrainedConfiguration(**record, policy=load(Path(folder) / POLICY))
+        return TrainedConfiguration(**record, policy=load(file))
     except TypeError as error:
         raise files.DamagedError(f"{folder} has no configuration of a sweep: {error}") from error

@@ -7,6 +7,7 @@ files that it left at the previous checkpoint; the original stays until the call
 stored.
 """
 
+import contextlib
 import json
 import logging
 import random
@@ -40,8 +41,11 @@ from verifai_jax.addons.training.sweeps.training_runs import (
 )
 from verifai_jax.core.compute.cores import available_cores
 from verifai_jax.core.compute.executors import Executor
+from verifai_jax.core.messages.checks import check_count
 from verifai_jax.core.messages.text import format_error, one_line
+from verifai_jax.core.store.atomic_files import replacing
 from verifai_jax.core.store.cache import Cache
+from verifai_jax.core.store.foreign_archives import read_arrays
 from verifai_jax.core.store.foreign_files import read_text
 from verifai_jax.core.store.log import Arrays
 from verifai_jax.core.values.trace import Status, Trace
@@ -69,7 +73,7 @@ class FunctionRuns(TrainingRuns):
             self._folder = Path(tempfile.mkdtemp(prefix="verifai_jax_trainings_"))
             weakref.finalize(self, shutil.rmtree, self._folder, ignore_errors=True)
         else:
-            self._folder = cache.path.parent / "trainings"
+            self._folder = cache.path.absolute().parent / "trainings"
         self._calls_back = takes(trainer.train, "checkpoint")
         if study.checkpoints and not (self._calls_back or takes(trainer.train, "resume")):
             log.warning(
@@ -92,10 +96,11 @@ class FunctionRuns(TrainingRuns):
                 if number in self.errors or at >= self.rungs(number):
                     continue
                 self._recall(number, at)
-                if (number, at) in self._checkpoints:
-                    self._advanced(number, at)
-                elif number not in self.errors and at in self._calls_of(number, rung):
+                called = number not in self.errors and at in self._calls_of(number, rung)
+                if called and not self._has_all(number, at):
                     waiting.append(number)
+                elif (number, at) in self._checkpoints:
+                    self._advanced(number, at)
             if waiting:
                 self._call(waiting, at)
         if not further:
@@ -113,10 +118,11 @@ class FunctionRuns(TrainingRuns):
     def _call(self, numbers: list[int], at: int) -> None:
         """Call the function for each of these, with at most one call per worker at a time."""
         calls: list[dict[str, Any]] = []
+        numbers = [number for number in numbers if self._begins(number, at)]
         for number in numbers:
-            run = self.runs[number]
-            steps, folder = run.checkpoints[at], str(self._begin(number, at))
-            calls.append({"values": dict(run.values), "steps": steps, "folder": folder})
+            run, folder = self.runs[number], self._folder_of(number, at).with_suffix(".part")
+            steps = run.checkpoints[at]
+            calls.append({"values": dict(run.values), "steps": steps, "folder": str(folder)})
             earlier = enumerate(run.checkpoints[:at])
             calls[-1]["checkpoints"] = [
                 c for i, c in earlier if (number, i) not in self._checkpoints
@@ -127,6 +133,7 @@ class FunctionRuns(TrainingRuns):
 
         def ended(index: int, result: "Arrays | str") -> None:
             number = numbers[index]
+            self._take_reported(number, at)
             if isinstance(result, str):
                 self.errors[number] = one_line(result)
             else:
@@ -158,33 +165,44 @@ class FunctionRuns(TrainingRuns):
                 done, total = (sum(each) for each in zip(*running, strict=True))
                 self.clock.advance(0, f"in training: {done:,} of {total:,} steps")
 
-    def _begin(self, number: int, at: int) -> Path:
-        """Make the folder of a call, with what the call before it left."""
+    def _begins(self, number: int, at: int) -> bool:
+        """Make the folder of a call, with what the call before it left, or say why it cannot be."""
         folder = self._folder_of(number, at).with_suffix(".part")
         shutil.rmtree(folder, ignore_errors=True)
-        if at and self._folder_of(number, at - 1).exists():
-            shutil.copytree(self._folder_of(number, at - 1), folder)
-        else:
+        for reported in folder.parent.glob(_reported(folder, "*").name):
+            reported.unlink()
+        if not (at and self._folder_of(number, at - 1).exists()):
             folder.mkdir(parents=True)
-        return folder
+            return True
+        try:
+            shutil.copytree(self._folder_of(number, at - 1), folder, symlinks=True)
+        except OSError as error:
+            self.errors[number] = one_line(f"its files in resume cannot be copied: {error}")
+        return number not in self.errors
+
+    def _take_reported(self, number: int, at: int) -> None:
+        """Store the policies that a call reported at earlier checkpoints, however it ended."""
+        for earlier in range(at if self._calls_back else 0):
+            steps = self.runs[number].checkpoints[earlier]
+            file = _reported(self._folder_of(number, at), steps)
+            if (number, earlier) not in self._checkpoints and file.exists():
+                self._store(number, earlier, read_arrays(file, file.name))
+                file.unlink()
 
     def _end(self, number: int, at: int, arrays: Arrays) -> None:
         """Store a finished call, and then let go of the one before it."""
-        folder, run = self._folder_of(number, at), self.runs[number]
+        folder = self._folder_of(number, at)
         shutil.rmtree(folder, ignore_errors=True)
-        folder.with_suffix(".part").rename(folder)
-        for earlier in range(at if self._calls_back else 0):
-            prefix = f"{run.checkpoints[earlier]}/"
-            some = {n.removeprefix(prefix): a for n, a in arrays.items() if n.startswith(prefix)}
-            if some and (number, earlier) not in self._checkpoints:
-                self.cache.put({self.cache_name(number, earlier): some})
-                self._set_checkpoint(number, earlier, some)
-                self._advanced(number, earlier)
-        arrays = {name: array for name, array in arrays.items() if not name[0].isdigit()}
-        self.cache.put({self.cache_name(number, at): arrays})
-        self._set_checkpoint(number, at, arrays)
+        part = folder.with_suffix(".part")
+        part.mkdir(parents=True, exist_ok=True)
+        part.rename(folder)
+        self._store(number, at, arrays)
         if at:
             shutil.rmtree(self._folder_of(number, at - 1), ignore_errors=True)
+
+    def _store(self, number: int, at: int, arrays: Arrays) -> None:
+        self.cache.put({self.cache_name(number, at): arrays})
+        self._set_checkpoint(number, at, arrays)
         self._advanced(number, at)
 
     def _folder_of(self, number: int, at: int | None = None) -> Path:
@@ -264,13 +282,14 @@ def train_once(
     if (torch := sys.modules.get("torch")) is not None:
         torch.manual_seed(seed)
     folder = Path(call["folder"])
-    reports = _Reports(call["checkpoints"], folder, observation)
+    reports = Reports(call["checkpoints"], folder, observation)
     given = {"resume": folder, "checkpoint": reports}
     options: dict[str, Any] = {name: value for name, value in given.items() if takes(train, name)}
     if "starts" in call:
         options["starts"] = call["starts"]
     began = time.perf_counter()
-    made = train(jax.random.key(seed), dict(call["values"]), steps=call["steps"], **options)
+    with contextlib.chdir("."):  # Where it is for the next call too.
+        made = train(jax.random.key(seed), dict(call["values"]), steps=call["steps"], **options)
     seconds = time.perf_counter() - began
     curve: Mapping[str, Any] = reports.curve
     if isinstance(made, tuple) and len(made) == 2 and isinstance(made[1], Mapping):
@@ -279,35 +298,43 @@ def train_once(
         missing := [at for at in call["checkpoints"] if at > reports.last]
     ):
         raise ValueError(f"checkpoint was not called at {missing[0]} steps or after them")
-    return cast(Trace, {**_encode(made, observation, curve, seconds), **reports.taken})
+    return cast(Trace, _encode(made, observation, curve, seconds))
 
 
-class _Reports:
-    """What a training function reports: how far it is, its returns, and policies at checkpoints.
-
-    `taken` has the arrays of the policies, with the steps of their checkpoints before the names.
+class Reports:
+    """What a training function reports: how far it is, its returns, and policies at checkpoints,
+    which it writes beside the folder of the call.
     """
 
     def __init__(self, checkpoints: Sequence[int], folder: Path, observation: Any) -> None:
-        self.taken: dict[str, np.ndarray] = {}
         self.curve: dict[str, list[float]] = {"steps": [], "mean_return": []}
         self.last, self._began = 0, time.perf_counter()
         self._checkpoints, self._folder, self._observation = checkpoints, folder, observation
 
     def __call__(self, steps: int, policy: Any, mean_return: float | None = None) -> None:
         """Report a policy after so many environment steps; see `Trainer`."""
+        steps = check_count("the steps of a checkpoint", steps)
         if steps <= self.last:
             raise ValueError(f"checkpoint was called at {steps} steps after {self.last} steps")
         passed = [at for at in self._checkpoints if self.last < at <= steps]
-        self.last = int(steps)
+        self.last = steps
         if mean_return is not None:
             self.curve["steps"].append(steps)
-            self.curve["mean_return"].append(mean_return)
+            self.curve["mean_return"].append(float(mean_return))
         for at in passed:
-            seconds = time.perf_counter() - self._began
-            arrays = _encode(policy, self._observation, self.curve, seconds)
-            self.taken |= {f"{at}/{name}": array for name, array in arrays.items()}
+            self._take(policy, _reported(self._folder, at))
         self._folder.with_suffix(".steps").write_text(str(self.last))
+
+    def _take(self, policy: Any, path: Path) -> None:
+        seconds = time.perf_counter() - self._began
+        arrays = _encode(policy, self._observation, self.curve, seconds)
+        with replacing(path) as made, made.open("wb") as file:
+            np.savez(file, **cast(Any, arrays))
+
+
+def _reported(folder: Path, steps: object) -> Path:
+    """Return the file with the policy that the call of a folder reported at a checkpoint."""
+    return folder.with_suffix(f".{steps}.npz")
 
 
 def reported_steps(folder: Path) -> int:
@@ -322,11 +349,17 @@ def _encode(
     made: Any, observation: Any, curve: Mapping[str, Any], seconds: float
 ) -> dict[str, np.ndarray]:
     graph, arrays, start = load(made, observation=observation).as_graph(observation)
+    steps, returns = (np.asarray(curve[name]) for name in ("steps", "mean_return"))
+    if steps.shape != returns.shape or steps.ndim != 1 or (np.diff(steps, prepend=0) <= 0).any():
+        raise ValueError(
+            "a learning curve has a mean_return for each of its steps, which are positive and "
+            f"increase; got {len(np.ravel(steps))} steps and {len(np.ravel(returns))} returns"
+        )
     held = {**arrays, **{name: s for (name, _), s in zip(graph.memory, start, strict=True)}}
     return {
         "graph": np.frombuffer(json.dumps(graph.to_json()).encode(), np.uint8),
-        "steps": np.asarray(curve["steps"], np.int64),
-        "mean_return": np.asarray(curve["mean_return"], np.float64),
+        "steps": steps.astype(np.int64),
+        "mean_return": returns.astype(np.float64),
         "seconds": np.asarray(seconds, np.float64),
         **{f"{ARRAY}{name}": array for name, array in held.items()},
     }

@@ -82,21 +82,23 @@ def _trial(
     optuna: ModuleType, number: int, row: Mapping[str, Any],
     distributions: "Mapping[str, BaseDistribution]",
 ) -> "FrozenTrial":  # fmt: skip
-    values = [float(row["failure_high"]), float(row["nominal_return"])]
-    state = optuna.trial.TrialState.COMPLETE
-    if not np.isfinite(values).all():
-        state = optuna.trial.TrialState.FAIL
-    elif STOPPED in str(row["status"]).split(", "):
-        state = optuna.trial.TrialState.PRUNED
-    complete = state == optuna.trial.TrialState.COMPLETE
+    values, state = [float(row["failure_high"]), float(row["nominal_return"])], state_of(row)
     attributes = {name: as_scalar(row[name]) for name in _ATTRIBUTES if name in row}
     parameters = {n: _clamp(as_scalar(row[n]), d) for n, d in distributions.items()}
     parameters = {n: v for n, v in parameters.items() if v == v}
     return optuna.trial.create_trial(
-        state=state, values=values if complete else None, params=parameters,
+        state=optuna.trial.TrialState[state], params=parameters,
+        values=values if state == "COMPLETE" else None,
         distributions={n: d for n, d in distributions.items() if n in parameters},
         user_attrs={"configuration": number, **attributes},
     )  # fmt: skip
+
+
+def state_of(row: Mapping[str, Any]) -> str:
+    """Return the name of Optuna's state for a configuration."""
+    if not np.isfinite([row["failure_high"], row["nominal_return"]]).all():
+        return "FAIL"
+    return "PRUNED" if STOPPED in str(row["status"]).split(", ") else "COMPLETE"
 
 
 def _clamp(value: object, distribution: "BaseDistribution") -> object:

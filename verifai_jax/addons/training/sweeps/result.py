@@ -20,7 +20,7 @@ from verifai_jax.addons.training.sweeps.importance import (
     HyperparameterImportance,
     hyperparameter_importance,
 )
-from verifai_jax.addons.training.sweeps.optuna_export import export_to_optuna
+from verifai_jax.addons.training.sweeps.optuna_export import export_to_optuna, state_of
 from verifai_jax.addons.training.sweeps.ranking import (
     group_by_configuration,
     is_safe,
@@ -248,9 +248,10 @@ class Sweep(Reported):
         policy, table = self.policy(i), self.table
         row: Any = table.loc[i].to_dict()
         values = {n: as_scalar(row[n]) for n in self.hyperparameters}
+        same = (table["configuration"] == row["configuration"]) & (table["seed"] == row["seed"])
+        whole = int(table.loc[same, STEPS].max())
         if STEPS in values:  # The table has those of the checkpoint.
-            same = (table["configuration"] == row["configuration"]) & (table["seed"] == row["seed"])
-            values[STEPS] = int(table.loc[same, STEPS].max())
+            values[STEPS] = whole
         before, number, parents = [], int(row["configuration"]), self.record.options.get("parents")
         while (parent := (parents or {}).get(str(number))) is not None:
             number, at = parent
@@ -258,7 +259,9 @@ class Sweep(Reported):
             before.insert(0, [at, {n: as_scalar(one[n]) for n in self.hyperparameters}])
         return TrainedConfiguration(
             study=self.name, hyperparameters=values, seed=int(row["seed"]),
-            steps=int(row[STEPS]), certificate={n: as_scalar(row[n]) for n in CERTIFICATE},
+            steps=int(row[STEPS]),
+            called=int(row[STEPS]) if self.record.options.get("halving") else whole,
+            certificate={n: as_scalar(row[n]) for n in CERTIFICATE},
             weights=weights_of(policy), version=self.record.version,
             processor=describe_processor(), policy=policy, before=before,
         )  # fmt: skip
@@ -275,17 +278,18 @@ class Sweep(Reported):
     def trials_dataframe(self) -> "pd.DataFrame":
         """Return one row for each configuration, with the columns of Optuna's `trials_dataframe`.
 
-        `values_0` is the upper end of the failure probability, `values_1` the nominal return.
+        `values_0` is the upper end of the failure probability, `values_1` the nominal return;
+        `state` is COMPLETE, PRUNED where halving stopped it, FAIL without one of the two.
         """
         groups: Any = self.configurations
         renamed = {name: f"params_{name}" for name in self.hyperparameters}
         values = {"failure_high": "values_0", "nominal_return": "values_1"}
         table = groups[[*values, *renamed]].rename(columns={**values, **renamed})
         table.insert(0, "number", range(len(table)))
-        text_columns = {"verdict": "user_attrs_verdict", "status": "state"}
-        return table.join(groups[[*text_columns]].rename(columns=text_columns)).reset_index(
-            drop=True
-        )
+        attributes = {name: f"user_attrs_{name}" for name in ("verdict", "status")}
+        table = table.join(groups[[*attributes]].rename(columns=attributes))
+        states = [*map(state_of, groups.to_dict("records"))]
+        return table.assign(state=states).reset_index(drop=True)
 
     @suggests_options
     def importance(self, *, repeats: int = 5, seed: int = 0) -> HyperparameterImportance:

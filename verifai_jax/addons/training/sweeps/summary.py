@@ -14,7 +14,7 @@ import numpy as np
 from verifai_jax.addons.estimation.simultaneous_interval import verdict_kind
 from verifai_jax.addons.training.sweeps import ranking
 from verifai_jax.addons.training.sweeps.record import algorithm_uses, error_message
-from verifai_jax.core.messages.text import counted, format_features, format_percent
+from verifai_jax.core.messages.text import counted, format_features, format_percent, format_seconds
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -87,7 +87,10 @@ def format_headline(sweep: Sweep) -> str:
     text = f"{counted(len(groups), 'configuration')}; "
     threshold = ranking.full_return_threshold(groups)
     if not np.isfinite(threshold):
-        return text + "none has a policy"
+        if all(policy is None for policy in sweep.record.policies):
+            return text + "none has a policy"
+        safe = f"{int(ranking.is_safe(groups).sum())} certified safe{_requirement(sweep.p)}"
+        return f"{text}{safe}, and no return at the end of a training is known"
     full = groups.loc[groups["nominal_return"] >= threshold]
     safe = int(ranking.is_safe(full).sum())
     reach = "reaches" if len(full) == 1 else "reach"
@@ -176,8 +179,8 @@ def _best_lines(sweep: Sweep) -> list[str]:
     if values := format_hyperparameters(sweep, best):
         lines.append(f"                  {values}")
     price = f"{int(best['steps']):,} environment steps"
-    if np.isfinite(best["training_seconds"]):
-        price += f" in {best['training_seconds']:z.1f} s of a core"
+    if np.isfinite(seconds := best["training_seconds"]):
+        price += f" in {format_seconds(float(f'{seconds:.2g}'))} of a core"
     if best["simulations"] > 0:
         price += f", then {counted(int(best['simulations']), 'simulation')} for the certificate"
     lines.append(f"                  cost {price}")
@@ -257,4 +260,6 @@ def _seconds(seconds: Mapping[str, float]) -> str:
 
 def _format_return(value: float) -> str:
     """Write a return with four digits, and no exponent where it can be avoided."""
+    if value != value:
+        return "unknown"
     return f"{value:z,.0f}" if abs(value) >= 1000 else f"{value:z.4g}"

@@ -179,7 +179,7 @@ class TrainingRuns:
             last = min(rung, self.rungs(number) - 1)
             for at in range(last + 1):
                 self._recall(number, at)
-            if (number, last) in self._checkpoints:
+            if self._has_all(number, last):
                 self.clock.advance(self._steps(number, last))
             else:
                 key = (id(self._batches[number][0]), self.structure(number))
@@ -287,6 +287,10 @@ class TrainingRuns:
                 self.clock.advance(self._steps(number, at) - self._steps(number, at - 1))
             self.clock.count_compilation(time.perf_counter() - began - busy)
             self.clock.check()
+
+    def _has_all(self, number: int, rung: int) -> bool:
+        """Return whether all checkpoints are known up to one; a damaged cache may lack any."""
+        return all((number, at) in self._checkpoints for at in range(rung + 1))
 
     def _recall(self, number: int, rung: int) -> None:
         if (number, rung) in self._checkpoints:
