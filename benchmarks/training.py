@@ -239,7 +239,7 @@ def rejax_ppo(steps: int, alike: bool = False) -> Any:
                 return -surrogate.mean() + self.vf_coef * error.mean() / 2
 
             gradients = jax.grad(loss)((ts.actor_ts.params, ts.critic_ts.params))
-            clip = optax.clip_by_global_norm(self.max_grad_norm)
+            clip: Any = optax.clip_by_global_norm(self.max_grad_norm)
             policy, critic = clip.update(gradients, optax.EmptyState())[0]
             return ts.replace(
                 actor_ts=ts.actor_ts.apply_gradients(grads=policy),
