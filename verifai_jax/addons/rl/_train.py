@@ -88,11 +88,9 @@ def train(
         reported = len(curve)
 
     run = BatchedTraining([Configuration(task, algorithm, steps, seed)], watch=watch)
-    reached = []
-    ordered = sorted(set(checkpoints))
-    for at in ordered:
-        if not 1 <= at <= steps:
-            raise ValueError(f"checkpoints must lie between 1 and steps = {steps}; got {at}")
+    reached, ordered = [], sorted(set(checkpoints))
+    if outside := [at for at in ordered if not 1 <= at <= steps]:
+        raise ValueError(f"checkpoints must lie between 1 and steps = {steps}; got {outside[0]}")
     for at in ordered:
         for number in run.advance({0: at}):
             reached.append(Checkpoint(int(run.curve(number)[0][-1]), run.policy(number)))

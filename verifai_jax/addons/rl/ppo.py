@@ -163,10 +163,7 @@ def _collect(
     shape = (ppo.horizon, ppo.environments, state.weights.policy[-1][1].shape[0])
     draw = jax.random.gumbel if isinstance(action, Discrete) else jax.random.normal
 
-    def step(
-        episodes: Episodes,
-        drawn: tuple[Float[Array, "environments outputs"], Key[Array, "environments 2"]],
-    ) -> tuple[Episodes, Experience]:
+    def step(episodes: Episodes, drawn: tuple[Array, Array]) -> tuple[Episodes, Experience]:
         noise, keys = drawn
         # Without the barrier XLA would make the first product of parts of the state, slowly.
         observation = jax.lax.optimization_barrier(jax.vmap(task.observe)(episodes.state))
@@ -191,13 +188,7 @@ def _learn(
     """Take a few epochs of clipped policy and value steps on one stretch of experience."""
     transition, action = seen.transition, task.action
     observation = normalise(state.statistics, seen.observation, ppo.normalise)
-    next_observation = normalise(state.statistics, transition.next_observation, ppo.normalise)
-    value, next_value = (
-        minibatch_network(state.weights.critic, each.reshape(-1, each.shape[-1])).reshape(
-            transition.reward.shape
-        )
-        for each in (observation, next_observation)
-    )
+    value, next_value = _values(ppo, task, state, transition, observation)
     advantage = advantages(
         transition.reward, value, next_value, transition.ends, ppo.discount, ppo.gae_lambda
     )
@@ -212,6 +203,23 @@ def _learn(
         annealed(ppo.learning_rate, state.done, state.updates, ppo.anneal), ppo.epochs,
         ppo.minibatches,
     )  # fmt: skip
+
+
+def _values(
+    ppo: PPO, task: Task, state: PPOState, transition: Transition,
+    observation: Float[Array, "time lanes k"],
+) -> tuple[Float[Array, "time lanes"], Float[Array, "time lanes"]]:  # fmt: skip
+    """Return the values of the observations, and of those that the steps led to."""
+    time, lanes, size = observation.shape
+    # The same values one step later, but for the last step and where the time limit cut a lane.
+    limit = task.time_limit
+    cuts = 1 + (time - 1) // limit if isinstance(limit, int) else time
+    cut = jax.lax.top_k(transition.ends.truncated.T.astype(jnp.int32), cuts)[1].T, jnp.arange(lanes)
+    following = transition.next_observation
+    others = jnp.concatenate([following[-1:], following[cut]])
+    rows = jnp.concatenate([observation, normalise(state.statistics, others, ppo.normalise)])
+    value = minibatch_network(state.weights.critic, rows.reshape(-1, size)).reshape(-1, lanes)
+    return value[:time], value[1 : time + 1].at[cut].set(value[time + 1 :])
 
 
 def _loss(weights: Weights, ppo: PPO, action: Action, part: Minibatch) -> Float[Array, ""]:

@@ -96,9 +96,7 @@ class MjxTask:
         data = before.replace(ctrl=jnp.asarray(self.control(action)).reshape(before.ctrl.shape))
         data = jax.lax.fori_loop(0, self.substeps, lambda _, d: mjx.step(model, d), data)
         after = MjxState(data.qpos, data.qvel, data.act, data.qacc_warmstart, state.varied)
-        finite = jnp.array(True)
-        for leaf in (after.qpos, after.qvel, after.act):
-            finite &= jnp.all(jnp.isfinite(leaf))
+        finite = jnp.all(jnp.isfinite(jnp.concatenate([after.qpos, after.qvel, after.act])))
         # A NaN would not stay in one episode: it would poison what is learnt from all of them.
         after = jax.tree.map(lambda new, old: jnp.where(finite, new, old), after, state)
         following = self._at(after)[1]
@@ -178,7 +176,7 @@ def mjx_task(
                 f"{kind} needs control=..., a function that returns the signals of "
                 f"{compiled.nu} actuators"
             )
-        control = _over_control_range(compiled) if action is None else _identity
+        control = _over_control_range(compiled) if action is None else jnp.asarray
     task = MjxTask(
         compiled=compiled, action=kind, time_limit=time_limit, substeps=substeps, reward=reward,
         observe_data=observe or (lambda data: jnp.concatenate([data.qpos, data.qvel])),
@@ -212,12 +210,8 @@ def _check(task: MjxTask) -> None:
     jax.eval_shape(task.observe, start)
 
 
-def _identity(action: Array) -> Array:
-    return action
-
-
 def _over_control_range(compiled: MjModel) -> Control:
     if not compiled.actuator_ctrllimited.all():
-        return _identity
+        return jnp.asarray
     low, high = compiled.actuator_ctrlrange.T
     return lambda action: jnp.asarray((high + low) / 2) + jnp.asarray((high - low) / 2) * action
