@@ -85,7 +85,9 @@ def _mean_returns(
     static_task: StaticTask, episodes: int, devices: tuple[Device, ...], numbers: list[Array],
     policies: PyTree, key: Key[Array, ""],
 ) -> Float[Array, " policies"]:  # fmt: skip
-    def on_device(numbers: list[Array], policies: PyTree, key: Array) -> Float[Array, " some"]:
+    def on_device(
+        numbers: list[Array], policies: PyTree, key: Key[Array, ""]
+    ) -> Float[Array, " some"]:
         task, count = static_task.with_numbers(numbers), jax.tree.leaves(policies)[0].shape[0]
         return jnp.mean(_returns(task, episodes, policies, key, count), axis=1)
 

@@ -39,7 +39,9 @@ def advantages(
     delta = reward + discount * continues * next_value - value
     same_episode = 1.0 - (ends.terminated | ends.truncated)
 
-    def backwards(later: Array, step: tuple[Array, Array]) -> tuple[Array, Array]:
+    def backwards(
+        later: Float[Array, "*lanes"], step: tuple[Float[Array, "*lanes"], Float[Array, "*lanes"]]
+    ) -> tuple[Float[Array, "*lanes"], Float[Array, "*lanes"]]:
         delta, same_episode = step
         advantage = delta + discount * gae_lambda * same_episode * later
         return advantage, advantage

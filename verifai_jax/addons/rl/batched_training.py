@@ -392,10 +392,12 @@ def _advance_updates(
         task = static_task.with_numbers(task_numbers)
         algorithm = jax.tree.unflatten(structure, numbers)
 
-        def update(at: Array, carry: tuple[AlgorithmState, Array]) -> tuple[AlgorithmState, Array]:
+        def update(
+            index: Int[Array, ""], carry: tuple[AlgorithmState, Float[Array, " capacity"]]
+        ) -> tuple[AlgorithmState, Float[Array, " capacity"]]:
             state, curve = carry
             state, progress = algorithm.step(task, state)
-            return state, curve.at[at].set(progress.mean_return)
+            return state, curve.at[index].set(progress.mean_return)
 
         return jax.lax.fori_loop(done, until, update, (state, curve))
 

@@ -36,7 +36,8 @@ def annealed(rate: Number, done: Int[Array, ""], updates: Int[Array, ""], enable
 
     It falls linearly from `rate` to 0 if `enabled`, and otherwise stays `rate`.
     """
-    return rate * (1.0 - done * (1.0 / updates) if enabled else 1.0)
+    left = 1.0 - done * (1.0 / updates) if enabled else 1.0
+    return rate * left
 
 
 def minibatch_epochs(
@@ -55,17 +56,21 @@ def minibatch_epochs(
     rows = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), batch)
     count = len(jax.tree.leaves(rows)[0])
 
-    def learn(carry: tuple[Weights, PyTree], part: Batch) -> tuple[tuple[Weights, PyTree], None]:
+    def minibatch(
+        carry: tuple[Weights, PyTree], part: Batch
+    ) -> tuple[tuple[Weights, PyTree], None]:
         weights, moments = carry
         direction, moments = optimizer.update(jax.grad(loss)(weights, part), moments)
         return (jax.tree.map(lambda w, d: w - rate * d, weights, direction), moments), None
 
-    def epoch(carry: tuple[Weights, PyTree], key: Array) -> tuple[tuple[Weights, PyTree], None]:
+    def epoch(
+        carry: tuple[Weights, PyTree], key: Key[Array, ""]
+    ) -> tuple[tuple[Weights, PyTree], None]:
         order = permutation(key, count)
         parts = jax.tree.map(
             lambda leaf: leaf[order].reshape(minibatches, -1, *leaf.shape[1:]), rows
         )
-        return jax.lax.scan(learn, carry, parts)
+        return jax.lax.scan(minibatch, carry, parts)
 
     return jax.lax.scan(epoch, start, jax.random.split(key, epochs))[0]
 
@@ -93,20 +98,6 @@ def minibatch_network(
     # Transposed here, or else XLA would do it in each product.
     units, between = jax.lax.optimization_barrier(rows.T), ACTIVATIONS[activation]
     for weight, bias in layers[:-1]:
-        units = between(_affine(weight, bias, units))
-    return jnp.transpose(_affine(*layers[-1], units))
-
-
-@jax.custom_vjp
-def _affine(weight: Array, bias: Array, units: Array) -> Float[Array, "outputs rows"]:
-    # Transposed in memory: a CPU's fast products need the summed axis last on the left.
-    return jax.lax.optimization_barrier(weight.T) @ units + bias[:, None]
-
-
-def _affine_gradients(kept: tuple[Array, Array], slope: Array) -> tuple[Array, Array, Array]:
-    # JAX' own would transpose through the barrier, and again in each product.
-    weight, units = kept
-    return units @ slope.T, jnp.sum(slope, axis=1), weight @ slope
-
-
-_affine.defvjp(lambda weight, *rest: (_affine(weight, *rest), (weight, rest[1])), _affine_gradients)
+        units = between(weight.T @ units + bias[:, None])
+    weight, bias = layers[-1]
+    return jnp.transpose(weight.T @ units + bias[:, None])

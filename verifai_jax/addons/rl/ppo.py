@@ -163,7 +163,10 @@ def _collect(
     shape = (ppo.horizon, ppo.environments, state.weights.policy[-1][1].shape[0])
     draw = jax.random.gumbel if isinstance(action, Discrete) else jax.random.normal
 
-    def step(episodes: Episodes, drawn: tuple[Array, Array]) -> tuple[Episodes, Experience]:
+    def step(
+        episodes: Episodes,
+        drawn: tuple[Float[Array, "environments outputs"], Key[Array, "environments 2"]],
+    ) -> tuple[Episodes, Experience]:
         noise, keys = drawn
         # Without the barrier XLA would make the first product of parts of the state, slowly.
         observation = jax.lax.optimization_barrier(jax.vmap(task.observe)(episodes.state))

@@ -161,7 +161,9 @@ def q_lambda_targets(
     discount = discount * (1.0 - ends.terminated)
     longer = q_lambda * (1.0 - (ends.terminated | ends.truncated))
 
-    def backwards(later: Array, step: tuple[Array, ...]) -> tuple[Array, Array]:
+    def backwards(
+        later: Float[Array, "*lanes"], step: tuple[Float[Array, "*lanes"], ...]
+    ) -> tuple[Float[Array, "*lanes"], Float[Array, "*lanes"]]:
         reward, next_value, discount, longer = step
         target = reward + discount * (next_value + longer * (later - next_value))
         return target, target
@@ -181,8 +183,11 @@ def _collect(
     options = jax.random.randint(action_key, shape, 0, count, jnp.int32)
 
     def step(
-        carry: tuple[Episodes, Array], drawn: tuple[Array, Array, Array]
-    ) -> tuple[tuple[Episodes, Array], Experience]:
+        carry: tuple[Episodes, Int[Array, " environments"]],
+        drawn: tuple[
+            Float[Array, " environments"], Int[Array, " environments"], Key[Array, "environments 2"]
+        ],
+    ) -> tuple[tuple[Episodes, Int[Array, " environments"]], Experience]:
         episodes, held = carry
         chance, option, keys = drawn
         observation = jax.lax.optimization_barrier(jax.vmap(task.observe)(episodes.state))
