@@ -426,10 +426,10 @@ def parts(task_name: str, environments: int, rounds: int) -> None:
 
     def collected(state: Any) -> Any:
         key, own = jax.random.split(state.key)
-        episodes, _ = module._collect(ppo, task, state, own)
+        episodes, _ = module.collect(ppo, task, state, own)
         return state._replace(episodes=episodes, key=key)
 
-    _, experience = jax.jit(lambda s: module._collect(ppo, task, s, s.key))(start)
+    _, experience = jax.jit(lambda s: module.collect(ppo, task, s, s.key))(start)
 
     def learnt(state: Any) -> Any:
         key, own = jax.random.split(state.key)

@@ -8,7 +8,7 @@ import pytest
 from verifai_jax.addons.rl import PPO, Discrete
 from verifai_jax.addons.rl.on_policy import minibatch_network
 from verifai_jax.addons.rl.policy import network, new_layers
-from verifai_jax.addons.rl.ppo import _collect, _values
+from verifai_jax.addons.rl.ppo import collect, values
 
 SMALL = PPO(hidden=(4,), value_hidden=(4,), environments=3, horizon=7, normalise=True)
 
@@ -41,8 +41,8 @@ def test_next_value_is_that_of_the_state_before_any_reset(limit):
     @jax.jit
     def both(key):
         state = SMALL.init(task, key, 1)
-        _, seen = _collect(SMALL, task, state, key)
-        value, next_value = _values(SMALL, task, state, seen.transition, seen.observation)
+        _, seen = collect(SMALL, task, state, key)
+        value, next_value = values(SMALL, task, state, seen.transition, seen.observation)
         led_to = seen.transition.next_observation
         wanted = (network(state.weights.critic, one)[..., 0] for one in (seen.observation, led_to))
         return value, next_value, *wanted, seen.transition.ends

@@ -88,7 +88,7 @@ class PPO(Vectorised):
         **Returns:** the state after it, and the episodes that ended in it.
         """
         collect_key, learn_key, key = jax.random.split(state.key, 3)
-        episodes, seen = _collect(self, task, state, collect_key)
+        episodes, seen = collect(self, task, state, collect_key)
         statistics = update(state.statistics, seen.observation, self.normalise)
         weights, moments = _learn(self, task, state, seen, learn_key)
         after = PPOState(weights, moments, statistics, episodes, key, state.done + 1, state.updates)
@@ -154,7 +154,7 @@ class Minibatch(NamedTuple):
     target: Float[Array, "*rows"]
 
 
-def _collect(
+def collect(
     ppo: PPO, task: Task, state: PPOState, key: Key[Array, ""]
 ) -> tuple[Episodes, Experience]:
     """Collect experience `[horizon, environments]`, with a new episode where one ends."""
@@ -191,7 +191,7 @@ def _learn(
     """Take a few epochs of clipped policy and value steps on one stretch of experience."""
     transition, action = seen.transition, task.action
     observation = normalise(state.statistics, seen.observation, ppo.normalise)
-    value, next_value = _values(ppo, task, state, transition, observation)
+    value, next_value = values(ppo, task, state, transition, observation)
     advantage = advantages(
         transition.reward, value, next_value, transition.ends, ppo.discount, ppo.gae_lambda
     )
@@ -208,7 +208,7 @@ def _learn(
     )  # fmt: skip
 
 
-def _values(
+def values(
     ppo: PPO, task: Task, state: PPOState, transition: Transition,
     observation: Float[Array, "time lanes k"],
 ) -> tuple[Float[Array, "time lanes"], Float[Array, "time lanes"]]:  # fmt: skip
