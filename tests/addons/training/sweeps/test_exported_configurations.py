@@ -14,7 +14,7 @@ from verifai_jax.addons.training.sweeps import running as driver
 from verifai_jax.addons.training.sweeps._sweep import sweep
 from verifai_jax.addons.training.sweeps.trainer import StudyError
 from verifai_jax.core.messages.errors import UnknownNameError
-from verifai_jax.core.store.files import DamagedError
+from verifai_jax.core.store.files import DamagedError, read_record, write_record
 
 pytestmark = pytest.mark.thorough
 
@@ -87,8 +87,11 @@ def test_what_cannot_be_loaded_or_trained_again(swept, tmp_path):
     with pytest.raises(DamagedError, match=r"policy\.onnx is not the policy of configuration"):
         load_configuration(tmp_path)
     policy.write_bytes(whole)
-    load_configuration(tmp_path)
     file = tmp_path / "configuration.json"
+    record = read_record(file)
+    earlier = {name: record[name] for name in record if name not in ("called", "onnx")}
+    write_record(file, earlier)
+    assert load_configuration(tmp_path).called == record["called"]
     file.write_text(file.read_text().replace('"seed": 3', '"seed": 4'))
     with pytest.raises(DamagedError, match="has changed"):
         load_configuration(tmp_path)

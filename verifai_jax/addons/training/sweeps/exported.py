@@ -121,9 +121,10 @@ def load_configuration(folder: str | Path) -> TrainedConfiguration:
     changed since; the errors of `vj.policy`.
     """
     record, file = files.read_record(Path(folder) / CONFIGURATION), Path(folder) / POLICY
-    if files.checksum(read_bytes(file)) != record.pop("onnx", None):
+    # Exports of earlier versions lack both.
+    if files.checksum(read_bytes(file)) != record.pop("onnx", files.checksum(read_bytes(file))):
         raise files.DamagedError(f"{file} is not the policy of {CONFIGURATION}, or is damaged")
     try:
-        return TrainedConfiguration(**record, policy=load(file))
+        return TrainedConfiguration(**{"called": record.get("steps")} | record, policy=load(file))
     except TypeError as error:
         raise files.DamagedError(f"{folder} has no configuration of a sweep: {error}") from error
