@@ -91,7 +91,7 @@ def test_what_cannot_be_loaded_or_trained_again(swept, tmp_path):
     record = read_record(file)
     earlier = {name: record[name] for name in record if name not in ("called", "onnx")}
     write_record(file, earlier)
-    assert load_configuration(tmp_path).called == record["called"]
+    assert load_configuration(tmp_path).called == record["steps"]
     file.write_text(file.read_text().replace('"seed": 3', '"seed": 4'))
     with pytest.raises(DamagedError, match="has changed"):
         load_configuration(tmp_path)
