@@ -21,6 +21,7 @@ WRITERS = {
     "addons/synthesis/commands/synthesize.py", "addons/verification/network.py",
     "cli/new.py", "core/compute/remembered.py",
     "core/display/notebook.py", "core/store/files.py", "addons/training/loggers.py",
+    "addons/training/sweeps/function_runs.py",
     "pictures/animation.py", "pictures/style.py", "systems/forks.py", "addons/rl/policy.py",
 }  # fmt: skip
 """Writers by `replacing`, which tests/core/store/test_replacements.py kills at each operation.
