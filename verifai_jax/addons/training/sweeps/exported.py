@@ -124,7 +124,8 @@ def load_configuration(folder: str | Path) -> TrainedConfiguration:
     # Exports of earlier versions lack both.
     if files.checksum(read_bytes(file)) != record.pop("onnx", files.checksum(read_bytes(file))):
         raise files.DamagedError(f"{file} is not the policy of {CONFIGURATION}, or is damaged")
+    record.setdefault("called", record.get("steps"))
     try:
-        return TrainedConfiguration(**{"called": record.get("steps")} | record, policy=load(file))
+        return TrainedConfiguration(**record, policy=load(file))
     except TypeError as error:
         raise files.DamagedError(f"{folder} has no configuration of a sweep: {error}") from error
