@@ -180,7 +180,7 @@ def _best_lines(sweep: Sweep) -> list[str]:
         lines.append(f"                  {values}")
     price = f"{int(best['steps']):,} environment steps"
     if np.isfinite(seconds := best["training_seconds"]):
-        price += f" in {format_seconds(float(f'{seconds:.2g}'))} of a core"
+        price += f" in {format_seconds(float(f'{seconds:z.2g}'))} of a core"
     if best["simulations"] > 0:
         price += f", then {counted(int(best['simulations']), 'simulation')} for the certificate"
     lines.append(f"                  cost {price}")
