@@ -61,6 +61,21 @@ def stacked_policies(dense: Sequence[Any], count: int) -> list[Any]:
     return [Policy(one, None, None, None, Discrete(2)) for one in layers]
 
 
+def timed(
+    train: Callable[[Any], Any], policies: Callable[[Any], list[Any]], count: int
+) -> Trainings:
+    """Return the timed trainings of a compiled function from keys to what holds the policies."""
+
+    def run(seed: int) -> tuple[float, list[float]]:
+        keys = jax.random.split(jax.random.key(seed), count)
+        before = time.process_time()
+        trained = jax.block_until_ready(train(keys if count > 1 else keys[0]))
+        seconds = time.process_time() - before
+        return seconds, mean_returns(policies(trained))
+
+    return run
+
+
 def gymnax_cartpole() -> tuple[Any, Any]:
     """Return CartPole of gymnax with one flag for the end of an episode, and its parameters."""
     import gymnax  # pyright: ignore[reportMissingImports]
@@ -164,15 +179,7 @@ def rejax_trainings(count: int) -> Trainings:
     """Return the trainings of `our_trainings` with rejax, whose policies are evaluated as ours."""
     algorithm = rejax_ppo(STEPS)
     train = jax.jit(jax.vmap(algorithm.train) if count > 1 else algorithm.train)
-
-    def run(seed: int) -> tuple[float, list[float]]:
-        keys = jax.random.split(jax.random.key(seed), count)
-        before = time.process_time()
-        state, _ = jax.block_until_ready(train(keys if count > 1 else keys[0]))
-        seconds = time.process_time() - before
-        return seconds, mean_returns(rejax_policies(state, count))
-
-    return run
+    return timed(train, lambda trained: rejax_policies(trained[0], count), count)
 
 
 def rejax_curve(seeds: int, alike: bool) -> np.ndarray:
@@ -230,15 +237,7 @@ def purejaxrl_program(steps: int, count: int, alike: bool = False) -> Callable[[
 def purejaxrl_trainings(count: int) -> Trainings:
     """Return the same with PureJaxRL."""
     train = purejaxrl_program(STEPS, count)
-
-    def run(seed: int) -> tuple[float, list[float]]:
-        keys = jax.random.split(jax.random.key(seed), count)
-        before = time.process_time()
-        dense = jax.block_until_ready(train(keys if count > 1 else keys[0]))
-        seconds = time.process_time() - before
-        return seconds, mean_returns(stacked_policies(dense, count))
-
-    return run
+    return timed(train, lambda dense: stacked_policies(dense, count), count)
 
 
 def purejaxrl_curve(seeds: int, alike: bool) -> np.ndarray:

@@ -121,8 +121,8 @@ def load_configuration(folder: str | Path) -> TrainedConfiguration:
     changed since; the errors of `vj.policy`.
     """
     record, file = files.read_record(Path(folder) / CONFIGURATION), Path(folder) / POLICY
-    # Exports of earlier versions lack both.
-    if files.checksum(read_bytes(file)) != record.pop("onnx", files.checksum(read_bytes(file))):
+    # Exports of earlier versions lack `onnx` and `called`.
+    if "onnx" in record and record.pop("onnx") != files.checksum(read_bytes(file)):
         raise files.DamagedError(f"{file} is not the policy of {CONFIGURATION}, or is damaged")
     record.setdefault("called", record.get("steps"))
     try:
